@@ -10,7 +10,9 @@ WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbi
 ``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
 first frame, outages of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns, ``--minutes`` what the page
 holds while viewers come and go. ``--floor`` measures the page with one viewer beside processes that only read the same topics
-(live_floor.py), all at the same time. One line of JSON for each part.
+(live_floor.py), all at the same time. ``--kills`` kills it while eight watch, one of which never reads.
+
+One line of JSON for each part, then the bars; the exit code is 1 where one is missed.
 """
 
 from __future__ import annotations
@@ -28,21 +30,29 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import aiortc
+from _report import Bar, show, spread
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
 from domains import free_domain
 from e2e.live_frames import Frames
 from e2e.machines import ROBOT, Machines
-from e2e.processes import Process, Processes, until
+from e2e.processes import Node, Process, Processes, until
 
 TOPICS = ['/camera/compressed', '/point_cloud2', '/imu', '/odom', '/joint_states', '/lowstate']
 KINDS = ('camera', 'cloud', 'imu', 'odom', 'joints', 'battery')
+WATCHING = 8
+"""While the page is killed."""
+TAKINGS = 2.5
+"""Times the CPU of taking the messages that the page may use with one viewer. 4 % of a core was the aim where that cost 1.1 %."""
+BESIDE = 1.2
+"""Times its p95 alone that a viewer beside one on a slow link may have."""
 
 
 class Watcher:
@@ -172,6 +182,23 @@ def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf:
             'each': [watcher.told(took) for watcher in watchers[deaf:][:2]]}  # fmt: skip
 
 
+def killed(url: str, live: Process) -> int:
+    """Kill the page while so many watch, of which the first never reads; how many of the others had been sent something."""
+    watchers = [Watcher(url, TOPICS) for _ in range(WATCHING)]
+
+    async def run() -> None:
+        tasks = [asyncio.create_task(watcher.run(reads=place > 0)) for place, watcher in enumerate(watchers)]
+        await asyncio.sleep(4)
+        live.signal(signal.SIGKILL)
+        await asyncio.wait(tasks[1:], timeout=5)
+        tasks[0].cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    asyncio.run(run())
+    live.wait()
+    return sum(watcher.bytes > 0 for watcher in watchers)
+
+
 def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: float) -> dict[str, Any]:
     """The page in a Chromium with software GL on a machine of its own; in the end the link to it is cut for 10 s, three times."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415 - for this part alone
@@ -281,67 +308,157 @@ def shape(url: str, mbps: float) -> None:
         subprocess.run(command.split(), check=True)
 
 
-def main() -> None:  # noqa: PLR0915 - one part after the other
+def at_most(what: str, limit: float, value: float, unit: str, rounds: Sequence[float] = (), aim: str = '') -> Bar:
+    return Bar(what, f'at most {limit:g}{aim}', value, unit, value <= limit, tuple(rounds))
+
+
+def at_least(what: str, limit: float, value: float, unit: str) -> Bar:
+    return Bar(what, f'at least {limit:g}', value, unit, value >= limit)
+
+
+def late(row: dict[str, Any], limits: dict[str, float], where: str) -> list[Bar]:
+    """The first viewer's p95 of each kind with a limit."""
+    return [at_most(f'{kind} to a viewer {where}, p95', ms, row['each'][0][kind]['p95_ms'], 'ms') for kind, ms in limits.items()]
+
+
+def cost_bars(rows: Sequence[dict[str, Any]]) -> list[Bar]:
+    """Of the series without a viewer, with one, with some, without one."""
+    alone, first, some, after = (row['cpu_percent']['live'] for row in rows[:4])
+    more = (some - first) / max(1, rows[2]['viewers'] - 1)
+    return [
+        at_most('CPU of the page without a viewer', 0.5, alone, '% of a core', (alone, after)),
+        at_most('CPU of the page for each further viewer', 1.5, more, '% of a core'),
+        at_most('private memory of the page with viewers', 120, rows[2]['private_mb'], 'MB'),
+        *late(rows[1], dict.fromkeys(KINDS, 60.0), 'on loopback'),
+    ]
+
+
+def link_bars(row: dict[str, Any], mbps: float, *, video: bool) -> list[Bar]:
+    where = f'on {mbps:g} Mbit/s'
+    if video:
+        camera_ms, least_hz = 500.0, 15.0
+    else:
+        camera_ms, least_hz = (250.0, 8.0) if mbps >= 8 else (1000.0, 0.0)
+    return [
+        *late(row, {'imu': 100.0 if mbps >= 8 else 300.0, 'camera': camera_ms}, where),
+        *([at_least(f'camera to a viewer {where}', least_hz, row['each'][0]['camera']['hz'], 'Hz')] if least_hz else []),
+    ]
+
+
+def browser_bars(row: dict[str, Any]) -> list[Bar]:
+    return [
+        *(at_most(f"{kind} to the browser's handler, p95", 60, ms, 'ms') for kind, ms in row['came'].items() if kind in KINDS),
+        *(at_most(f'{kind} until it is drawn, p95', 250, ms, 'ms') for kind, ms in row['drawn'].items() if kind in KINDS),
+        *(at_most(f'first frame ({name[:-3]})', 2000, row[name], 'ms') for name in row if name.startswith('first_frame')),
+        at_most('until the page goes on after an outage', 2, max(row['goes_on_s']), 's', row['goes_on_s']),
+        at_most('ages shown in an outage, p95 of the error', 200, max(row['ages_wrong_p95_ms']), 'ms', row['ages_wrong_p95_ms']),
+    ]
+
+
+def beside_bars(row: dict[str, Any]) -> list[Bar]:
+    """Of each kind the mean of both runs, since one run's p95 alone differs from the other's as well."""
+    found = []
+    for kind in ('imu', 'camera', 'cloud'):
+        alone, with_slow = (statistics.mean(run[kind] for run in row[name]) for name in ('alone', 'beside'))
+        found.append(at_most(f'p95 of {kind} beside a slow viewer', BESIDE, with_slow / alone, 'of that alone'))
+    return found
+
+
+def floor_bars(row: dict[str, Any]) -> list[Bar]:
+    used = row['cpu_percent']
+    what = 'CPU of the page with one viewer, against that of taking the same messages'
+    return [at_most(what, TAKINGS, used['live'] / used['take'], 'of it', aim=' (aim: 4 % of a core where taking costs 1.1 %)')]
+
+
+def ending_bars(node: Node, url: str, live: Process, processes: Processes, sim: Process, kills: int) -> list[Bar]:
+    """Kill the page so often, then end the robot and the node: nothing may be missing in its ledger."""
+    watching = []
+    for _ in range(kills):
+        watching.append(killed(url, live))
+        live, url = processes.page(node)
+    sim.signal(signal.SIGINT)
+    sim.wait()
+    time.sleep(1)
+    ledger = node.stop()
+    lost = {topic: (row['missed'], sum(row['dropped'].values())) for topic, row in ledger['topics'].items()}
+    received = sum(row['received'] for row in ledger['topics'].values())
+    told = {'balanced': ledger['balanced'], 'received': received, 'missed_and_dropped': lost, 'kills': kills}
+    print(json.dumps(told), flush=True)
+    bars = [
+        at_most('messages missed or dropped by the node', 0, sum(map(sum, lost.values())), f'of {received}'),
+        Bar('the ledger balances', 'yes', float(ledger['balanced']), '', ledger['balanced']),
+    ]
+    if kills:
+        bars.append(at_least('viewers that were being sent items when the page was killed', WATCHING - 1, min(watching), ''))
+    return bars
+
+
+def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[Bar]:
+    """What one call measures, a line for each row; the bars of all of it."""
+    machines = Machines(stack, os.getpid()) if given.browser else None
+    processes = Processes(folder, stack.enter_context(free_domain()), f'r{secrets.token_hex(4)}')
+    stack.callback(processes.end)
+    node = processes.node()
+    sim = processes.sim(f'rate_scale:={given.scale}')
+    live, url = processes.page(node, *(['--bind', ROBOT] if machines else []))
+    pids = {'node': node.popen.pid, 'live': live.popen.pid}
+    until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
+
+    def tell(row: dict[str, Any]) -> dict[str, Any]:
+        print(json.dumps({'link_mbps': given.link or None, 'load': os.getloadavg()[0], **row}), flush=True)
+        return row
+
+    if machines:
+        token = (node.home / 'live' / 'viewer.token').read_text().strip()
+        bars = browser_bars(tell(in_browser(url, token, machines, folder, given.seconds)))
+    elif given.pairs:
+        row = tell(paired(url, given.viewers, given.seconds, given.pairs, pids))
+        what = f'CPU of the node with {given.viewers} viewers more than without, median of {given.pairs} pairs'
+        bars = [at_most(what, 0.3, row['median'], 'points of a core', row['node_points_more'])]
+    elif given.minutes:
+        row = tell(lasting(url, given.viewers, given.minutes, live.popen.pid))
+        bars = [at_most('private memory of the page at any minute', 120, max(row['private_mb']), 'MB', row['private_mb'])]
+    elif given.floor:
+        bars = floor_bars(tell(floor(url, given.seconds, processes, pids)))
+    elif given.beside:
+        bars = beside_bars(tell(beside(url, given.seconds, given.beside)))
+    elif given.link:
+        shape(url, given.link)
+        bars = link_bars(tell(watched(url, 1, given.seconds, pids, video=given.video)), given.link, video=given.video)
+    elif given.kills:
+        bars = []
+    else:
+        bars = cost_bars([tell(watched(url, count, given.seconds, pids)) for count in (0, 1, given.viewers, 0)])
+        tell(watched(url, given.viewers, given.seconds / 2, pids, deaf=given.viewers - 1))
+    return bars + ending_bars(node, url, live, processes, sim, given.kills)
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--viewers', type=int, default=3)
-    parser.add_argument('--link', type=float, default=0.0)
-    parser.add_argument('--video', action='store_true')
-    parser.add_argument('--kills', type=int, default=0)
-    parser.add_argument('--beside', type=float, default=0.0)
-    parser.add_argument('--browser', action='store_true')
-    parser.add_argument('--pairs', type=int, default=0)
-    parser.add_argument('--minutes', type=int, default=0)
-    parser.add_argument('--floor', action='store_true')
-    parser.add_argument('--scale', type=float, default=1.0)
+    parser.add_argument('--seconds', type=float, default=20.0, help='how long each row is measured (default 20)')
+    parser.add_argument('--viewers', type=int, default=3, help='of the rows with more than one (default 3)')
+    parser.add_argument('--link', type=float, default=0.0, metavar='MBPS', help='what the page sends leaves no faster')
+    parser.add_argument('--video', action='store_true', help='with --link: take the camera as WebRTC')
+    parser.add_argument('--kills', type=int, default=0, help='so often the page is killed while eight watch')
+    parser.add_argument('--beside', type=float, default=0.0, metavar='MBPS', help='a second viewer that reads no faster')
+    parser.add_argument('--browser', action='store_true', help='in a Chromium on a machine of its own')
+    parser.add_argument('--pairs', type=int, default=0, help='so many times without viewers and with them')
+    parser.add_argument('--minutes', type=int, default=0, help='so long, while viewers come and go')
+    parser.add_argument('--floor', action='store_true', help='beside processes that only read the same topics')
+    parser.add_argument('--scale', type=float, default=1.0, help="of the robot's rates (default 1)")
     given = parser.parse_args()
     if (given.link or given.browser) and 'LIVE_BENCH' not in os.environ:
         command = ['unshare', '-n', sys.executable, *sys.argv]
-        sys.exit(subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode)
+        return subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode
     if given.link:
         subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
         subprocess.run(['ip', 'addr', 'add', '192.0.2.1/32', 'dev', 'lo'], check=True)  # aiortc's viewer takes no 127.0.0.1
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
-        machines = Machines(stack, os.getpid()) if given.browser else None
-        domain = stack.enter_context(free_domain())
-        processes = Processes(Path(folder), domain, f'r{secrets.token_hex(4)}')
-        stack.callback(processes.end)
-        node = processes.node()
-        sim = processes.sim(f'rate_scale:={given.scale}')
-        live, url = processes.page(node, *(['--bind', ROBOT] if machines else []))
-        pids = {'node': node.popen.pid, 'live': live.popen.pid}
-        until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
-        if machines:
-            token = (node.home / 'live' / 'viewer.token').read_text().strip()
-            rows = [in_browser(url, token, machines, Path(folder), given.seconds)]
-        elif given.pairs:
-            rows = [paired(url, given.viewers, given.seconds, given.pairs, pids)]
-        elif given.minutes:
-            rows = [lasting(url, given.viewers, given.minutes, live.popen.pid)]
-        elif given.floor:
-            rows = [floor(url, given.seconds, processes, pids)]
-        elif given.beside:
-            rows = [beside(url, given.seconds, given.beside)]
-        elif given.link:
-            shape(url, given.link)
-            rows = [watched(url, 1, given.seconds, pids, video=given.video)]
-        else:
-            rows = [watched(url, count, given.seconds, pids) for count in (0, 1, given.viewers, 0)]
-            rows.append(watched(url, given.viewers, given.seconds / 2, pids, deaf=given.viewers - 1))
-        for row in rows:
-            print(json.dumps({'link_mbps': given.link or None, 'load': os.getloadavg()[0], **row}), flush=True)
-        for _ in range(given.kills):
-            live.signal(signal.SIGKILL)
-            live.wait()
-            live, url = processes.page(node)
-            watched(url, 8, 2.0, {'live': live.popen.pid})
-        sim.signal(signal.SIGINT)
-        sim.wait()
-        time.sleep(1)
-        ledger = node.stop()
-        lost = {topic: (row['missed'], sum(row['dropped'].values())) for topic, row in ledger['topics'].items()}
-        print(json.dumps({'balanced': ledger['balanced'], 'missed_and_dropped': lost, 'kills': given.kills}), flush=True)
+        bars = measured(given, stack, Path(folder))
+    for bar in bars:
+        print(f'{"ok    " if bar.holds else "MISSED"} {bar.what}: {show(bar.value)} {bar.unit} ({bar.bar}) {spread(bar.rounds)}')
+    return 0 if all(bar.holds for bar in bars) else 1
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())
