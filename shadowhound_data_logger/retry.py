@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TypeVar
 
-from shadowhound_data_logger.errors import StoreUnavailable, StoreUntrusted
+from shadowhound_data_logger.errors import DataLoggerError, StoreUnavailable, StoreUntrusted
 
 BASE_S: Final = 0.5
 """The longest pause before the second try; it doubles with each further one."""
@@ -28,10 +28,12 @@ def backoff(attempt: int, cap_s: float, rng: random.Random) -> float:
 
 
 def steadily(ask: Callable[[], _Answer], *, tries: float | None = None, until_s: float = float('inf'), cap_s: float = CAP_S,
-             pause: Callable[[float], object] = time.sleep) -> _Answer:  # fmt: skip
+             pause: Callable[[float], object] = time.sleep, away: type[DataLoggerError] = StoreUnavailable,
+             failed: Callable[[DataLoggerError], object] = lambda _: None) -> _Answer:  # fmt: skip
     """The answer, after some tries (``TRIES``) where the store is away in passing. Raises what the last one raised.
 
-    No try begins after ``until_s`` of the monotonic clock.
+    No try begins after ``until_s`` of the monotonic clock. ``away`` is what another server's absence raises; ``failed`` is called
+    before each further try.
     """
     failures, most = 0, TRIES if tries is None else tries
     while True:
@@ -39,9 +41,10 @@ def steadily(ask: Callable[[], _Answer], *, tries: float | None = None, until_s:
             return ask()
         except StoreUntrusted:  # somebody has to do something first
             raise
-        except StoreUnavailable:
+        except away as error:
             failures += 1
             pause_s = backoff(failures, cap_s, _rng)
             if failures >= most or time.monotonic() + pause_s >= until_s:
                 raise
+            failed(error)
             pause(pause_s)

@@ -12,7 +12,7 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from shutil import copyfile, rmtree
+from shutil import copyfileobj, rmtree
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -91,9 +91,8 @@ def synchronize(task: Path) -> list[str]:
             target = _folder(task, GO2, row[f'{OURS}mission_id']) / f'camera_{key.rpartition(".")[2]}.mp4'
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.is_file():
-                part = target.with_suffix('.part')
-                copyfile(made.path(VIDEO, row, f'videos/{key}', video_key=key), part)
-                part.replace(target)
+                with made.path(VIDEO, row, f'videos/{key}', video_key=key).open('rb') as video, replacing(target) as file:
+                    copyfileobj(video, file)
     with replacing(task / TIMESTAMPS) as file:
         text = io.TextIOWrapper(file, 'utf-8', newline='')
         _write_timestamps(made, text)

@@ -45,7 +45,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import days, folder_of, name_of, robots
 from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.retry import backoff
+from shadowhound_data_logger.retry import backoff, steadily
 from shadowhound_data_logger.untrusted import from_json, visible
 
 if TYPE_CHECKING:
@@ -561,16 +561,8 @@ class Sink:
 
     def _patiently(self, ask: Callable[[], _Answer]) -> _Answer:
         """The answer, after so many tries. Raises what the last one raised."""
-        failures = 0
-        while True:
-            try:
-                return ask()
-            except SinkUnavailable as error:
-                failures += 1
-                if failures >= self.tries:
-                    raise
-                self.tell(f'{error.what}; trying again')
-                self.pause(backoff(failures, CAP_S, _rng))
+        return steadily(ask, tries=self.tries, cap_s=CAP_S, pause=self.pause, away=SinkUnavailable,
+                        failed=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
 
 
 class _Part(NamedTuple):
