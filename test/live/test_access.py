@@ -18,7 +18,7 @@ import pytest
 
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live.access import MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
-from shadowhound_data_logger.live.server import MOST_BODY, MOST_MESSAGE, MOST_VIEWERS, SECURITY, LiveServer, LiveSettings
+from shadowhound_data_logger.live.server import MOST_BODY, MOST_MESSAGE, MOST_VIEWERS, LiveServer, LiveSettings
 
 WHO = ('stranger', 'viewer', 'operator')
 UPGRADE = {'Connection': 'Upgrade', 'Upgrade': 'websocket', 'Sec-WebSocket-Version': '13',
@@ -95,6 +95,15 @@ async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.
 ACT = json.dumps({'do': 'flush'}).encode()
 LABEL = b'{"robot": "thor", "label": "x", "from": 5, "to": 5}'
 PULL = b'{"robot": "thor", "sensor": "x", "from": 5, "to": 6}'
+POLICY = {
+    'default-src': "'none'", 'script-src': "'self'", 'style-src': "'self'", 'img-src': "'self'", 'connect-src': "'self'",
+    'font-src': "'self'", 'manifest-src': "'self'", 'base-uri': "'none'", 'form-action': "'self'", 'frame-ancestors': "'none'",
+}  # fmt: skip
+"""What the page may load and who may frame it: nothing inline, nothing evaluated, nothing from elsewhere."""
+KEEPING_OUT = {
+    'X-Content-Type-Options': 'nosniff', 'X-Frame-Options': 'DENY', 'Referrer-Policy': 'no-referrer',
+    'Cross-Origin-Opener-Policy': 'same-origin', 'Cross-Origin-Resource-Policy': 'same-origin',
+}  # fmt: skip
 REBOUND = {'Host': 'evil.example:8765'}
 FOREIGN = {'Origin': 'http://evil.example'}
 CHUNKED = b'2000\r\n' + b'x' * 0x2000 + b'\r\n0\r\n\r\n'
@@ -167,6 +176,12 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
 )
 
 
+def policy(headers: dict[str, str]) -> dict[str, str]:
+    """Directive -> sources, of an answer's Content-Security-Policy."""
+    parts = (part.strip().partition(' ') for part in headers['Content-Security-Policy'].split(';'))
+    return {directive: sources for directive, _, sources in parts}
+
+
 def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each as a stranger, as a viewer and as an operator; every answer has the headers that keep others out."""
 
@@ -180,7 +195,8 @@ def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
                     found.append((case, given))
                     expected.append((case, status))
                     if given != 101:
-                        assert SECURITY.items() <= headers.items(), case
+                        assert policy(headers) == POLICY, case
+                        assert KEEPING_OUT.items() <= headers.items(), case
             assert found == expected
 
     asyncio.run(run())
