@@ -155,8 +155,11 @@ class Events:
             last=self._last,
         )  # fmt: skip
 
-    def trigger(self, name: str, by: str, detail: str | None = None, age_s: float = 0.0) -> Answer:
-        """Something happened, so long ago: begin an event, or make the one that goes on last longer. Names the bag."""
+    def trigger(self, name: str, by: str, detail: str | None = None, age_s: float = 0.0, who: str = '') -> Answer:
+        """Something happened, so long ago: begin an event, or make the one that goes on last longer. Names the bag.
+
+        ``who`` is the person who asked for it, where one is known.
+        """
         with self._lock:
             if not self._settings.enabled:
                 return False, 'no events: neither events.topics nor events.regex names a topic to keep'
@@ -165,7 +168,7 @@ class Events:
             self._triggers += 1
             now_s, event = self._monotonic(), self._current
             unset = self._place.unset() if event is None else event.unset
-            said = TriggerOf(name, by, max(0, self._place.now_ns(unset) - round(age_s * SECOND)), detail or None)
+            said = TriggerOf(name, by, max(0, self._place.now_ns(unset) - round(age_s * SECOND)), detail or None, who or None)
             if event is None:
                 event = self._current = self._begin([said], now_s - age_s)
                 self._ended.clear()

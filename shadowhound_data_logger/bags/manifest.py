@@ -14,7 +14,8 @@ fields are a later version's, and ignored.
 ``event`` is what made the bag of an event, in the order of the triggers:
 
     {"name": "low_battery", "pre_s": 30.0, "held_s": 30.0, "post_s": 10.0,
-     "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "low_battery: ...soc < 20: 19"}]}
+     "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "low_battery: ...soc < 20: 19", "who": null},
+                  {"name": "fall", "by": "page", "at_ns": 2, "detail": null, "who": "operator at 192.168.1.7"}]}
 
 ``clock`` is null where the clock of the machine was set. Else all times of the bag are by the clock as it was, and to make UTC
 of them ``offset_ns`` is to be added (null with ``known`` ``unset``: nobody knows); ``wall_ns`` and ``boot_ns`` are what that
@@ -57,12 +58,17 @@ class MissionOf:
 
 @dataclass(frozen=True, slots=True)
 class TriggerOf:
-    """What asked for an event: ``by`` is ``service``, ``log_event`` or ``condition``; ``at_ns`` is Unix nanoseconds."""
+    """What asked for an event.
+
+    ``by`` is ``command``, ``service``, ``page``, ``log_event`` or ``condition``; ``at_ns`` is Unix nanoseconds.
+    """
 
     name: str
     by: str
     at_ns: int
     detail: str | None
+    who: str | None = None
+    """The person who asked for it, where the page knows one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +201,10 @@ def read_mission(one: JsonObject) -> MissionOf:
 def read_event(one: JsonObject) -> EventOf:
     """Whatever an agent calls an event."""
     triggers = tuple(
-        TriggerOf(each.text('name', is_any=True), each.text('by'), each.count('at_ns'), each.text_or_none('detail'))
+        TriggerOf(each.text('name', is_any=True), each.text('by'), each.count('at_ns'), each.text_or_none('detail'),
+                  each.text_or_none('who'))
         for each in one.objects('triggers')
-    )
+    )  # fmt: skip
     return EventOf(one.text('name'), one.number('pre_s'), one.number('held_s'), one.number('post_s'), triggers)
 
 

@@ -33,7 +33,7 @@ MOST_NAME: Final = 100
 YIELD_S: Final = 5.0
 """For so long uploads yield to whoever watches, unless it is asked for again: a live page that was killed slows nothing down."""
 WHO: Final = 'who'
-"""With any request: whom somebody asks for, to be said in the log."""
+"""With any request: whom somebody asks for, to be said in the log and in the manifest of an event."""
 MOST_NOTE: Final = 1000
 """Letters of what is said of it."""
 
@@ -52,6 +52,7 @@ class _Command:
     arguments: Mapping[str, type] = field(default_factory=dict)
     quiet: bool = False
     """Whether a success is worth no line in the log: it only tells something, or whoever does it says so."""
+    takes_who: bool = False
 
 
 class Commands:
@@ -77,7 +78,7 @@ class Commands:
             'bag split': _Command(recorder.split),
             'bag pause': _Command(lambda: recorder.pause(paused=True)),
             'bag resume': _Command(lambda: recorder.pause(paused=False)),
-            'event': _Command(self._trigger, {'name': str, 'note': str, 'by': str}, quiet=True),
+            'event': _Command(self._trigger, {'name': str, 'note': str, 'by': str}, quiet=True, takes_who=True),
             'pull': _Command(self._pull, {'want': dict, 'cancel': str, 'by': str}),
             'yield': _Command(self._yield, {'max_mbps': float}, quiet=True),
             'set': _Command(self._set, {'values': dict}, quiet=True),
@@ -117,7 +118,7 @@ class Commands:
                 return False, f'{name} takes {takes}, and no {key[:MOST_NAME]!r}'
             if not isinstance(value, kind):
                 return False, f'{key} of {name} is {_KINDS[kind]}, not {str(value)[:MOST_NAME]!r}'
-        done = command.do(**arguments)
+        done = command.do(**arguments, **({WHO: who} if command.takes_who else {}))
         if not isinstance(done, dict) and (who or not (done[0] and command.quiet)):
             log.log(logging.INFO if done[0] else logging.WARNING, '%s%s: %s', who and f'{who}: ', name, done[1])
         return done
@@ -153,13 +154,13 @@ class Commands:
         _, spooled = self._flush(end_s - time.monotonic())
         return True, f'paused: messages are counted and not stored, delivery continues; {spooled}'
 
-    def _trigger(self, name: str = MANUAL, note: str = '', by: str = ASKERS[0]) -> Answer:
+    def _trigger(self, name: str = MANUAL, note: str = '', by: str = ASKERS[0], who: str = '') -> Answer:
         """Begin an event, or make the one that goes on last longer; names the bag."""
         if not 0 < len(name) <= MOST_NAME or len(note) > MOST_NOTE:
             return False, f'an event has a name of 1 to {MOST_NAME} letters, and a note of up to {MOST_NOTE}'
         if by not in ASKERS:
             return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MOST_NAME]!r}'
-        return self._stages.event_buffer.events.trigger(name, by, note)
+        return self._stages.event_buffer.events.trigger(name, by, note, who=who)
 
     def _pull(self, want: Mapping[str, Any] | None = None, cancel: str = '', by: str = MANUAL) -> Answer | dict[str, Any]:
         """Ask for what is kept here, or take a request back."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from bags.eventing import buffer, hear_each_second, in_bag, only_bag
 from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission
+from spool.making import NOON_NS
 
 from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.queue import Lot
@@ -35,6 +36,20 @@ def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['missed'], row['dropped']) == (8, 8, 0, 0, {})
         assert not list(it.root.iterdir())
+
+
+def test_the_manifest_says_who_asked_for_it(tmp_path: Path) -> None:
+    """Of each trigger the operator at the page, beside when it was; nobody is named where nobody is known."""
+    with buffer(tmp_path) as it:
+        hear_each_second(it, range(10))
+        it.events.trigger('fall', 'page', 'on the stairs', who='operator at 192.0.2.7')
+        hear_each_second(it, range(10, 11))
+        it.events.trigger('low_battery', 'condition')
+        hear_each_second(it, range(11, 15))
+        it.written()
+        first, second = manifest(it.objects(), only_bag(it))['event']['triggers']
+        assert (first['by'], first['who'], second['who']) == ('page', 'operator at 192.0.2.7', None)
+        assert first['at_ns'] == NOON_NS
 
 
 def test_what_was_on_its_way_for_a_while_counts_from_when_it_happened(tmp_path: Path) -> None:

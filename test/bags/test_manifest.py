@@ -54,9 +54,15 @@ def test_the_fields_that_others_read() -> None:
 def test_what_made_an_event_comes_back() -> None:
     """Each trigger with its time; a manifest of before there were events has none, and damage is told with its place."""
     event = EventOf(
-        'fall', 30.0, 12.5, 10.0, (TriggerOf('fall', 'service', 7, None), TriggerOf('low', 'condition', 8, 'soc < 20: 19'))
-    )
+        'fall', 30.0, 12.5, 10.0,
+        (TriggerOf('fall', 'page', 7, None, 'operator at ::1'), TriggerOf('low', 'condition', 8, 'soc < 20: 19')),
+    )  # fmt: skip
     assert Manifest.from_json(replace(WHOLE, event=event).to_json()).event == event
+    found = json.loads(replace(WHOLE, event=event).to_json())
+    del found['event']['triggers'][0]['who']  # as versions wrote it that knew nobody
+    before = Manifest.from_json(json.dumps(found).encode()).event
+    assert before is not None
+    assert before.triggers[0] == TriggerOf('fall', 'page', 7, None)
     found = json.loads(WHOLE.to_json())
     del found['event']
     assert Manifest.from_json(json.dumps(found).encode()).event is None

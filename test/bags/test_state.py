@@ -20,7 +20,10 @@ from shadowhound_data_logger.mcap.writer import SliceWriter
 
 IMU = Channel('/imu', 'x/msg/Y', 'ros2msg', 'float32 x', 'RIHS01_0', '- history: 1')
 POSE = Channel('/pose', 'x/msg/Z', 'ros2msg', 'float32 z', 'RIHS01_1', '')
-EVENT = EventOf('fall', 5.0, 4.5, 2.0, (TriggerOf('fall', 'service', 7, None), TriggerOf('again', 'condition', 9, 'x > 1')))
+EVENT = EventOf(
+    'fall', 5.0, 4.5, 2.0,
+    (TriggerOf('fall', 'page', 7, None, 'operator at ::1'), TriggerOf('again', 'condition', 9, 'x > 1')),
+)  # fmt: skip
 CLOCK = ClockOf('unset', 'boot', 60, 70, None)
 
 

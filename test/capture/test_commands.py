@@ -68,8 +68,8 @@ class Stages:
     def yield_to(self, *given: float) -> None:
         self.asked.append(given)
 
-    def trigger(self, *given: str) -> tuple[bool, str]:
-        self.asked.append(given)
+    def trigger(self, *given: str, who: str) -> tuple[bool, str]:
+        self.asked.append((*given, who))
         return True, 'event_1 begins'
 
     def status(self) -> dict[str, Any]:
@@ -244,7 +244,7 @@ def test_an_event_has_a_name_and_a_note() -> None:
     commands = stages.commands()
     assert ask(commands, 'event', name='fall', note='on the stairs') == (True, 'event_1 begins')
     commands.answer(TRIGGERS['~/event/trigger'])
-    assert stages.asked == [('fall', 'command', 'on the stairs'), ('manual', 'service', '')]
+    assert stages.asked == [('fall', 'command', 'on the stairs', ''), ('manual', 'service', '', '')]
 
 
 def test_what_it_tells() -> None:
@@ -273,12 +273,12 @@ def test_what_changes_something_is_logged(caplog: pytest.LogCaptureFixture) -> N
 
 
 def test_whom_somebody_asks_for_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """Also where a success is worth no line otherwise; whatever is in the name, it stays one line."""
+    """Also where a success is worth no line otherwise, and goes on to the event; whatever is in the name, it stays one line."""
     caplog.set_level(logging.INFO)
     stages = Stages()
     assert ask(stages.commands(), 'event', name='fall', by='page', who='operator at 10.0.0.7') == (True, 'event_1 begins')
     assert ask(stages.commands(), 'bag stop', who='a\nb' * 1000)[0] is False
-    assert stages.asked == [('fall', 'page', '')]
+    assert stages.asked == [('fall', 'page', '', 'operator at 10.0.0.7')]
     first, second = (record.getMessage() for record in caplog.records)
     assert first == 'operator at 10.0.0.7: event: event_1 begins'
     assert '\n' not in second

@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import aiohttp
@@ -198,6 +199,26 @@ def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
                         assert policy(headers) == POLICY, case
                         assert KEEPING_OUT.items() <= headers.items(), case
             assert found == expected
+
+    asyncio.run(run())
+
+
+def test_the_node_is_told_of_each_act_whose_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The operator and the address, for its log and for the manifest of an event; the page cannot say another name."""
+    asked: list[tuple[str, dict[str, str]]] = []
+
+    def ask(do: str, **given: str) -> dict[str, Any]:
+        asked.append((do, given))
+        return {'ok': True}
+
+    monkeypatch.setattr(module, 'connect', lambda *_: SimpleNamespace(ask=ask, close=lambda: None))
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            for do in ('flush', 'pause', 'resume', 'bag start', 'bag stop', 'bag split', 'event'):
+                assert (await page.ask('operator', 'POST', '/api/act', body=json.dumps({'do': do}).encode()))[0] == 200
+                by = {'by': 'page'} if do == 'event' else {}
+                assert asked.pop() == (do, {'who': 'operator at 127.0.0.1', **by})
 
     asyncio.run(run())
 
