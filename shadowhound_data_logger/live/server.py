@@ -694,7 +694,7 @@ class LiveServer:
     async def _tell_doctor(self, _: web.Request) -> web.StreamResponse:
         async with self._examining:
             if self._doctor is None or time.monotonic() - self._doctor[0] > DOCTOR_S:
-                self._doctor = time.monotonic(), await _examine()
+                self._doctor = time.monotonic(), await _examine(self._settings.spool.absolute(), self._settings.robot)
         return _json(self._doctor[1])
 
     # -- a viewer --------------------------------------------------------------------------------------------------
@@ -933,11 +933,14 @@ def _quicken(request: web.Request) -> None:
             connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)
 
 
-async def _examine() -> dict[str, Any]:
-    """What ``shadowhound-data doctor --json`` says, in a process of its own."""
+async def _examine(spool: Path, robot: str) -> dict[str, Any]:
+    """What ``shadowhound-data doctor --json`` says of the node that has this spool, in a process of its own."""
+    if spool.name != 'spool':
+        return {'error': f'the doctor examines a node, which has its spool in SHADOWHOUND_HOME/spool, and not {spool}'}
     process = await asyncio.create_subprocess_exec(
         sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'doctor', '--json', stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL, env=dict(os.environ),
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
+        env={**os.environ, 'SHADOWHOUND_HOME': str(spool.parent), 'SHADOWHOUND_ROBOT': robot},
     )  # fmt: skip
     try:
         out, _ = await asyncio.wait_for(process.communicate(), 60.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -51,3 +52,30 @@ def test_items_of_every_size_arrive_whole(tmp_path: Path, monkeypatch: pytest.Mo
 
     expected: list[tuple[str, int, Any]] = [(item.topic, (item.head or {})['number'], item.body) for item in (*small, large)]
     assert asyncio.run(run()) == expected
+
+
+def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not that of the variables with which the page was started: the home of its spool, and its robot."""
+    doctor = tmp_path / 'doctor'
+    said = """'{"asked": "%s", "home": "%s", "robot": "%s"}' "$*" "$SHADOWHOUND_HOME" "$SHADOWHOUND_ROBOT\""""
+    doctor.write_text(f'#!/bin/sh\nprintf {said}\n')
+    doctor.chmod(0o700)
+    monkeypatch.setattr(sys, 'executable', str(doctor))
+    monkeypatch.setattr(module, 'find_spec', lambda _: None)  # no ROS here
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path / 'elsewhere'))
+    monkeypatch.setenv('SHADOWHOUND_ROBOT', 'another')
+
+    async def told(spool: Path) -> dict[str, Any]:
+        server = LiveServer(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0))
+        await server.open()
+        try:
+            async with aiohttp.ClientSession() as session, session.get(f'http://127.0.0.1:{server.port}/api/doctor') as answer:
+                found: dict[str, Any] = await answer.json()
+                return found
+        finally:
+            await server.close()
+
+    found = asyncio.run(told(tmp_path / 'home' / 'spool'))
+    assert found['doctor']['asked'].endswith('doctor --json')
+    assert (found['doctor']['home'], found['doctor']['robot']) == (str(tmp_path / 'home'), 'thor')
+    assert 'has its spool in SHADOWHOUND_HOME/spool' in asyncio.run(told(tmp_path / 'copy'))['error']
