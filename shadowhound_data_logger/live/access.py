@@ -1,30 +1,38 @@
 """Who may see the page and who may act: tokens, sign-ins, and which requests are this page's own.
 
 Two roles have a token each, in files of mode 0600 beside the spool. A sign-in is a cookie that the token signs (HMAC-SHA256), so
-it outlives the process and ends when the token's file is replaced. No token is ever in a URL.
+it outlives the process, and ends when the token's file is replaced or may be read by others. A file beside the tokens says what
+was signed out. No token is ever in a URL.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import logging
 import os
 import secrets
 import socket
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
+from shadowhound_data_logger.durable_files import flock, replacing, sync
 from shadowhound_data_logger.errors import DataLoggerError
+
+log = logging.getLogger(__name__)
 
 VIEWER, OPERATOR = 'viewer', 'operator'
 ROLES: Final = (OPERATOR, VIEWER)
 RTSP_FILE: Final = 'rtsp.password'
+ENDED_FILE: Final = 'ended'
 COOKIE: Final = 'shadowhound_live'
 LASTS_S: Final = 12 * 3600
 """A sign-in."""
@@ -34,6 +42,8 @@ FAILURES_S: Final = 60.0
 MOST_ADDRESSES: Final = 1000
 LEAST_TOKEN: Final = 16
 """Letters of a token that somebody wrote into the file."""
+MOST_ENDED: Final = 1000
+"""Sign-ins that were signed out and are remembered one by one, in 28 bytes each."""
 
 
 class TokenRefused(DataLoggerError):
@@ -49,6 +59,8 @@ class SignIn:
     role: str
     nonce: str = ''
     """Of the cookie; empty for somebody of this machine who has none."""
+    expires: int = 0
+    """Of the cookie, Unix seconds."""
     csrf: str = ''
     """What a request that acts has to bring along in a header."""
 
@@ -98,8 +110,106 @@ def token_of(path: Path) -> str:
     return token
 
 
+class _Ended:
+    """Sign-ins that were signed out, in a file that outlives the process as their cookies do.
+
+    Its lines: the SHA-256 of the rest, a time ``until``, and for each sign-in when its cookie expires and its nonce. Whatever
+    expires no later than ``until`` counts as signed out. So an entry may leave, once it has expired or when there are too many,
+    and lets nobody in again, not even when the clock is set back.
+
+    A damaged file could have named anybody: all sign-ins of before count as signed out then, the log says so, and whoever has a
+    token signs in again. A file that is missing names nobody: the first sign-out makes it.
+
+    ``keep`` waits for the disk and is for any thread, all else for the event loop; ``_lock`` guards changes of what is known.
+    Several pages that share the tokens share the file too.
+    """
+
+    def __init__(self, path: Path, now: Callable[[], float]) -> None:
+        self._path = path
+        self._now = now
+        self._lock = threading.Lock()
+        self._seen: tuple[int, ...] = ()
+        self._known: dict[str, int] = {}
+        self._until = 0
+
+    def has(self, nonce: str, expires: int) -> bool:
+        """Whether the sign-in that expires then was signed out."""
+        self._refresh()
+        return nonce in self._known or expires <= self._until  # in this order: an entry leaves once ``_until`` counts it
+
+    def expiry(self) -> int:
+        """When a sign-in of now expires."""
+        self._refresh()
+        return max(int(self._now()) + LASTS_S, self._until + 1)
+
+    def add(self, nonce: str, expires: int) -> None:
+        """In this process at once; ``keep`` makes it last."""
+        self._merge({nonce: expires})
+
+    def keep(self) -> None:
+        """Write all that is known here and in the file. Raises OSError."""
+        with flock(self._path.with_name(f'{self._path.name}.lock')):
+            self._look()
+            with self._lock:
+                lines = [str(self._until), *(f'{expires} {nonce}' for nonce, expires in self._known.items())]
+            body = '\n'.join(lines).encode()
+            with replacing(self._path, is_synced=True, mode=0o600) as file:
+                file.write(sha256(body).hexdigest().encode() + b'\n' + body)
+            sync(self._path.parent)
+
+    def _refresh(self) -> None:
+        """Know what the file says; put a good one in the place of a damaged one."""
+        if self._look():
+            try:
+                self.keep()
+            except OSError as error:
+                log.error('%s cannot be written: %s', self._path, error)  # noqa: TRY400 - an operator's matter
+
+    def _look(self) -> bool:
+        """Take in what the file says, if it is another one than before; whether it is damaged."""
+        seen: tuple[int, ...] = ()
+        with suppress(OSError):
+            about = self._path.stat()
+            seen = about.st_ino, about.st_mtime_ns, about.st_size
+        if seen == self._seen:
+            return False
+        known, until, is_damaged = dict[str, int](), 0, False
+        try:
+            until, known = _ended_in(self._path.read_bytes())
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError) as error:
+            log.warning('%s is damaged (%s): all sign-ins until now have ended, and whoever has a token signs in again',
+                        self._path, error)  # fmt: skip
+            until, is_damaged = int(self._now()) + LASTS_S, True
+        self._merge(known, until)
+        self._seen = seen
+        return is_damaged
+
+    def _merge(self, known: Mapping[str, int], until: int = 0) -> None:
+        with self._lock:
+            self._until = max(self._until, until)
+            self._known |= known
+            now = self._now()
+            for nonce, expires in sorted(self._known.items(), key=lambda each: each[1]):
+                if expires > now and len(self._known) <= MOST_ENDED:
+                    break
+                self._until = max(self._until, expires)
+                del self._known[nonce]
+
+
+def _ended_in(content: bytes) -> tuple[int, dict[str, int]]:
+    """Raises ValueError for what ``_Ended`` did not write."""
+    digest, _, body = content.partition(b'\n')
+    if sha256(body).hexdigest().encode() != digest:
+        raise ValueError('its hash does not fit')
+    until, *lines = body.decode().split('\n')
+    entries = [line.split(' ') for line in lines]
+    return int(until), {nonce: int(expires) for expires, nonce in entries}
+
+
 class Access:
-    """Decides who may do what. Used by the event loop alone.
+    """Decides who may do what. Used by the event loop alone, but for ``keep``.
 
     ``is_open``: whoever reaches the page may watch, which holds for a page that listens on the loopback alone.
     """
@@ -109,17 +219,19 @@ class Access:
         self._is_open = is_open
         self._now = now
         self._failures: dict[str, deque[float]] = {}
-        self._ended: dict[str, float] = {}
+        self._refused: dict[str, str] = {}
+        self._ended = _Ended(tokens[VIEWER].with_name(ENDED_FILE), now)
 
     def sign_in(self, token: str, address: str) -> tuple[SignIn, str] | None:
         """Of whoever knows a token, with the cookie; None for a wrong one."""
         given = _bytes(token)
         for role in ROLES:
-            if hmac.compare_digest(given, self._token(role).encode()):
-                nonce, until = secrets.token_urlsafe(12), int(self._now()) + LASTS_S
-                text = f'{role}.{until}.{nonce}'
-                self._failures.pop(address, None)
-                return self._of(role, nonce), f'{text}.{self._sign(role, text)}'
+            with suppress(TokenRefused):  # the other role's may be good
+                if hmac.compare_digest(given, self._token(role).encode()):
+                    nonce, expires = secrets.token_urlsafe(12), self._ended.expiry()
+                    text = f'{role}.{expires}.{nonce}'
+                    self._failures.pop(address, None)
+                    return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
         self._fail(address)
         return None
 
@@ -136,48 +248,68 @@ class Access:
     def who(self, cookie: str | None) -> SignIn | None:
         """Who has this cookie; None where nobody may watch who has none."""
         parts = (cookie or '').split('.')
-        if len(parts) == 4 and parts[0] in ROLES and parts[1].isdecimal() and len(parts[1]) < 12:
+        if len(parts) == 4:
             role, until, nonce, signature = parts
-            is_signed = hmac.compare_digest(_bytes(signature), self._sign(role, f'{role}.{until}.{nonce}').encode())
-            if is_signed and int(until) > self._now() and nonce not in self._ended:
-                return self._of(role, nonce)
+            with suppress(TokenRefused):
+                if self._is_good(role, until, nonce, f'{role}.{until}.{nonce}', signature):
+                    return self._of(role, nonce, int(until))
         return SignIn(VIEWER) if self._is_open else None
 
     def sign_out(self, who: SignIn) -> None:
-        """Its cookie is worth nothing from now on."""
-        now = self._now()
-        self._ended = {nonce: until for nonce, until in self._ended.items() if until > now}
+        """Its cookie and its tickets are worth nothing from now on; ``keep`` makes that last."""
         if who.nonce:
-            self._ended[who.nonce] = now + LASTS_S
+            self._ended.add(who.nonce, who.expires)
+
+    def keep(self) -> None:
+        """Write down who was signed out; waits for the disk, in any thread. Raises OSError."""
+        self._ended.keep()
 
     def ticket(self, who: SignIn, address: str) -> str:
-        """What lets a program at this address watch, and nothing else, for as long as a sign-in lasts: it may stand in a URL."""
-        text = f'{who.role}.{int(self._now()) + LASTS_S}.{who.nonce}'
+        """What lets a program at this address watch, and nothing else, for as long as the sign-in lasts: it may stand in a URL.
+
+        Raises TokenRefused.
+        """
+        text = f'{who.role}.{who.expires or self._ended.expiry()}.{who.nonce}'
         return f'{text}.{self._sign(who.role, f"ticket.{text}.{address}")}'
 
     def of_ticket(self, ticket: str, address: str) -> str | None:
         """The nonce of the sign-in that asked for this ticket; None for one that is worth nothing."""
         parts = ticket.split('.')
-        if len(parts) != 4 or parts[0] not in ROLES or not parts[1].isdecimal() or len(parts[1]) >= 12:
-            return None
-        role, until, nonce, signature = parts
-        expected = self._sign(role, f'ticket.{role}.{until}.{nonce}.{address}')
-        is_signed = hmac.compare_digest(_bytes(signature), expected.encode())
-        return nonce if is_signed and int(until) > self._now() and nonce not in self._ended else None
+        if len(parts) == 4:
+            role, until, nonce, signature = parts
+            with suppress(TokenRefused):
+                if self._is_good(role, until, nonce, f'ticket.{role}.{until}.{nonce}.{address}', signature):
+                    return nonce
+        return None
 
     def is_csrf(self, who: SignIn, given: str) -> bool:
         """Whether a request that acts comes from the page itself."""
         return bool(who.csrf) and hmac.compare_digest(who.csrf.encode(), _bytes(given))
 
-    def _of(self, role: str, nonce: str) -> SignIn:
-        return SignIn(role, nonce, self._sign(role, f'csrf.{nonce}'))
+    def _is_good(self, role: str, until: str, nonce: str, text: str, signature: str) -> bool:
+        """Whether the token of the role signed this text, which has not expired and was not signed out. Raises TokenRefused."""
+        if role not in ROLES or not until.isdecimal() or len(until) >= 12:
+            return False
+        is_signed = hmac.compare_digest(_bytes(signature), self._sign(role, text).encode())
+        return is_signed and int(until) > self._now() and not self._ended.has(nonce, int(until))
+
+    def _of(self, role: str, nonce: str, expires: int) -> SignIn:
+        return SignIn(role, nonce, expires, self._sign(role, f'csrf.{nonce}'))
 
     def _sign(self, role: str, text: str) -> str:
         return hmac.new(self._token(role).encode(), _bytes(text), sha256).hexdigest()
 
     def _token(self, role: str) -> str:
-        """Read anew each time: whoever replaces the file ends all sign-ins."""
-        return token_of(self._paths[role])
+        """Read anew each time: whoever replaces the file ends all sign-ins. Raises TokenRefused, which the log says once."""
+        try:
+            token = token_of(self._paths[role])
+        except TokenRefused as error:
+            if self._refused.get(role) != str(error):
+                self._refused[role] = str(error)
+                log.warning('nobody is signed in as %s any more: %s', role, error)
+            raise
+        self._refused.pop(role, None)
+        return token
 
     def _fail(self, address: str) -> None:
         if len(self._failures) > MOST_ADDRESSES:

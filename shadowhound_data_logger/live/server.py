@@ -13,7 +13,7 @@ import socket
 import ssl
 import sys
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
@@ -37,6 +37,7 @@ from shadowhound_data_logger.live.access import (
     Access,
     OwnNames,
     SignIn,
+    TokenRefused,
     is_loopback,
     is_same_origin,
     make_tokens,
@@ -76,6 +77,8 @@ MOST_WATCHED: Final = 16
 FIGURES_S: Final = 1.0
 LEDGER_EVERY: Final = 2
 """The ledger is read with each second status."""
+ASK_AGAIN_EVERY: Final = 5
+"""Whether those who watch still may is asked with each fifth status."""
 SEND_BUFFER: Final = 32 << 10
 LEASE_EVERY_S: Final = 2.0
 DOCTOR_S: Final = 60.0
@@ -135,6 +138,7 @@ class _Connected:
 
     ws: web.WebSocketResponse
     viewer: Viewer
+    cookie: str | None
     who: SignIn
     address: str
     at: str
@@ -175,9 +179,10 @@ class _Connected:
 
 @dataclass(eq=False)
 class _Foxglove:
-    """A client that speaks Foxglove's protocol, by whose sign-in it is here, and from where."""
+    """A client that speaks Foxglove's protocol, by which ticket and whose sign-in it is here, and from where."""
 
     client: FoxgloveClient
+    ticket: str
     nonce: str
     address: str
     protocol: asyncio.BaseProtocol
@@ -259,9 +264,7 @@ class LiveServer:
             self._ticker.cancel()
             with suppress(asyncio.CancelledError):
                 await self._ticker
-        for tasks in [one.tasks for one in self._viewers] + [one.tasks for one in self._foxgloves]:
-            for task in tasks:
-                task.cancel()
+        _end((*self._viewers, *self._foxgloves))
         if self._listening is not None:
             self._listening.close()
         if self._runner is not None:
@@ -339,10 +342,12 @@ class LiveServer:
         for each in [each for each, since_s in self._silent.items() if since_s < before_s]:
             self._drop(each)
 
-        for one in self._viewers:
-            if one.heard_s < time.monotonic() - SILENT_S:
-                for task in one.tasks:
-                    task.cancel()
+        _end(one for one in self._viewers if one.heard_s < time.monotonic() - SILENT_S)
+
+    def _end_unknown(self) -> None:
+        """A connection outlives neither the sign-in that it came by nor the token that signed it."""
+        _end(one for one in self._viewers if self._access.who(one.cookie) != one.who)
+        _end(one for one in self._foxgloves if self._access.of_ticket(one.ticket, one.address) is None)
 
     def _drop(self, handler: Any) -> None:
         self._silent.pop(handler, None)
@@ -430,12 +435,14 @@ class LiveServer:
                     source.wake()
 
     async def _tick(self) -> None:
-        """Once a second: the figures, the sizes, the lease, and threads that died."""
+        """Once a second: the figures, the sizes, the lease, who may no longer watch, and threads that died."""
         rounds = 0
         lease_s = 0.0
         while True:
             began_s = time.monotonic()
             self._drop_silent()
+            if rounds % ASK_AGAIN_EVERY == 0:
+                self._end_unknown()
             if self._topics is not None:
                 self._topics.worker.look()
             if self._video is not None:
@@ -566,11 +573,14 @@ class LiveServer:
         if not self._access.is_csrf(who, request.headers.get('X-CSRF-Token', '')):
             return _problem(403, 'the request does not come from this page')
         self._access.sign_out(who)
-        of_it = [one.tasks for one in self._viewers if one.who.nonce == who.nonce]
-        for tasks in of_it + [one.tasks for one in self._foxgloves if one.nonce == who.nonce]:
-            for task in tasks:
-                task.cancel()
-        response = _json({})
+        _end(one for one in self._viewers if one.who.nonce == who.nonce)
+        _end(one for one in self._foxgloves if one.nonce == who.nonce)
+        try:
+            await asyncio.to_thread(self._access.keep)
+            response = _json({})
+        except OSError as error:
+            log.error('a sign-out is forgotten when this page restarts: %s', error)  # noqa: TRY400 - an operator's matter
+            response = _problem(503, 'signed out until this page restarts: the disk refused it; --new-tokens ends it for good')
         response.del_cookie(COOKIE)
         return response
 
@@ -704,7 +714,8 @@ class LiveServer:
             return _problem(429, f'{MOST_VIEWERS} viewers are here, which is the most there may be', {'Retry-After': '10'})
         ws = web.WebSocketResponse(max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
-        one = _Connected(ws, Viewer(), self._who(request), request.remote or '', own[0] if own else '', request.protocol)
+        one = _Connected(ws, Viewer(), request.cookies.get(COOKIE), self._who(request), request.remote or '',
+                         own[0] if own else '', request.protocol)  # fmt: skip
         self._viewers.add(one)  # before anything waits: the cap counts those that are coming
         try:
             await ws.prepare(request)
@@ -738,12 +749,16 @@ class LiveServer:
         """The address for a Foxglove at the same machine as this viewer."""
         if self._settings.is_of_store:
             return _problem(404, "Foxglove gets topics from the robot's own page")
-        return _json({'path': f'/foxglove?ticket={self._access.ticket(self._who(request), request.remote or "")}'})
+        try:
+            return _json({'path': f'/foxglove?ticket={self._access.ticket(self._who(request), request.remote or "")}'})
+        except TokenRefused as error:
+            return _problem(503, str(error))
 
     async def _foxglove(self, request: web.Request) -> web.StreamResponse:
         """A client that speaks Foxglove's protocol. Its ticket, which no foreign page knows, stands for sign-in and origin."""
         address = request.remote or ''
-        nonce = self._access.of_ticket(request.query.get('ticket', ''), address)
+        ticket = request.query.get('ticket', '')
+        nonce = self._access.of_ticket(ticket, address)
         if nonce is None:
             return _problem(401, 'this address has ended, or is not for this machine: ask the page for another')
         if len(self._foxgloves) >= MOST_FOXGLOVES:
@@ -751,7 +766,7 @@ class LiveServer:
         ws = web.WebSocketResponse(
             protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0, heartbeat=SILENT_S
         )
-        one = _Foxglove(FoxgloveClient(self._settings.robot, self._session_id), nonce, address, request.protocol)
+        one = _Foxglove(FoxgloveClient(self._settings.robot, self._session_id), ticket, nonce, address, request.protocol)
         self._foxgloves.add(one)
         try:
             await ws.prepare(request)
@@ -831,6 +846,12 @@ class LiveServer:
             tell({'problem': self.no_video})
         else:
             await self._video.take(one, said, (one.at, one.address), tell)
+
+
+def _end(connections: Iterable[_Connected | _Foxglove]) -> None:
+    """Without a farewell, for which one that reads nothing would be waited for."""
+    for task in [task for one in connections for task in one.tasks]:
+        task.cancel()
 
 
 def _message_header(size: int) -> bytes:

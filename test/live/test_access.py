@@ -7,7 +7,8 @@ import json
 import logging
 import re
 import stat
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
@@ -17,8 +18,10 @@ from typing import Any
 import aiohttp
 import pytest
 
+from shadowhound_data_logger.live import access as access_module
 from shadowhound_data_logger.live import server as module
-from shadowhound_data_logger.live.access import MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
+from shadowhound_data_logger.live.access import ENDED_FILE, LASTS_S, MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
+from shadowhound_data_logger.live.foxglove import PROTOCOLS
 from shadowhound_data_logger.live.server import MOST_BODY, MOST_MESSAGE, MOST_VIEWERS, LiveServer, LiveSettings
 
 WHO = ('stranger', 'viewer', 'operator')
@@ -75,6 +78,19 @@ class Page:
         writer.close()
         fields = dict(line.split(': ', 1) for line in head.decode().split('\r\n')[1:] if ': ' in line)
         return int(head.split()[1]), fields, answer or b''
+
+
+async def ended(ws: aiohttp.ClientWebSocketResponse) -> None:
+    """Wait until the server has ended it."""
+    while not ws.closed:
+        await ws.receive(60.0)
+
+
+async def answers(ws: aiohttp.ClientWebSocketResponse, ping: int) -> None:
+    """Wait until a viewer's ping is answered, which it is while the viewer may watch."""
+    await ws.send_json({'ping': ping})
+    while f'"ping":{ping},'.encode() not in (await ws.receive_bytes(timeout=60.0)):
+        pass
 
 
 @asynccontextmanager
@@ -255,6 +271,132 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
     asyncio.run(run())
 
 
+def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At once all tabs of that browser and its Foxglove; those of another sign-in with the same token go on."""
+    monkeypatch.setattr(module, 'FIGURES_S', 3600.0)  # nobody else looks who may watch
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
+            gone = {'Cookie': f'shadowhound_live={page.cookies["viewer"]}'}
+            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
+            foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
+            tabs = [await session.ws_connect(f'{page.origin}/ws', headers=gone) for _ in range(2)]
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 200
+            signed_out = page.cookies['viewer'], page.csrf['viewer']
+            await page.sign_in('viewer')
+            stays = {'Cookie': f'shadowhound_live={page.cookies["viewer"]}'}
+            other = await session.ws_connect(f'{page.origin}/ws', headers=stays)
+            page.cookies['viewer'], page.csrf['viewer'] = signed_out
+            assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
+            for each in (*tabs, foxglove):
+                await ended(each)
+            await answers(other, 5)
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(f'{page.origin}/ws', headers=gone)
+            assert refused.value.status == 401
+            await other.close()
+
+    asyncio.run(run())
+
+
+def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the page: the cookie and the ticket for Foxglove stay worth nothing, and nobody else has to sign in again."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
+            async with aiohttp.ClientSession() as session:
+                foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
+                assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
+                await ended(foxglove)
+            assert stat.S_IMODE((page.folder / ENDED_FILE).stat().st_mode) == 0o600
+            cookies = dict(page.cookies)
+        async with serving(tmp_path, monkeypatch) as page:
+            page.cookies = cookies
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
+            assert (await page.ask('stranger', 'GET', path))[0] == 401
+            assert (await page.ask('operator', 'GET', '/api/session'))[0] == 200
+
+    asyncio.run(run())
+
+
+def test_a_sign_out_that_the_disk_refuses_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It holds until the page restarts; whoever signs out and the log are told that it does not for longer."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            (page.folder / f'{ENDED_FILE}.part').mkdir()
+            status, _, body = await page.ask('viewer', 'POST', '/api/sign-out')
+            assert (status, b'until this page restarts' in body) == (503, True)
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
+            assert 'a sign-out is forgotten' in caplog.text
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize('how', ['new tokens', 'others may read it', 'it is gone', 'twelve hours'])
+def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    """A viewer and a Foxglove, within some rounds; they cannot come back by it. The other role goes on if its token is good."""
+    monkeypatch.setattr(module, 'FIGURES_S', 0.01)
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
+            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
+            cookies = {who: {'Cookie': f'shadowhound_live={page.cookies[who]}'} for who in ('viewer', 'operator')}
+            viewer = await session.ws_connect(f'{page.origin}/ws', headers=cookies['viewer'])
+            operator = await session.ws_connect(f'{page.origin}/ws', headers=cookies['operator'])
+            foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
+            await answers(viewer, 1)
+            await answers(operator, 1)
+            token = page.folder / 'viewer.token'
+            if how == 'new tokens':
+                make_tokens(page.folder, anew=True)
+            elif how == 'others may read it':
+                token.chmod(0o644)
+            elif how == 'it is gone':
+                token.unlink()
+            else:
+                monkeypatch.setattr(page.server._access, '_now', lambda: time.time() + LASTS_S)
+            await ended(viewer)
+            await ended(foxglove)
+            is_of_all = how in ('new tokens', 'twelve hours')
+            await (ended(operator) if is_of_all else answers(operator, 2))
+            for who, status in (('viewer', 401), ('operator', 401 if is_of_all else 200)):
+                assert (await page.ask(who, 'GET', '/api/session'))[0] == status
+            assert (await page.ask('stranger', 'GET', path))[0] == 401
+            await operator.close()
+
+    asyncio.run(run())
+
+
+def test_who_needs_no_token_watches_on_whatever_becomes_of_the_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the loopback; an operator there is ended and may come back as a viewer."""
+    monkeypatch.setattr(module, 'FIGURES_S', 0.01)
+
+    async def run() -> None:
+        async with (
+            serving(tmp_path, monkeypatch, '127.0.0.1') as page,
+            aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+        ):
+            signed_in = {'Cookie': f'shadowhound_live={page.cookies["operator"]}'}
+            operator = await session.ws_connect(f'{page.origin}/ws', headers=signed_in)
+            viewer = await session.ws_connect(f'{page.origin}/ws')
+            for path in make_tokens(page.folder).values():
+                path.unlink()
+            await ended(operator)
+            await answers(viewer, 3)
+            again = await session.ws_connect(f'{page.origin}/ws', headers=signed_in)
+            await answers(again, 4)
+            assert (await page.ask('operator', 'POST', '/api/act', body=ACT))[0] == 403
+            assert (await page.ask('stranger', 'GET', '/api/foxglove'))[0] == 503  # nothing can sign a ticket
+            await viewer.close()
+            await again.close()
+
+    asyncio.run(run())
+
+
 def test_on_the_loopback_whoever_is_there_may_watch_and_not_act(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Acting needs the token of the operator everywhere."""
 
@@ -419,6 +561,114 @@ def test_a_cookie_says_what_its_token_signed(tmp_path: Path) -> None:
         assert access.who(forged) is None
     now[0] += 13 * 3600
     assert access.who(cookie) is None
+
+
+class Signing:
+    """Sign-ins at a time that the test owns; each ``Access`` is another process with the same tokens."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.now = [1_800_000_000.0]
+        self.tokens = make_tokens(folder)
+
+    def access(self) -> Access:
+        return Access(self.tokens, is_open=False, now=lambda: self.now[0])
+
+    def cookie(self, access: Access) -> str:
+        signed = access.sign_in(self.tokens['viewer'].read_text().strip(), '10.0.0.1')
+        assert signed is not None
+        return signed[1]
+
+    def sign_out(self, access: Access, cookie: str) -> None:
+        who = access.who(cookie)
+        assert who is not None
+        access.sign_out(who)
+        access.keep()
+
+    @property
+    def entries(self) -> int:
+        """Of the file, each of which has a line; the first two are none."""
+        return len((self.folder / ENDED_FILE).read_text().splitlines()) - 2
+
+
+def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> None:
+    """Two of them run: neither forgets what the other one was told, not even at the same moment."""
+    it = Signing(tmp_path)
+    first, second = it.access(), it.access()
+    cookies = [it.cookie(first) for _ in range(6)]
+    for done, access in enumerate((first, second, first), 1):
+        it.sign_out(access, cookies[done - 1])
+        for each in (first, second, it.access()):
+            assert [each.who(cookie) is None for cookie in cookies] == [place < done for place in range(6)]
+    for access, cookie in ((first, cookies[3]), (second, cookies[4])):
+        who = access.who(cookie)
+        assert who is not None
+        access.sign_out(who)
+    first.keep()
+    second.keep()
+    assert [it.access().who(cookie) is None for cookie in cookies] == [True] * 5 + [False]
+
+
+def test_what_is_remembered_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the most there may be the oldest leave, and nobody of theirs comes back; what has expired leaves by itself."""
+    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    it = Signing(tmp_path)
+    access = it.access()
+    ended = []
+    for _ in range(7):
+        it.now[0] += 60.0
+        ended.append(it.cookie(access))
+        it.sign_out(access, ended[-1])
+    assert it.entries == 3
+    living = it.cookie(access)
+    for each in (access, it.access()):
+        assert [cookie for cookie in ended if each.who(cookie) is not None] == []
+        assert each.who(living) is not None
+    it.now[0] += LASTS_S + 60.0
+    last = it.cookie(access)
+    it.sign_out(access, last)
+    assert it.entries == 1
+    it.now[0] -= LASTS_S  # the clock of a robot is set back: what has expired had not
+    assert [cookie for cookie in (*ended, last) if it.access().who(cookie) is not None] == []
+
+
+@pytest.mark.parametrize('damage', [
+    lambda content: content[:0], lambda content: content[:-9], lambda content: content + b'\n', lambda content: b'\xff' + content,
+    lambda content: content[:-5] + bytes([content[-5] ^ 1]) + content[-4:], lambda content: content.replace(b'1', b'2'),
+], ids=['empty', 'cut', 'longer', 'noise', 'a bit of a nonce', 'other times'])  # fmt: skip
+def test_damage_lets_nobody_in_and_locks_nobody_out(
+    tmp_path: Path, damage: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    """It could have named anybody: all sign in again, at once and with the same tokens, and the log says why, once."""
+    it = Signing(tmp_path)
+    access = it.access()
+    ended, living = it.cookie(access), it.cookie(access)
+    it.sign_out(access, ended)
+    path = tmp_path / ENDED_FILE
+    path.write_bytes(damage(path.read_bytes()))
+    after = it.access()
+    again = it.cookie(after)  # the very first request, within the same second
+    for each in (after, it.access()):
+        assert [each.who(cookie) is not None for cookie in (ended, living, again)] == [False, False, True]
+    assert [record.levelname for record in caplog.records] == ['WARNING']
+    assert 'whoever has a token signs in again' in caplog.text
+
+
+def test_a_sign_in_of_a_role_whose_token_is_good_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The other role's file may be read by others: it lets nobody in, which the log says once."""
+    it = Signing(tmp_path)
+    access = it.access()
+    viewer = it.cookie(access)
+    it.tokens['viewer'].chmod(0o640)
+    operator = access.sign_in(it.tokens['operator'].read_text().strip(), '10.0.0.1')
+    assert operator is not None
+    for _ in range(3):
+        assert access.who(operator[1]) == operator[0]
+        assert access.who(viewer) is None
+        assert access.sign_in(it.tokens['viewer'].read_text().strip(), '10.0.0.1') is None
+    assert ['not for its owner alone' in record.getMessage() for record in caplog.records] == [True]
+    it.tokens['viewer'].chmod(0o600)
+    assert access.who(viewer) is not None
 
 
 @pytest.mark.parametrize(('host', 'own'), [

@@ -104,7 +104,7 @@ def test_a_subscription_ends() -> None:
 
 
 def test_a_ticket_is_for_one_address_and_ends(tmp_path: Path) -> None:
-    """With its time, with the sign-out of whoever asked for it, and with new tokens."""
+    """With the sign-in of whoever asked for it, whether by its time or by a sign-out, and with new tokens."""
     now = [1000.0]
     access = Access(make_tokens(tmp_path), is_open=True, now=lambda: now[0])
     signed_in, _ = access.sign_in((tmp_path / 'viewer.token').read_text().strip(), '192.0.2.1') or (SignIn('none'), '')
@@ -115,8 +115,11 @@ def test_a_ticket_is_for_one_address_and_ends(tmp_path: Path) -> None:
         assert access.of_ticket(wrong, '192.0.2.1') is None
     assert access.of_ticket(ticket, '192.0.2.2') is None
     assert access.who(ticket) == SignIn('viewer')  # which everybody is here: it is no cookie
-    now[0] += 13 * 3600
-    assert access.of_ticket(ticket, '192.0.2.1') is None
+    now[0] += 6 * 3600
+    late = access.ticket(signed_in, '192.0.2.1')
+    assert access.of_ticket(late, '192.0.2.1') == signed_in.nonce
+    now[0] += 7 * 3600
+    assert [access.of_ticket(each, '192.0.2.1') for each in (ticket, late)] == [None, None]
     now[0] -= 13 * 3600
     access.sign_out(signed_in)
     assert access.of_ticket(ticket, '192.0.2.1') is None

@@ -27,6 +27,7 @@ from lake.test_pull import Field
 from live.test_history import jpeg, patrol, told
 
 from shadowhound_data_logger.live import server as server_module
+from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
@@ -388,6 +389,59 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         holds(page, f'shadowhound.count.imu > {count}')
         assert page.evaluate('window.same')
         assert sorted(wrong_ms)[len(wrong_ms) // 2] < 2500  # ages that stand still would be off by 5 s; how exact: bench/live.py
+
+
+def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An open page says so and tries no more connections; with the new token it goes on, without a reload."""
+    settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
+    served = Served(settings, monkeypatch)
+    try:
+        page = opened(browser, f'http://127.0.0.1:{served.server.port}/')
+        tried: list[str] = []
+        page.on('websocket', lambda socket: tried.append(socket.url))
+
+        def sign_in() -> None:
+            page.locator('input[name=token]').fill((tmp_path / 'live' / 'viewer.token').read_text().strip())
+            press(page.locator('button.primary'))
+
+        sign_in()
+        holds(page, 'shadowhound.count.figures > 0')
+        page.evaluate('window.same = true')
+        make_tokens(tmp_path / 'live', anew=True)
+        page.get_by_text('Your sign-in has ended.').wait_for()
+        before = len(tried)
+        page.wait_for_timeout(4000)  # it would have tried three times
+        assert len(tried) == before
+        count = counted(page, 'figures')
+        sign_in()
+        holds(page, f'shadowhound.count.figures > {count}')
+        assert page.evaluate('window.same')
+        assert len(tried) == before + 1
+        page.close()
+    finally:
+        served.close()
+
+
+def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once the sign-in has ended: the page has no button that acts any more, and goes on."""
+    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
+    try:
+        page = opened(browser, served.server.url)
+        press(page.get_by_role('button', name='Sign in', exact=True))
+        page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
+        press(page.locator('dialog button.primary'))
+        page.locator('[data-act=flush]').wait_for()
+        page.reload()  # with the cookie, by which the connection is known
+        page.locator('[data-act=flush]').wait_for()
+        make_tokens(tmp_path / 'live', anew=True)
+        page.locator('[data-act=flush]').wait_for(state='detached')
+        count = counted(page, 'figures')
+        holds(page, f'shadowhound.count.figures > {count}')
+        page.close()
+    finally:
+        served.close()
 
 
 def test_a_first_question_that_is_lost_is_asked_again(browser: Browser, watching: Watching) -> None:

@@ -243,7 +243,7 @@ const FORCE = [['accel.x', 'x', 1], ['accel.y', 'y', 1], ['accel.z', 'z', 1]];
 const POWER = [['battery', 'battery', 1], ['volts', 'voltage', 1]];
 const HEAT = [['body', 'body', 1], ['motor', 'warmest motor', 1], ['cells', 'cells', 1]];
 
-function SignIn({ box, onDone }) {
+function SignIn({ box, why, onDone }) {
   const [wrong, setWrong] = useState('');
   const submit = async (event) => {
     event.preventDefault();
@@ -257,7 +257,7 @@ function SignIn({ box, onDone }) {
   };
   return html`<form onSubmit=${submit} class="sign-in"><h2>Sign in</h2><p>The token is in a file on the robot; <code>shadowhound-data live</code> says where.</p>
     <input name="token" type="password" autocomplete="current-password" required autofocus aria-label="Token" aria-invalid=${Boolean(wrong)} />
-    ${wrong && html`<p class="note bad" role="alert">${wrong}</p>`}
+    ${wrong ? html`<p class="note bad" role="alert">${wrong}</p>` : why && html`<p class="note" role="status">${why}</p>`}
     <div class="row"><button class="primary">Sign in</button>${box && html`<button type="button" onClick=${() => box.current.close()}>Cancel</button>`}</div></form>`;
 }
 
@@ -297,7 +297,7 @@ function App() {
     start();
   };
   if (who === null) return html`<main class="alone"><p class="empty">Connecting …</p></main>`;
-  if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} onDone=${done} /></div></main>`;
+  if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} why=${link && 'Your sign-in has ended.'} onDone=${done} /></div></main>`;
   const told = figures.value;
   return html`<${Head} onSignIn=${open} />
     <main class=${past.value ? 'past' : connection.value === 'connected' || !who.has_live ? '' : 'stale'}>
@@ -320,17 +320,20 @@ function start() {
     if (!past.value) openRobot(session.value.robot);
     return;
   }
-  if (link) return;
+  if (link) return link.start();
   link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') { video.lost(); check(); } else video.follow(); } });
   video = stats.video = new Video({ link, onFrame: drawVideo, onChange: rewatch });
 }
 
-// Whether the cookie is still good: a token that was replaced ends it.
+// Whether the cookie is still good: its time, a sign-out elsewhere or a new token ends it. Where everybody may watch a viewer is left.
 async function check() {
+  const before = session.value;
   try {
     const answer = await fetch('/api/session', { signal: AbortSignal.timeout(5000) });
-    if (answer.status === 401) session.value = false;
-    if (answer.ok && session.value?.role === undefined) session.value = await answer.json();
+    const told = answer.status === 401 ? false : answer.ok ? await answer.json() : before;
+    if (session.value !== before) return; // somebody signed in meanwhile
+    if (JSON.stringify(told) !== JSON.stringify(before)) session.value = told;
+    if (told === false) link?.stop();
   } catch { /* the link says that the robot cannot be reached, or begin asks again */ }
 }
 

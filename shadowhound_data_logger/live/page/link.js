@@ -25,6 +25,7 @@ export class Link {
     this.offset = null; // what its clock (ms) is ahead of performance.now()
     this.rtt = null; // the least of late, ms
     this.tries = 0; // since it was connected
+    this.isStopped = false;
     this.bytes = 0;
     this.items = 0;
     document.addEventListener('visibilitychange', () => {
@@ -32,7 +33,7 @@ export class Link {
       this.tell();
       this.tick();
     });
-    addEventListener('online', () => this.socket?.readyState !== WebSocket.OPEN && this.connect());
+    addEventListener('online', () => !this.isStopped && this.socket?.readyState !== WebSocket.OPEN && this.connect());
     setInterval(() => this.tick(), TICK_MS);
     this.connect();
   }
@@ -54,6 +55,21 @@ export class Link {
 
   say(what) {
     if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(what));
+  }
+
+  // While nobody is signed in, no connection is tried.
+  stop() {
+    this.isStopped = true;
+    const old = this.socket;
+    this.socket = null;
+    old?.close();
+  }
+
+  start() {
+    if (!this.isStopped) return;
+    this.isStopped = false;
+    this.tries = 0;
+    this.connect();
   }
 
   connect() {
@@ -149,6 +165,7 @@ export class Link {
 
   // A connection that is silent is given up: what TCP sends again after an outage comes later than what a new one brings.
   tick() {
+    if (this.isStopped) return;
     const now = performance.now();
     const isOpen = this.socket?.readyState === WebSocket.OPEN;
     if (isOpen && now - this.heardAt <= SILENT_MS) {
