@@ -19,6 +19,7 @@ from shadowhound_data_logger.capture.status import Stages, Status
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.mailbox import RequestRefused
+from shadowhound_data_logger.spool.act_record import ActRecord
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ MOST_NAME: Final = 100
 YIELD_S: Final = 5.0
 """For so long uploads yield to whoever watches, unless it is asked for again: a live page that was killed slows nothing down."""
 WHO: Final = 'who'
-"""With any request: whom somebody asks for, to be said in the log and in the manifest of an event."""
+"""With any request: whom somebody asks for, to be said in the log, in the ledger and in the manifest of an event."""
 MOST_NOTE: Final = 1000
 """Letters of what is said of it."""
 
@@ -61,11 +62,12 @@ class Commands:
     Used by the main thread alone: one command is done after the other, and a flush may take ``FLUSH_S``.
     """
 
-    def __init__(self, stages: Stages, parameters: Settable, status: Status, robot: str, node: str) -> None:
-        """``node`` is the full name under which ROS knows the node."""
+    def __init__(self, stages: Stages, parameters: Settable, status: Status, acts: ActRecord, robot: str, node: str) -> None:
+        """``acts`` keeps what somebody with a name asked for; ``node`` is the full name under which ROS knows the node."""
         self._stages = stages
         self._parameters = parameters
         self._status = status
+        self._acts = acts
         self._robot = robot
         self._node = node
         recorder = stages.recorder
@@ -102,6 +104,8 @@ class Commands:
             done = False, f'it failed, which is a defect of this program: {type(error).__name__}: {error}'
         if isinstance(done, dict):
             return {'ok': True, 'robot': self._robot, **done}
+        if who := _who(request):
+            self._acts.add(who, printable(str(request.get('do')))[:MOST_NAME], ok=done[0], said=done[1])
         return {'ok': done[0], 'robot': self._robot, 'message' if done[0] else 'error': done[1]}
 
     def _do(self, request: Mapping[str, Any]) -> Answer | dict[str, Any]:
@@ -109,7 +113,7 @@ class Commands:
         command = self._known.get(name) if isinstance(name, str) else None
         if command is None:
             return False, f'"do" is one of {", ".join(self._known)}; it is {str(name)[:MOST_NAME]!r}'
-        who = printable(str(request.get(WHO, '')))[:MOST_NAME]
+        who = _who(request)
         arguments = {key: value for key, value in request.items() if key not in ('do', WHO)}
         for key, value in arguments.items():
             kind = command.arguments.get(key)
@@ -219,3 +223,8 @@ _KINDS: Final[Mapping[type, str]] = {str: 'a string', float: 'a number with a po
 
 def _count(number: int, noun: str) -> str:
     return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
+
+
+def _who(request: Mapping[str, Any]) -> str:
+    """For whom it is asked; empty where nobody says so."""
+    return printable(str(request.get(WHO, '')))[:MOST_NAME]

@@ -57,6 +57,7 @@ from shadowhound_data_logger.ship.thinning import Thinner
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import SINKS
+from shadowhound_data_logger.spool.act_record import ActRecord
 from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.redating import Redating
 from shadowhound_data_logger.spool.spool import Spool
@@ -164,7 +165,8 @@ class Pipeline:
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
                                        self._ros.front, self._make_unheard(), self._requests)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
-        self._commands = Commands(stages, self._parameters, self._status, settings.robot, self._ros.name)
+        acts = ActRecord(settings.spool_path, settings.robot, self._clock.wall_ns)
+        self._commands = Commands(stages, self._parameters, self._status, acts, settings.robot, self._ros.name)
         self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
 
     def _open_stages(self, opened: ExitStack) -> None:

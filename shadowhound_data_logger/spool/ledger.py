@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.spool import clock_record
+from shadowhound_data_logger.spool import act_record, clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
@@ -28,7 +28,8 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
     with _reading(spool) as index:
         known = clock_record.read(spool, robot)
         del known['offsets']
-        return {**of_index(index, robot), 'clock': {**known, 'held': index.held_count('clock')}}
+        clock = {**known, 'held': index.held_count('clock')}
+        return {**of_index(index, robot), 'clock': clock, 'acts': act_record.read(spool, robot)}
 
 
 def journal(spool: Path, robot: str) -> list[Gap]:

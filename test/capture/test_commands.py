@@ -36,10 +36,14 @@ class Stages:
         self.earlier: Mapping[str, Any] | None = None
         self.version = '1'
         self.requests: Any = None
+        self.acts: list[tuple[str, str, bool, str]] = []
 
     def commands(self) -> Commands:
         stages: Any = self
-        return Commands(stages, Parameters(), stages, 'thor', '/ns/sensor_logger_node')
+        return Commands(stages, Parameters(), stages, stages, 'thor', '/ns/sensor_logger_node')
+
+    def add(self, who: str, do: str, *, ok: bool, said: str) -> None:
+        self.acts.append((who, do, ok, said))
 
     def does(self, stage: str) -> bool:
         self.asked.append(stage)
@@ -270,6 +274,21 @@ def test_what_changes_something_is_logged(caplog: pytest.LogCaptureFixture) -> N
         ('INFO', 'flush: 0 objects with 0 messages spooled'),
         ('WARNING', 'bag stop: nothing is recorded'),
     ]
+
+
+def test_what_somebody_with_a_name_asked_for_is_kept() -> None:
+    """With the node's answer, whatever it was; not what nobody's name is given with."""
+    stages = Stages()
+    commands = stages.commands()
+    for do in ('bag start', 'bag stop', 'bag split', 'event', 'nothing'):
+        commands.answer({'do': do, 'who': 'operator at 10.0.0.7'})
+    ask(commands, 'resume')
+    ask(commands, 'yield', max_mbps=1.0)
+    assert {who for who, *_ in stages.acts} == {'operator at 10.0.0.7'}
+    assert [(do, ok) for _, do, ok, _ in stages.acts] == [
+        ('bag start', True), ('bag stop', False), ('bag split', False), ('event', True), ('nothing', False),
+    ]  # fmt: skip
+    assert stages.acts[1][3] == 'nothing is recorded'
 
 
 def test_whom_somebody_asks_for_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,58 @@
+"""What operators asked of a node: the newest acts, in ``spool/acts-<robot>.json``, which the ledger shows.
+
+The log has them too; this outlives it, and leaves the robot with the ledger. It is not a promise: a file that is damaged or
+missing has none.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.durable_files import replacing
+
+log = logging.getLogger(__name__)
+
+MOST_ACTS: Final = 200
+MOST_SAID: Final = 300
+"""Letters of an answer."""
+
+
+def file(spool: Path, robot: str) -> Path:
+    """Where the node of a robot keeps them."""
+    return spool / f'acts-{robot}.json'
+
+
+def read(spool: Path, robot: str) -> list[dict[str, Any]]:
+    """Each with ``at_ns`` (Unix, by the robot's clock), ``who``, ``do``, ``ok`` and ``said``, the node's answer; oldest first."""
+    try:
+        given = json.loads(file(spool, robot).read_bytes())
+        return [
+            {'at_ns': int(each['at_ns']), 'who': str(each['who']), 'do': str(each['do']), 'ok': bool(each['ok']),
+             'said': str(each['said'])}
+            for each in given[-MOST_ACTS:]
+        ]  # fmt: skip
+    except (OSError, ValueError, TypeError, KeyError):
+        return []
+
+
+class ActRecord:
+    """Keeps them in the file. New when the spool is open; one thread. A failed write is logged, and has no other effect."""
+
+    def __init__(self, spool: Path, robot: str, now_ns: Callable[[], int]) -> None:
+        self._path = file(spool, robot)
+        self._acts = read(spool, robot)
+        self._now_ns = now_ns
+
+    def add(self, who: str, do: str, *, ok: bool, said: str) -> None:
+        """``who`` asked for ``do``, and was told ``said``."""
+        self._acts.append({'at_ns': self._now_ns(), 'who': who, 'do': do, 'ok': ok, 'said': said[:MOST_SAID]})
+        del self._acts[:-MOST_ACTS]
+        try:
+            with replacing(self._path, is_synced=True, mode=0o600) as file:
+                file.write(json.dumps(self._acts).encode())
+        except OSError as error:
+            log.warning('what %s asked for cannot be kept: %s', who, error)

@@ -1,0 +1,42 @@
+"""What operators asked for outlives the node and leaves it with the ledger."""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from shadowhound_data_logger.spool import act_record
+from shadowhound_data_logger.spool.act_record import MOST_ACTS, MOST_SAID, ActRecord
+
+
+def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
+    """So many of them, in their order, each with who, what, when and the answer; of another robot none."""
+    now_ns = count(1).__next__
+    record = ActRecord(tmp_path, 'thor', now_ns)
+    for number in range(MOST_ACTS):
+        record.add('operator at 10.0.0.7', 'flush', ok=True, said=f'{number} objects')
+    ActRecord(tmp_path, 'thor', now_ns).add('operator at 10.0.0.8', 'pause', ok=False, said='x' * 1000)
+    found = act_record.read(tmp_path, 'thor')
+    assert len(found) == MOST_ACTS
+    assert found[0] == {'at_ns': 2, 'who': 'operator at 10.0.0.7', 'do': 'flush', 'ok': True, 'said': '1 objects'}
+    assert found[-1] == {
+        'at_ns': MOST_ACTS + 1, 'who': 'operator at 10.0.0.8', 'do': 'pause', 'ok': False, 'said': 'x' * MOST_SAID
+    }  # fmt: skip
+    assert act_record.file(tmp_path, 'thor').stat().st_mode & 0o077 == 0
+    assert act_record.read(tmp_path, 'loki') == []
+
+
+@pytest.mark.parametrize('damage', [b'', b'{', b'{"a": 1}', b'[1]', b'[{"at_ns": "x"}]', b'\xff', b'null'])
+def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
+    """And the next act is kept."""
+    act_record.file(tmp_path, 'thor').write_bytes(damage)
+    assert act_record.read(tmp_path, 'thor') == []
+    ActRecord(tmp_path, 'thor', lambda: 1).add('operator', 'flush', ok=True, said='done')
+    assert [act['do'] for act in act_record.read(tmp_path, 'thor')] == ['flush']
+
+
+def test_a_disk_that_takes_nothing_stops_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    ActRecord(tmp_path / 'gone', 'thor', lambda: 1).add('operator', 'flush', ok=True, said='done')
+    assert 'cannot be kept' in caplog.text
