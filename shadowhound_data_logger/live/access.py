@@ -331,7 +331,7 @@ class OwnNames:
         if name in self._names:
             return True
         try:
-            return ipaddress.ip_address(name) == ipaddress.ip_address(own_address.partition('%')[0])
+            return _address(name) == _address(own_address)
         except ValueError:
             return False
 
@@ -353,9 +353,15 @@ def _host(url: str) -> str:
         return ''
 
 
+def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """Without zone, and without the form that IPv4 has on a socket of IPv6. Raises ValueError."""
+    found = ipaddress.ip_address(text.partition('%')[0])
+    return getattr(found, 'ipv4_mapped', None) or found
+
+
 def is_loopback(address: str) -> bool:
     """Whether it can be reached from this machine alone."""
     try:
-        return ipaddress.ip_address(address.partition('%')[0]).is_loopback
+        return _address(address).is_loopback
     except ValueError:
         return address == 'localhost'

@@ -950,8 +950,7 @@ def _quicken(request: web.Request) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, 25, 16 << 10)  # TCP_NOTSENT_LOWAT
         if connection.family == socket.AF_INET6:
             connection.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, AF41)
-        else:
-            connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)
+        connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)  # of a socket of IPv6 too, which may speak IPv4
 
 
 async def _examine(spool: Path, robot: str) -> dict[str, Any]:

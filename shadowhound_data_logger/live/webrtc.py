@@ -413,7 +413,10 @@ def _gather_at(connection: Any, address: str) -> None:
         found = await gather(component, [address], timeout)
         for protocol in connection._protocols:
             with suppress(OSError):
-                protocol.transport.get_extra_info('socket').setsockopt(socket.IPPROTO_IP, socket.IP_TOS, 34 << 2)
+                own = protocol.transport.get_extra_info('socket')
+                is_ipv6 = own.family == socket.AF_INET6
+                option = (socket.IPPROTO_IPV6, socket.IPV6_TCLASS) if is_ipv6 else (socket.IPPROTO_IP, socket.IP_TOS)
+                own.setsockopt(*option, 34 << 2)
         return found
 
     connection.get_component_candidates = at_address

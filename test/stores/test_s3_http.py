@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import os
+import socket
+import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+from stores.fake_s3 import FakeS3, served
+from stores.spooled import Spool
 
-from shadowhound_data_logger.stores.s3_http import _Connection
+from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_http import CS1, _Connection
 
 
 class _Socket:
@@ -32,8 +38,8 @@ class _Socket:
 def wire() -> tuple[Any, list[bytes]]:
     """A connection that is open, and what it sends."""
     connection: Any = _Connection('tower', 9000)
-    connection.sock = socket = _Socket()
-    return connection, socket.sent
+    connection.sock = held = _Socket()
+    return connection, held.sent
 
 
 def test_the_head_leaves_with_the_first_piece_of_the_body(wire: tuple[Any, list[bytes]]) -> None:
@@ -83,3 +89,25 @@ def test_botocore_brings_no_pyopenssl() -> None:
     environ = {**os.environ, 'AWS_ACCESS_KEY_ID': 'key', 'AWS_SECRET_ACCESS_KEY': 'secret'}
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, env=environ, check=False)
     assert (done.stdout.split(), done.returncode) == (['True', 'False'], 0), done.stderr
+
+
+IP_PKTOPTIONS = 9
+"""linux/in.h: what was asked about a connection's packets, as it was when the connection opened."""
+
+
+def test_uploads_are_marked_as_background(bucket: str, spool: Spool, opened: Callable[..., S3Store]) -> None:
+    """On the wire, as the server gets them (DSCP CS1), over IPv4."""
+    marks: dict[str, int] = {}
+    server = FakeS3()
+
+    class Handler(server.RequestHandlerClass):  # type: ignore[misc,name-defined]
+        def do_PUT(self) -> None:  # noqa: N802 - as http.server has it
+            said = self.connection.getsockopt(socket.IPPROTO_IP, IP_PKTOPTIONS, 100)
+            (marks[self.path],) = struct.unpack_from('i', said, socket.CMSG_LEN(0))
+            super().do_PUT()
+
+    server.RequestHandlerClass = Handler
+    server.socket.setsockopt(socket.IPPROTO_IP, socket.IP_RECVTOS, 1)
+    with served(server):
+        opened(server.url).put(spool('robot/imu/one.json', b'one'))
+    assert marks[f'/{bucket}/robot/imu/one.json'] == CS1
