@@ -58,6 +58,8 @@ class RtspServer:
         self._refused: dict[str, str] = {}
         self.topics: frozenset[str] = frozenset()
         """Those that somebody plays."""
+        self.players: tuple[str, ...] = ()
+        """The addresses from which they are played."""
         self.port = 0
 
     async def open(self) -> None:
@@ -126,7 +128,9 @@ class RtspServer:
         """What is played; and the process again after it ended."""
         while True:
             while said := await self._said():
-                self._watch(said.get('watched', ()))
+                self.players = tuple(said.get('players', self.players))
+                self._watch(said.get('watched', self.topics))
+            self.players = ()
             self._watch(())
             log.warning('the process that serves RTSP has ended; it is started again')
             while True:

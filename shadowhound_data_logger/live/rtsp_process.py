@@ -3,7 +3,7 @@
 It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
 of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``; later ones name ``topics`` that are
 served, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. What it says are lines of JSON: ``port``,
-``watched`` (topics that clients play), or ``error``. It ends with its input.
+``watched`` (topics that clients play), ``players`` (the addresses of these), or ``error``. It ends with its input.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class Cameras:
         self._sources: dict[str, Any] = {}
         self._caps: dict[str, tuple[int, int]] = {}
         self._mounted: set[str] = set()
+        self._players: dict[Any, str] = {}
         self.server = rtsp.RTSPServer()
         self.server.set_address(given['address'])
         self.server.set_service(str(given['port']))
@@ -57,6 +58,7 @@ class Cameras:
         auth.set_supported_methods(digest)
         auth.add_digest(given['user'], given['password'], token)
         self.server.set_auth(auth)
+        self.server.connect('client-connected', self._meet)
 
     def mount(self, topics: list[str]) -> None:
         """Serve these; others that were served before stay."""
@@ -83,6 +85,18 @@ class Cameras:
                 self._caps[topic] = width, height
                 source.set_property('caps', self._gst.Caps.from_string(f'image/jpeg,width={width},height={height},framerate=0/1'))
             source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
+
+    def _meet(self, _: Any, client: Any) -> None:
+        client.connect('play-request', self._follow)
+        client.connect('closed', self._follow)
+
+    def _follow(self, client: Any, context: Any = None) -> None:
+        """Say from where clients play; one that is closed plays no more."""
+        with self._lock:
+            self._players.pop(client, None)
+            if context is not None:
+                self._players[client] = client.get_connection().get_ip()
+            say(players=sorted({*self._players.values()}))
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:
         with self._lock:

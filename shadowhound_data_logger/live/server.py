@@ -489,6 +489,7 @@ class LiveServer:
     @property
     def _is_watched_from_afar(self) -> bool:
         addresses = [one.address for one in self._viewers] + [one.address for one in self._foxgloves]
+        addresses += self._rtsp.players if self._rtsp is not None else ()
         return not self._settings.is_of_store and any(not is_loopback(address) for address in addresses)
 
     def _lease(self) -> None:

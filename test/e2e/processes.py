@@ -20,6 +20,7 @@ from shadowhound_data_logger.spool import ledger
 HERE = Path(__file__).parent
 NODE = 'shadowhound_data_logger.capture.sensor_logger_node'
 SIM = 'shadowhound_data_logger.sim.sim_go2_node'
+COMMANDS = 'shadowhound_data_logger.cli.main'
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 """``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""
 WAIT_S = 120.0
@@ -267,11 +268,11 @@ class Processes:
         command = ['-m', SIM, '--ros-args', '-r', f'__ns:={namespace}', *given]
         return self._keep(Process(name, command, self.folder / f'{name}.log', self.environ, forked=self._forked))
 
-    def page(self, node: Node, *arguments: str, port: int = 0) -> tuple[Process, str]:
+    def page(self, node: Node, *arguments: str, port: int = 0, program: Sequence[str] = ('-m', COMMANDS)) -> tuple[Process, str]:
         """The live page of what this node logs, and its address."""
         name = self._name('live')
         environ = {**self.environ, 'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_ROBOT': node.robot}
-        command = ['-m', 'shadowhound_data_logger.cli.main', 'live', '--json', '--port', str(port), *arguments]
+        command = [*program, 'live', '--json', '--port', str(port), *arguments]
         page = self._keep(Process(name, command, self.folder / f'{name}.log', environ))
         page.said('"problem"')
         said = page.log

@@ -87,7 +87,7 @@ def test_a_machine_without_gstreamer_says_what_to_install(monkeypatch: pytest.Mo
 
 @pytest.mark.long("GStreamer's RTSP server and client")
 def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the password, the very JPEGs; without it, nothing. The topic is read while somebody plays it."""
+    """With the password, the very JPEGs; without it, nothing. A topic is read while somebody plays it, from where is known."""
     if not has_gstreamer():
         pytest.skip(f'no GStreamer is installed here: {INSTALL}')
 
@@ -113,7 +113,10 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     async def run() -> None:
         async with robot(tmp_path, monkeypatch, rtsp=0) as found:
-            server = found.server
+            server, rtsp = found.server, found.server._rtsp
+            assert rtsp is not None
+            players: list[tuple[str, ...]] = []
+            monkeypatch.setattr(rtsp, '_changed', lambda: (players.append(rtsp.players), server._rewatch()))
 
             async def is_idle() -> bool:
                 return server._wanted == {}
@@ -122,12 +125,18 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             assert 'nauthorized' in await play(url, 'a wrong password', tmp_path / 'none')
             assert list((tmp_path / 'none').iterdir()) == []
             assert await is_idle()
+            assert {*players} <= {()}
             said = await play(url, password, tmp_path / 'out')
             pictures = [path.read_bytes() for path in sorted((tmp_path / 'out').iterdir())[:3]]
             assert len(pictures) == 3, said
             for played in pictures:
                 level = int(simplejpeg.decode_jpeg(played)[120, 160, 1])
                 assert min(abs(level - (20 + 18 * number)) for number in range(LEVELS)) < 4
-            await until(is_idle, 'nothing is read')
+            assert ('127.0.0.1',) in players
+
+            async def has_left() -> bool:
+                return await is_idle() and rtsp.players == ()
+
+            await until(has_left, 'nothing is read, and nobody plays')
 
     asyncio.run(run())

@@ -5,15 +5,25 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import aiohttp
 import pytest
 from e2e.live_frames import Frames
+from live.test_access import serving
 
 from shadowhound_data_logger.live import server as module
-from shadowhound_data_logger.live.kinds import FULL, LiveItem
-from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+from shadowhound_data_logger.live.kinds import FULL, HALF, LiveItem
+from shadowhound_data_logger.live.server import NARROW_S, LiveServer, LiveSettings
+from shadowhound_data_logger.live.viewer import Viewer
+from shadowhound_data_logger.options import COMPRESSED_IMAGE
+
+CAMERA = '/camera'
+
+
+def closed_server(folder: Path, **settings: Any) -> LiveServer:
+    return LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', **settings))
 
 
 async def watched(server: LiveServer, items: list[LiveItem]) -> list[tuple[str, int, bytes]]:
@@ -79,3 +89,77 @@ def test_the_doctor_examines_the_node_whose_page_it_is(tmp_path: Path, monkeypat
     assert found['doctor']['asked'].endswith('doctor --json')
     assert (found['doctor']['home'], found['doctor']['robot']) == (str(tmp_path / 'home'), 'thor')
     assert 'has its spool in SHADOWHOUND_HOME/spool' in asyncio.run(told(tmp_path / 'copy'))['error']
+
+
+def test_who_watches_from_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Viewers, clients of Foxglove's protocol and players of RTSP alike; on the page of a store nobody does."""
+    robot, store = closed_server(tmp_path), closed_server(tmp_path, is_of_store=True)
+    assert not robot._is_watched_from_afar
+    near, far = ('127.0.0.1', '::1', '::ffff:127.0.0.1'), ('10.77.0.2', '::ffff:10.77.0.2', 'fe80::2%eth0')
+    for address in near + far:
+        watching = [SimpleNamespace(address='127.0.0.1'), SimpleNamespace(address=address)]
+        players = SimpleNamespace(players=('127.0.0.1', address))
+        for name, here in (('_viewers', watching), ('_foxgloves', watching), ('_rtsp', players)):
+            with monkeypatch.context() as patch:
+                for server in (robot, store):
+                    patch.setattr(server, name, here)
+                assert robot._is_watched_from_afar is (address in far), (name, address)
+                assert not store._is_watched_from_afar
+
+
+def test_video_is_suggested_to_who_has_had_a_narrow_link_for_a_while(tmp_path: Path) -> None:
+    """Each time that it was narrow for ten seconds without a break; not without a camera, and not where there is no video."""
+    told: list[LiveItem] = []
+    viewer = Viewer()
+    one: Any = SimpleNamespace(viewer=viewer, narrow_s=None, tell=told.append)
+    server = closed_server(tmp_path)
+    server.no_video, server._graph = '', {CAMERA: COMPRESSED_IMAGE, '/cloud': 'sensor_msgs/msg/PointCloud2'}
+    clock = iter(range(10_000))
+
+    def suggested(seconds: float, *, narrow: bool) -> int:
+        """How often within this time."""
+        told.clear()
+        viewer._sizes = dict.fromkeys((CAMERA, '/cloud'), HALF if narrow else FULL)
+        for _ in range(round(seconds)):
+            server._suggest_video(one, float(next(clock)))
+        assert all(item.kind == 'video' and item.head == {'narrow': True} for item in told)
+        return len(told)
+
+    viewer.watch([CAMERA, '/cloud'])
+    assert suggested(3 * NARROW_S, narrow=False) == 0
+    assert suggested(NARROW_S, narrow=True) == 0
+    assert suggested(1, narrow=True) == 1
+    assert suggested(NARROW_S - 1, narrow=True) == 0
+    assert suggested(2 * NARROW_S, narrow=True) == 2
+    assert suggested(1, narrow=False) == 0
+    assert suggested(NARROW_S, narrow=True) == 0
+    viewer.watch(['/cloud'])
+    assert suggested(3 * NARROW_S, narrow=True) == 0
+    viewer.watch([CAMERA])
+    server.no_video = 'there is none'
+    assert suggested(3 * NARROW_S, narrow=True) == 0
+
+
+def test_a_page_on_a_narrow_link_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gets frames that the link does not carry in full, and after a while the word."""
+    monkeypatch.setattr(module, 'FIGURES_S', 0.05)
+    monkeypatch.setattr(module, 'NARROW_S', 0.3)
+
+    async def run() -> dict[str, Any]:
+        async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
+            page.server.no_video = ''
+            page.server._on_graph({CAMERA: COMPRESSED_IMAGE})
+            frames = Frames()
+            async with (
+                aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+                session.ws_connect(f'{page.origin}/ws') as ws,
+            ):
+                await ws.send_json({'watch': [CAMERA], 'ping': 1.0})
+                while True:
+                    for head, _ in frames.take((await ws.receive(60)).data):
+                        if head['kind'] == 'pong':  # by now it is known what is watched
+                            page.server._on_items([LiveItem(CAMERA, 'camera', FULL, {'at': 1.0}, bytes(500_000))])
+                        if head['kind'] == 'video':
+                            return head
+
+    assert asyncio.run(run()) == {'topic': '', 'kind': 'video', 'narrow': True}
