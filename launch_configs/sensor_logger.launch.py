@@ -11,12 +11,21 @@ from typing import Any
 
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, RegisterEventHandler, SetEnvironmentVariable, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    LogInfo,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
+    TimerAction,
+)
+from launch.condition import Condition
 from launch.conditions import IfCondition, LaunchConfigurationNotEquals
 from launch.event_handlers import OnProcessExit
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.substitutions import ExecutableInPackage
 
 FOLDER = Path(__file__).resolve().parent
 SPOOL = Path(os.environ.get('SHADOWHOUND_HOME') or '~/.shadowhound').expanduser() / 'spool'
@@ -57,30 +66,26 @@ def logger() -> list[Action]:
     return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)), node]
 
 
-def live_page() -> Action:
-    """The page on which the robot can be watched, where it is asked for; it starts again whatever ends it."""
-    return Node(
-        package='shadowhound_data_logger',
-        executable='shadowhound-data',
-        arguments=['live', '--spool', str(SPOOL), '--bind', LaunchConfiguration('live_bind')],
-        condition=IfCondition(LaunchConfiguration('live')),
+def command(*arguments: str | LaunchConfiguration, condition: Condition) -> Action:
+    """A verb of ``shadowhound-data``, which starts again whatever ends it. ``Node`` would append --ros-args, which it refuses."""
+    return ExecuteProcess(
+        cmd=[ExecutableInPackage(package='shadowhound_data_logger', executable='shadowhound-data'), *arguments],
+        condition=condition,
         output='screen',
         respawn=True,
         respawn_delay=RESTART_AFTER_S,
     )
+
+
+def live_page() -> Action:
+    """The page on which the robot can be watched, where it is asked for."""
+    bind = LaunchConfiguration('live_bind')
+    return command('live', '--spool', str(SPOOL), '--bind', bind, condition=IfCondition(LaunchConfiguration('live')))
 
 
 def policies() -> Action:
-    """What follows the registry for a trained policy, where one is named; it starts again whatever ends it."""
-    return Node(
-        package='shadowhound_data_logger',
-        executable='shadowhound-data',
-        arguments=['policy', 'run', '--name', LaunchConfiguration('policy')],
-        condition=LaunchConfigurationNotEquals('policy', ''),
-        output='screen',
-        respawn=True,
-        respawn_delay=RESTART_AFTER_S,
-    )
+    """What follows the registry for a trained policy, where one is named."""
+    return command('policy', 'run', '--name', LaunchConfiguration('policy'), condition=LaunchConfigurationNotEquals('policy', ''))
 
 
 def generate_launch_description() -> LaunchDescription:
