@@ -1,7 +1,8 @@
-"""The systemd unit: what it starts exists, and when it starts it again."""
+"""The systemd units: what they start exists, and when they start it again."""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -10,32 +11,44 @@ from pathlib import Path
 
 import pytest
 
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.options import ShutdownSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-UNIT = ROOT / 'launch_configs' / 'shadowhound-data-logger.service'
+UNITS = sorted((ROOT / 'launch_configs').glob('*.service'))
+UNIT, LIVE = (ROOT / 'launch_configs' / f'shadowhound-{name}.service' for name in ('data-logger', 'live'))
 CLOSE_S = 5.0
 """What capture/pipeline.py allows for making durable what is in memory."""
 
 
-@pytest.fixture
-def service() -> dict[str, str]:
+def section(unit: Path) -> dict[str, str]:
     """The [Service] section, with continued lines joined as systemd joins them (systemd.syntax(7))."""
     parser = ConfigParser(interpolation=None, delimiters=('=',))
     parser.optionxform = str  # type: ignore[assignment,method-assign]
-    parser.read_string(UNIT.read_text(encoding='utf-8').replace('\\\n', ' '))
+    parser.read_string(unit.read_text(encoding='utf-8').replace('\\\n', ' '))
     return dict(parser['Service'])
+
+
+def script(service: dict[str, str]) -> str:
+    """What the shell is given, which parses and becomes an executable of ours."""
+    found = re.fullmatch(r"/bin/bash -c '(.*)'", service['ExecStart'])
+    assert found
+    text = found[1].replace('$$', '$')
+    assert subprocess.run(['bash', '-n', '-c', text], check=False).returncode == 0
+    executable = re.search(r'exec "\$P/lib/shadowhound_data_logger/([\w-]+)"', text)
+    assert executable
+    assert f"'{executable[1]} = shadowhound_data_logger." in (ROOT / 'setup.py').read_text(encoding='utf-8')
+    return text
+
+
+@pytest.fixture
+def service() -> dict[str, str]:
+    return section(UNIT)
 
 
 def test_what_it_starts_is_there(service: dict[str, str]) -> None:
     """The shell's script parses; the executable and the files that it names are installed under these names."""
-    script = re.fullmatch(r"/bin/bash -c '(.*)'", service['ExecStart'])
-    assert script
-    text = script[1].replace('$$', '$')
-    assert subprocess.run(['bash', '-n', '-c', text], check=False).returncode == 0
-    executable = re.search(r'exec "\$P/lib/shadowhound_data_logger/(\w+)"', text)
-    assert executable
-    assert f"'{executable[1]} = shadowhound_data_logger." in (ROOT / 'setup.py').read_text(encoding='utf-8')
+    text = script(service)
     named = re.findall(r'\$C/([\w.]+)', text)
     assert sorted(named) == ['fastdds_shm.xml', 'go2.yaml']
     assert all((UNIT.parent / name).is_file() for name in named)
@@ -62,9 +75,32 @@ def test_the_secrets_are_in_the_file_that_the_guide_makes(service: dict[str, str
     assert not [name for name in service if name == 'Environment']
 
 
-def test_systemd_takes_it() -> None:
+@pytest.mark.parametrize('unit', UNITS, ids=lambda unit: unit.stem)
+def test_systemd_takes_it(unit: Path) -> None:
     """systemd-analyze finds nothing to complain about."""
     if shutil.which('systemd-analyze') is None:
         pytest.skip('no systemd here')
-    said = subprocess.run(['systemd-analyze', 'verify', str(UNIT)], capture_output=True, text=True, check=False, timeout=60)
+    said = subprocess.run(['systemd-analyze', 'verify', str(unit)], capture_output=True, text=True, check=False, timeout=60)
     assert (said.returncode, said.stderr) == (0, '')
+
+
+@pytest.mark.parametrize(('environ', 'spool', 'bind'), [
+    ({}, '/home/go2/.shadowhound/spool', '127.0.0.1'),
+    ({'SHADOWHOUND_HOME': '/data/a robot', 'SHADOWHOUND_LIVE_BIND': '0.0.0.0'}, '/data/a robot/spool', '0.0.0.0'),
+])  # fmt: skip
+def test_the_live_page_is_started_with_arguments_that_it_takes(environ: dict[str, str], spool: str, bind: str) -> None:
+    """The spool of the node, named because there is none before the node has run, and where to listen."""
+    words = script(section(LIVE)).rpartition('/shadowhound-data"')[2]
+    given = {'PATH': os.environ['PATH'], 'HOME': '/home/go2', **environ}
+    said = subprocess.run(['bash', '-c', f"printf '%s\\n' {words}"], env=given, capture_output=True, text=True, check=True).stdout
+    verb, *arguments = said.splitlines()
+    with cli.commands[verb].make_context(verb, arguments) as context:
+        assert (context.params['spool'], context.params['bind']) == (Path(spool), bind)
+
+
+def test_the_live_page_reads_what_the_logger_writes() -> None:
+    """As the same user, with the same environment; it starts again after a crash, and not with settings that are refused."""
+    live, logger = section(LIVE), section(UNIT)
+    for name in ('User', 'EnvironmentFile', 'Restart', 'RestartPreventExitStatus', 'ReadWritePaths', 'UMask'):
+        assert live[name] == logger[name], name
+    assert not [name for name in live if name == 'Environment']
