@@ -155,15 +155,36 @@ def test_an_operator_acts(page: Page, watching: Watching) -> None:
     page.wrong.clear()  # the browser's own line about the wrong token (401)
 
 
-def test_a_hidden_tab_watches_nothing(page: Page, watching: Watching) -> None:
-    """Its subscriptions end, and begin again when it is seen."""
+@pytest.fixture
+def graph(watching: Watching) -> Iterator[Any]:
+    """A node of ROS that sees those of the robot."""
+    import rclpy
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=int(watching.processes.environ['ROS_DOMAIN_ID']))
+    node = rclpy.create_node('observer', context=context, start_parameter_services=False, enable_rosout=False)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_a_hidden_tab_watches_nothing(page: Page, watching: Watching, graph: Any) -> None:
+    """Its subscriptions end, as ROS sees them, and begin again when it is seen."""
+
+    def is_read(topic: str) -> bool:
+        return any(each.node_name == 'shadowhound_live' for each in graph.get_subscriptions_info_by_topic(topic))
+
+    watched = ('/imu', '/camera/compressed', '/point_cloud2')
+    until(lambda: all(map(is_read, watched)), 'what is shown is read')
     page.evaluate("Object.defineProperty(document, 'hidden', {configurable: true, get: () => true});"
                   " document.dispatchEvent(new Event('visibilitychange'))")  # fmt: skip
     quiet = 'async () => { const before = shadowhound.count.imu; await new Promise(done => setTimeout(done, 1500)); return %s }'
     holds(page, quiet % 'shadowhound.count.imu === before')
+    until(lambda: not any(map(is_read, watched)), 'nothing is read', 10.0)
     before = counted(page, 'imu')
     page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
     holds(page, f'shadowhound.count.imu > {before + 3}')
+    until(lambda: all(map(is_read, watched)), 'what is shown is read again')
 
 
 def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching) -> None:

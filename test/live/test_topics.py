@@ -1,0 +1,179 @@
+"""What is read from ROS, and how often: real publishers, and viewers without a browser."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+from domains import free_domain
+from e2e.live_frames import Frames
+from live.test_kinds import image
+
+from shadowhound_data_logger.live import kinds
+from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+
+pytestmark = [pytest.mark.ros, pytest.mark.long('publishers over DDS')]
+
+IMU, OTHER, RAW_IMAGE = '/imu', '/other_imu', '/image_raw'
+SOON_S = 10.0
+
+
+class Tab:
+    """A viewer, and when (``at``) what it got of each topic came to the robot."""
+
+    def __init__(self, ws: aiohttp.ClientWebSocketResponse) -> None:
+        self._ws = ws
+        self.topics: set[str] = set()
+        self.at: dict[str, set[float]] = {}
+
+    async def watch(self, *topics: str) -> None:
+        """These and no others; a hidden tab says that it watches none."""
+        await self._ws.send_json({'watch': topics})
+
+    async def read(self) -> None:
+        frames = Frames()
+        async for message in self._ws:
+            for head, _ in frames.take(message.data):
+                if head['kind'] == 'topics':
+                    self.topics = {topic for topic, *_ in head['topics']}
+                elif head['topic']:
+                    self.at.setdefault(head['topic'], set()).add(head['at'])
+                elif head['kind'] == 'figures':  # each second, in which a page says something too
+                    await self._ws.send_json({'ping': 1})
+            if (said := frames.acknowledgement()) is not None:
+                await self._ws.send_bytes(said)
+
+
+class Robot:
+    """Publishers, and the live page of them."""
+
+    def __init__(self, server: LiveServer, node: Any) -> None:
+        from sensor_msgs.msg import Image, Imu
+
+        self._origin = f'http://127.0.0.1:{server.port}'
+        types = {IMU: Imu, OTHER: Imu, RAW_IMAGE: Image}
+        self.publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
+
+    def read(self) -> dict[str, int]:
+        """How many subscriptions each topic has that has any."""
+        counts = {topic: publisher.get_subscription_count() for topic, publisher in self.publishers.items()}
+        return {topic: count for topic, count in counts.items() if count}
+
+    @asynccontextmanager
+    async def tab(self) -> AsyncIterator[Tab]:
+        """A viewer that knows the topics and watches none yet."""
+        async with (
+            aiohttp.ClientSession(headers={'Origin': self._origin}) as session,
+            session.ws_connect(f'{self._origin}/ws') as ws,
+        ):
+            tab = Tab(ws)
+            reading = asyncio.create_task(tab.read())
+            try:
+                await until(lambda: tab.topics >= {IMU, OTHER, RAW_IMAGE}, 'the topics are found')
+                yield tab
+            finally:
+                reading.cancel()
+                await asyncio.gather(reading, return_exceptions=True)
+
+    async def shown(self, topic: str, message: Any, *tabs: Tab) -> None:
+        """Publish until each of them got one more than it has."""
+        before = [len(tab.at.get(topic, ())) for tab in tabs]
+
+        def came() -> bool:
+            self.publishers[topic].publish(message)
+            return all(len(tab.at.get(topic, ())) > count for tab, count in zip(tabs, before, strict=True))
+
+        await until(came, f'{topic} is shown', every_s=0.1)
+
+
+async def until(condition: Callable[[], bool], what: str, seconds: float = 60.0, every_s: float = 0.02) -> None:
+    end_s = asyncio.get_running_loop().time() + seconds
+    while not condition():
+        assert asyncio.get_running_loop().time() < end_s, f'within {seconds:g} s: {what}'
+        await asyncio.sleep(every_s)
+
+
+@asynccontextmanager
+async def robot(folder: Path) -> AsyncIterator[Robot]:
+    from rclpy.node import Node
+
+    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', port=0))
+    await server.open()
+    node = Node('talker', start_parameter_services=False, enable_rosout=False)
+    try:
+        yield Robot(server, node)
+    finally:
+        node.destroy_node()
+        await server.close()
+
+
+def run(folder: Path, monkeypatch: pytest.MonkeyPatch, doing: Callable[[Robot], Any]) -> None:
+    """With a robot, in a domain of its own."""
+    pytest.importorskip('rclpy')
+
+    async def with_robot() -> None:
+        async with robot(folder) as found:
+            await doing(found)
+
+    with free_domain() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        asyncio.run(with_robot())
+
+
+def test_a_topic_is_read_once_and_only_while_somebody_watches_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the publishers see it: no subscription before, one however many watch, none once the last tab hides or leaves."""
+
+    async def doing(found: Robot) -> None:
+        from sensor_msgs.msg import Imu
+
+        async with found.tab() as first:
+            async with found.tab() as second:
+                assert found.read() == {}
+                await first.watch(IMU)
+                await found.shown(IMU, Imu(), first)
+                assert found.read() == {IMU: 1}
+                await second.watch(IMU)
+                await found.shown(IMU, Imu(), first, second)
+                assert found.read() == {IMU: 1}
+                await first.watch()
+                await found.shown(IMU, Imu(), second)
+                assert found.read() == {IMU: 1}
+                await second.watch()
+                await until(lambda: found.read() == {}, 'both are hidden', SOON_S)
+                await second.watch(OTHER)
+                await found.shown(OTHER, Imu(), second)
+                assert found.read() == {OTHER: 1}
+            await until(lambda: found.read() == {}, 'who watched has left, the other is hidden', SOON_S)
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_a_raw_image_is_encoded_once_for_all_viewers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three of them: as many JPEGs are made as images are shown, and each viewer gets them all."""
+    encode, made = kinds.simplejpeg.encode_jpeg, list[int]()
+
+    def counted(*given: Any, **more: Any) -> bytes:
+        made.append(1)
+        return bytes(encode(*given, **more))
+
+    monkeypatch.setattr(kinds.simplejpeg, 'encode_jpeg', counted)
+    message = image(np.full((48, 64, 3), 128, np.uint8), 'rgb8')
+
+    async def doing(found: Robot) -> None:
+        async with AsyncExitStack() as stack:
+            tabs = [await stack.enter_async_context(found.tab()) for _ in range(3)]
+            for tab in tabs:
+                await tab.watch(RAW_IMAGE)
+            for _ in range(6):
+                await found.shown(RAW_IMAGE, message, *tabs)
+            assert found.read() == {RAW_IMAGE: 1}
+            await until(lambda: len(made) == len({at for tab in tabs for at in tab.at[RAW_IMAGE]}), f'{made} encoded')
+            assert tabs[0].at == tabs[1].at == tabs[2].at
+
+    run(tmp_path, monkeypatch, doing)
