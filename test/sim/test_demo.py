@@ -5,12 +5,17 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
+import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from urllib.request import ProxyHandler, build_opener
 
 import pytest
 from PIL import Image
@@ -29,6 +34,7 @@ from shadowhound_data_logger.sim.demo_run import Record, SpoolReading, StoreOuta
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.memory import MemoryStore
 
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 CAMERA, IMU, RAW = '/camera/compressed', '/imu', '/camera/image_raw'
 IMU_KEY = 'thor/imu/20251018/120000_imu.json'
 READING = SpoolReading(30.0, 12_345, 412, 398, 14, 25_300_000, 'corridor', 'away')
@@ -348,24 +354,63 @@ stop.wait()
         child.check()
 
 
+def asked(address: str, path: str) -> bytes:
+    """What the live page answers."""
+    with build_opener(ProxyHandler({})).open(address + path, timeout=60) as answer:
+        assert answer.status == 200
+        return bytes(answer.read())
+
+
 @pytest.mark.long('a whole demo')
 @pytest.mark.ros
 @pytest.mark.seaweedfs
 def test_a_short_demo_ends_well(tmp_path: Path) -> None:
-    """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures."""
+    """With a real Tower, the real node, a mission and the simulated robot: exit code 0, a ledger that balances, four pictures.
+
+    The page is there while the robot walks, and with --keep afterwards until Ctrl-C; a Chromium takes a fifth picture, of it.
+    """
     pytest.importorskip('rclpy')
-    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo']
-    options = ['--duration', '6', '--outage', '2', '--folder', str(tmp_path / 'demo')]
-    environ = os.environ | {'COLUMNS': '80'}
-    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=200, check=False, env=environ)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert 'The ledger balances' in done.stdout
-    assert 'all as spooled' in done.stdout
-    assert 'AWAY' in done.stdout
-    assert 'The mission patrol_' in done.stdout
-    assert done.stderr == ''
-    assert json.loads((tmp_path / 'demo' / 'ledger.json').read_text())['balanced'] is True
-    for name in ('frames.png', 'patrol.png', 'delivery.png', 'mission.png'):
-        with Image.open(tmp_path / 'demo' / name) as picture:
+    folder = tmp_path / 'demo'
+    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--keep']
+    options = ['--duration', '6', '--outage', '2', '--folder', str(folder)]
+    environ = os.environ | {'COLUMNS': '80', 'PYTHONUNBUFFERED': '1'}
+    with (tmp_path / 'errors').open('w+') as errors, ExitStack() as stack:
+        run = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=errors, text=True, env=environ)
+        stack.callback(run.communicate)
+        stack.callback(run.kill)
+        assert run.stdout is not None
+        said = ''
+
+        def heard(words: str) -> str:
+            """All that it says, up to the line with these."""
+            nonlocal said
+            assert run.stdout is not None
+            while words not in said and (line := run.stdout.readline()):
+                said += line
+            assert words in said, said + (tmp_path / 'errors').read_text()
+            return said
+
+        address = heard('Watch it live').split()[-1]
+        walking = folder / 'sim.out'
+        until(walking.exists, 60.0)
+        assert json.loads(asked(address, 'api/session'))['robot'] == 'thor'
+        assert '"published"' not in walking.read_text(), 'the robot walks no more'
+
+        assert address in heard('Ctrl-C ends it').split()[-20:]
+        assert b'<html' in asked(address, '')
+        run.send_signal(signal.SIGINT)
+        said += run.stdout.read()
+        assert run.wait(200) == 0, said + (tmp_path / 'errors').read_text()
+    assert 'The ledger balances' in said
+    assert 'all as spooled' in said
+    assert 'AWAY' in said
+    assert 'The mission patrol_' in said
+    assert (tmp_path / 'errors').read_text() == ''
+    assert json.loads((folder / 'ledger.json').read_text())['balanced'] is True
+    pictures = ['frames.png', 'patrol.png', 'delivery.png', 'mission.png']
+    if CHROMIUM is not None and find_spec('playwright') is not None:
+        pictures.append('live.jpg')
+    for name in pictures:
+        with Image.open(folder / name) as picture:
             assert min(picture.size) > 200
-        assert str(tmp_path / 'demo' / name) in done.stdout
+        assert str(folder / name) in said
