@@ -1,8 +1,8 @@
-"""The cameras over RTSP, for players and recorders: JPEGs as they came (RFC 2435), served by GStreamer in a process of its own.
+"""The cameras over RTSP, for players and recorders: served by GStreamer in a process of its own (``rtsp_process.py``).
 
-GStreamer's RTSP server comes from Debian or Ubuntu with bindings for the system's Python, so ``rtsp_process.py`` runs under that.
-RFC 2435 knows baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and the
-log says so. A topic is read while somebody plays it.
+With an encoder of H.264 they are sent so, else as the JPEGs that came (RFC 2435). RFC 2435 knows baseline JPEGs in YUV 4:2:0 or
+4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and the log says so. A topic is read while somebody
+plays it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import struct
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -19,19 +18,19 @@ from typing import Any, Final
 import simplejpeg
 
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
+from shadowhound_data_logger.live.h264 import BLOCKS_4_0, H264Element, fitted
 from shadowhound_data_logger.live.kinds import LiveItem
 
 log = logging.getLogger(__name__)
 
-PYTHON: Final = Path('/usr/bin/python3')
-"""Of the system: the one for which Debian and Ubuntu build GStreamer's bindings."""
 SCRIPT: Final = Path(__file__).with_name('rtsp_process.py')
 USER: Final = 'viewer'
 START_S: Final = 20.0
 AGAIN_S: Final = 5.0
 MOST_SIDE: Final = 2040
-MOST_WAITING: Final = 4 << 20
-"""Bytes for a process that does not read; frames beyond it are left out."""
+H264_RATE, H264_KEY_EVERY = 4_000_000, 30
+"""Bits a second; frames from one key frame to the next, for which a player that comes later waits."""
 _BASELINE, _FRAMES = 0xC0, range(0xC0, 0xD0)
 _NO_FRAMES: Final = (0xC4, 0xC8, 0xCC)
 """Markers among those of frames that begin tables (ITU T.81, table B.1)."""
@@ -46,13 +45,17 @@ class RtspUnavailable(DataLoggerError):
 class RtspServer:
     """The process that serves, as long as this one. Used by one event loop. New; open once; close once.
 
-    ``changed`` is called when other topics are played than before.
+    ``changed`` is called when other topics are played than before. ``h264`` encodes; without it JPEGs are sent.
     """
 
-    def __init__(self, address: str, port: int, password: str, changed: Callable[[], None]) -> None:
-        self._given = {'address': address, 'port': port, 'user': USER, 'password': password}
+    def __init__(self, address: str, port: int, password: str, changed: Callable[[], None],
+                 h264: H264Element | None = None) -> None:  # fmt: skip
+        encoder = None if h264 is None else h264.told(H264_RATE, H264_KEY_EVERY)
+        self._given: dict[str, Any] = {
+            'address': address, 'port': port, 'user': USER, 'password': password, 'h264': encoder
+        }  # fmt: skip
         self._changed = changed
-        self._process: asyncio.subprocess.Process | None = None
+        self._process = GstProcess(SCRIPT)
         self._task: asyncio.Task[None] | None = None
         self._cameras: list[str] = []
         self._refused: dict[str, str] = {}
@@ -72,56 +75,53 @@ class RtspServer:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        await self._end()
+        await self._process.end()
 
     def serve(self, cameras: Iterable[str]) -> None:
         """Let these topics be played."""
         if (wanted := sorted(cameras)) != self._cameras:
             self._cameras = wanted
-            self._tell({'topics': wanted})
+            self._process.tell({'topics': wanted})
 
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
         if item.topic not in self.topics:
             return
-        if why := unsuited(item.body):
-            if self._refused.get(item.topic) != why:
-                log.warning('%s is not sent over RTSP: %s', item.topic, why)
-                self._refused[item.topic] = why
-            return
-        height, width, *_ = simplejpeg.decode_jpeg_header(item.body)
-        self._tell({'topic': item.topic, 'width': width, 'height': height}, item.body)
+        try:
+            head = self._head(item.body)
+        except ValueError as error:
+            if self._refused.get(item.topic) != str(error):
+                log.warning('%s is not sent over RTSP: %s', item.topic, error)
+                self._refused[item.topic] = str(error)
+        else:
+            self._process.tell({'topic': item.topic, **head}, item.body)
 
-    def _tell(self, head: dict[str, Any], body: bytes = b'') -> None:
-        if self._process is None or (stdin := self._process.stdin) is None or stdin.is_closing():
-            return
-        if not body or stdin.transport.get_write_buffer_size() < MOST_WAITING:
-            text = json.dumps(head).encode()
-            stdin.write(struct.pack('<II', len(text), len(body)) + text + body)
+    def _head(self, jpeg: bytes) -> dict[str, Any]:
+        """What the process is told of a frame. Raises ValueError with why it cannot be sent."""
+        if self._given['h264'] is None and (why := unsuited(jpeg)):
+            raise ValueError(why)
+        height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
+        head = {'width': width, 'height': height}
+        return head if self._given['h264'] is None else head | {'size': fitted(width, height, BLOCKS_4_0)}
 
     async def _start(self) -> None:
         try:
-            self._process = await asyncio.create_subprocess_exec(
-                str(PYTHON), '-I', str(SCRIPT), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
-            )
+            await self._process.start(self._given)
         except OSError as error:
             raise RtspUnavailable(f'{PYTHON} cannot be run: {error}') from error
-        self._tell(self._given)  # not on the command line, which everybody can read
         try:
             said = await asyncio.wait_for(self._said(), START_S)
         except asyncio.TimeoutError:
             said = {'error': f'it says nothing for {START_S:.0f} s'}
         if 'port' not in said:
-            await self._end()
+            await self._process.end()
             raise RtspUnavailable(f'RTSP is not served: {said.get("error", "the process ended")}', remedy=said.get('remedy', ''))
         self.port = self._given['port'] = said['port']
-        self._tell({'topics': self._cameras})
+        self._process.tell({'topics': self._cameras})
 
     async def _said(self) -> dict[str, Any]:
         """The next line of the process; empty when it has ended."""
-        assert self._process is not None
-        assert self._process.stdout is not None
-        line = await self._process.stdout.readline()
+        line = await self._process.output.readline()
         return dict(json.loads(line)) if line else {}
 
     async def _run(self) -> None:
@@ -136,7 +136,7 @@ class RtspServer:
             while True:
                 await asyncio.sleep(AGAIN_S)
                 try:
-                    await self._end()
+                    await self._process.end()
                     await self._start()
                     break
                 except RtspUnavailable as error:
@@ -145,18 +145,6 @@ class RtspServer:
     def _watch(self, topics: Iterable[str]) -> None:
         self.topics = frozenset(topics)
         self._changed()
-
-    async def _end(self) -> None:
-        process, self._process = self._process, None
-        if process is None:
-            return
-        if process.stdin is not None:
-            process.stdin.close()  # it ends with its input
-        try:
-            await asyncio.wait_for(process.wait(), 5.0)
-        except asyncio.TimeoutError:
-            process.kill()
-            await process.wait()
 
 
 def unsuited(jpeg: bytes) -> str:

@@ -1,9 +1,10 @@
 """Serves JPEGs from standard input over RTSP: a script for the system's Python, which has GStreamer's bindings (python3-gi).
 
 It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
-of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``; later ones name ``topics`` that are
-served, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. What it says are lines of JSON: ``port``,
-``watched`` (topics that clients play), ``players`` (the addresses of these), or ``error``. It ends with its input.
+of a body, and these. The first head has ``address``, ``port``, ``user``, ``password``, and an encoder under ``h264`` as
+``h264_process.py`` has it, or null: JPEGs are sent as they are. Later ones name ``topics`` that are served, or a ``topic`` with
+``width`` and ``height`` of the JPEG in the body, and the ``size`` in which it is encoded. What it says are lines of JSON:
+``port``, ``watched`` (topics that clients play), ``players`` (the addresses of these), or ``error``. It ends with its input.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import sys
 import threading
 from typing import Any, BinaryIO
 
-PIPELINE = (
-    '( appsrc name=frames is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream'
-    ' ! rtpjpegpay name=pay0 pt=26 )'
-)
+FRAMES = 'appsrc name=frames is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream'
+AS_JPEG = f'( {FRAMES} ! rtpjpegpay name=pay0 pt=26 )'
+AS_H264 = f'( {FRAMES} ! {{launch}} ! rtph264pay name=pay0 pt=96 )'
+AF41 = 34
+"""DSCP of interactive video (RFC 4594)."""
 MOST_SESSIONS = 16
 CLEAN_S = 5
 ROLE = 'viewer'
@@ -46,7 +48,8 @@ class Cameras:
         self._rtsp, self._gst = rtsp, gst
         self._lock = threading.Lock()
         self._sources: dict[str, Any] = {}
-        self._caps: dict[str, tuple[int, int]] = {}
+        self._caps: dict[str, tuple[Any, ...]] = {}
+        self._h264: dict[str, Any] | None = given['h264']
         self._mounted: set[str] = set()
         self._players: dict[Any, str] = {}
         self.server = rtsp.RTSPServer()
@@ -67,8 +70,9 @@ class Cameras:
                 continue
             self._mounted.add(topic)
             factory = self._rtsp.RTSPMediaFactory()
-            factory.set_launch(PIPELINE)
+            factory.set_launch(AS_JPEG if self._h264 is None else AS_H264.format(launch=self._h264['launch']))
             factory.set_shared(True)
+            factory.set_dscp_qos(AF41)
             permissions = self._rtsp.RTSPPermissions()
             for right in ('media.factory.access', 'media.factory.construct'):
                 permissions.add_permission_for_role(ROLE, right, True)
@@ -76,14 +80,23 @@ class Cameras:
             factory.connect('media-configure', self._begin, topic)
             self.server.get_mount_points().add_factory(topic, factory)
 
-    def push(self, topic: str, width: int, height: int, jpeg: bytes) -> None:
+    def push(self, head: dict[str, Any], jpeg: bytes) -> None:
+        topic, width, height = head['topic'], head['width'], head['height']
+        size: Any = head.get('size')
         with self._lock:
-            source = self._sources.get(topic)
+            source, scaled = self._sources.get(topic, (None, None))
             if source is None:
                 return
-            if self._caps.get(topic) != (width, height):
-                self._caps[topic] = width, height
-                source.set_property('caps', self._gst.Caps.from_string(f'image/jpeg,width={width},height={height},framerate=0/1'))
+            if self._caps.get(topic) != (width, height, size):
+                self._caps[topic] = width, height, size
+                caps = f'image/jpeg,width={width},height={height}'
+                if scaled is None:
+                    caps += ',framerate=0/1'
+                else:
+                    caps += ',framerate=30/1'
+                    scaled.set_property('caps', self._gst.Caps.from_string(
+                        f'video/x-raw,width={size[0]},height={size[1]},pixel-aspect-ratio=1/1'))  # fmt: skip
+                source.set_property('caps', self._gst.Caps.from_string(caps))
             source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
 
     def _meet(self, _: Any, client: Any) -> None:
@@ -99,8 +112,14 @@ class Cameras:
             say(players=sorted({*self._players.values()}))
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:
+        pipeline = media.get_element()
+        if self._h264 is not None:
+            encoder = pipeline.get_by_name('h264')
+            for name, text in self._h264['set'].items():
+                if encoder.find_property(name) is not None:  # as other versions have it
+                    self._gst.util_set_object_arg(encoder, name, text)
         with self._lock:
-            self._sources[topic] = media.get_element().get_by_name('frames')
+            self._sources[topic] = pipeline.get_by_name('frames'), pipeline.get_by_name('size')
             self._caps.pop(topic, None)
             media.connect('unprepared', self._end, topic)
             say(watched=sorted(self._sources))
@@ -126,7 +145,8 @@ def main() -> None:
         say(error=f'the system has no RTSP server: {error}')
         return
     Gst.init(None)
-    lacks = [name for name in ('appsrc', 'rtpjpegpay') if Gst.ElementFactory.find(name) is None]
+    needs = ('appsrc', 'rtpjpegpay') if first[0]['h264'] is None else ('rtph264pay',)
+    lacks = [name for name in needs if Gst.ElementFactory.find(name) is None]
     if lacks:
         say(error=f'GStreamer has no {" and no ".join(lacks)}')
         return
@@ -142,7 +162,7 @@ def main() -> None:
             if 'topics' in head:
                 GLib.idle_add(cameras.mount, head['topics'])
             else:
-                cameras.push(head['topic'], head['width'], head['height'], jpeg)
+                cameras.push(head, jpeg)
         GLib.idle_add(loop.quit)
 
     def forget() -> bool:

@@ -45,6 +45,7 @@ from shadowhound_data_logger.live.access import (
 )
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
 from shadowhound_data_logger.live.foxglove import PROTOCOLS, FoxgloveClient
+from shadowhound_data_logger.live.h264 import H264Element, find_h264
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import FULL, KINDS, RAW, LiveItem
 from shadowhound_data_logger.live.relay import Relay
@@ -128,6 +129,8 @@ class LiveSettings:
     """The file with the token of a viewer there."""
     rtsp: int | None = None
     """The port of RTSP; None: there is none."""
+    h264: str = ''
+    """The encoder of GStreamer for H.264; empty: one in hardware, if there is one; ``none``: no encoder."""
     uploads_mbps: float = 4.0
     """What uploads are left while somebody watches over the network; 0: all they want."""
 
@@ -210,6 +213,7 @@ class LiveServer:
         self._told_topics: LiveItem | None = None
         self._video: CameraVideo | None = None
         self._rtsp: RtspServer | None = None
+        self._h264: H264Element | None = None
         self.no_video = '' if find_spec('aiortc') and find_spec('av') else NO_WEBRTC
         """Why cameras are sent as JPEG alone; empty where WebRTC is to be had."""
         self._pool = ThreadPoolExecutor(2, 'spool')
@@ -227,8 +231,9 @@ class LiveServer:
         """Why nothing but the data is shown; empty where topics are read."""
 
     async def open(self) -> None:
-        """Raises OSError where nobody can listen there, or the certificate cannot be read; RtspUnavailable."""
+        """Raises OSError where nobody can listen there, or the certificate cannot be read; RtspUnavailable; H264Unavailable."""
         self._loop = asyncio.get_running_loop()
+        await self._find_h264()
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BODY)
         app.add_routes([
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
@@ -253,7 +258,7 @@ class LiveServer:
         )
         if self._settings.rtsp is not None:
             password = rtsp_password(self._settings.tokens)
-            self._rtsp = RtspServer(self._settings.bind, self._settings.rtsp, password, self._rewatch)
+            self._rtsp = RtspServer(self._settings.bind, self._settings.rtsp, password, self._rewatch, self._h264)
             await self._rtsp.open()
             self._rewatch()  # the topics of the graph are wanted even while nobody watches
         self._open_topics()
@@ -281,6 +286,11 @@ class LiveServer:
         self._pool.shutdown()
 
     @property
+    def h264(self) -> str:
+        """The name of the encoder of GStreamer that encodes cameras as H.264; empty where none does."""
+        return '' if self._h264 is None else self._h264.name
+
+    @property
     def rtsp_url(self) -> str:
         """To which the name of a camera's topic is appended; empty where RTSP is not served."""
         return '' if self._rtsp is None else f'rtsp://{self._host}:{self._rtsp.port}'
@@ -297,6 +307,17 @@ class LiveServer:
     @property
     def _scheme(self) -> str:
         return 'https' if self._settings.certificate is not None else 'http'
+
+    async def _find_h264(self) -> None:
+        """Where cameras may be sent as video."""
+        has_cameras = not self._settings.is_of_store or bool(self._settings.robot_url)
+        if not self._settings.h264 and (not has_cameras or (self._settings.rtsp is None and self.no_video)):
+            return
+        self._h264 = await find_h264(self._settings.h264)
+        if self._h264 is not None:
+            log.info('cameras are encoded as H.264 by %s where players and viewers take it', self.h264)
+        else:
+            log.info('cameras are not encoded as H.264: they are sent as JPEG over RTSP and as VP8 over WebRTC')
 
     def _open_topics(self) -> None:
         """Where ROS is, read topics; else the data alone is shown."""

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
+import re
 import shutil
+import socket
 import stat
 import subprocess
+import time
+from hashlib import new
 from pathlib import Path
 
 import numpy as np
 import pytest
 import simplejpeg
-from live.test_webrtc import CAMERA, LEVELS, robot, until
+from live.test_h264 import software_encoder
+from live.test_webrtc import CAMERA, LEVELS, Robot, robot, until
 from PIL import Image
 
-from shadowhound_data_logger.live import rtsp as module
+from shadowhound_data_logger.live import gstreamer as module
 from shadowhound_data_logger.live.access import make_tokens, rtsp_password
-from shadowhound_data_logger.live.rtsp import PYTHON, RtspServer, RtspUnavailable, unsuited
+from shadowhound_data_logger.live.gstreamer import PYTHON
+from shadowhound_data_logger.live.kinds import LiveItem
+from shadowhound_data_logger.live.rtsp import RtspServer, RtspUnavailable, unsuited
+from shadowhound_data_logger.options import COMPRESSED_IMAGE
 
 PROBE = """import gi
 for name in ('Gst', 'GstRtspServer'):
@@ -85,6 +94,166 @@ def test_a_machine_without_gstreamer_says_what_to_install(monkeypatch: pytest.Mo
         assert 'secret' not in said
 
 
+def hashed(text: str) -> str:
+    """As RFC 2617 has it."""
+    return new('md5', text.encode(), usedforsecurity=False).hexdigest()
+
+
+class Player:
+    """A client of RTSP (RFC 2326) of our own, for what others do not show: who is refused, and the marks of packets."""
+
+    def __init__(self, url: str, password: str | None) -> None:
+        self.url, self.password = url, password
+        self._socket = socket.create_connection((host := url.split('/')[2]).rsplit(':', 1), 30.0)
+        self._host, self._number, self._challenge = host, 0, dict[str, str]()
+
+    def ask(self, method: str, url: str = '', **headers: str) -> tuple[int, str]:
+        """Status and text of the answer; asked again with the password where one is wanted."""
+        status, text = self._ask(method, url or self.url, headers)
+        if status == 401 and self.password is not None and not self._challenge:
+            self._challenge = dict(re.findall(r'(\w+)="([^"]*)"', next(line for line in text.splitlines() if 'Digest' in line)))
+            status, text = self._ask(method, url or self.url, headers)
+        return status, text
+
+    def _ask(self, method: str, url: str, headers: dict[str, str]) -> tuple[int, str]:
+        self._number += 1
+        if self._challenge:
+            realm, nonce = self._challenge['realm'], self._challenge['nonce']
+            secret, asked = (hashed(text) for text in (f'viewer:{realm}:{self.password}', f'{method}:{url}'))
+            answer = hashed(f'{secret}:{nonce}:{asked}')
+            headers = headers | {'Authorization': f'Digest username="viewer", realm="{realm}", nonce="{nonce}", uri="{url}",'
+                                                  f' response="{answer}"'}  # fmt: skip
+        lines = [f'{method} {url} RTSP/1.0', f'CSeq: {self._number}', *(f'{name}: {value}' for name, value in headers.items())]
+        self._socket.sendall('\r\n'.join([*lines, '', '']).encode())
+        text = b''
+        while b'\r\n\r\n' not in text or len(text.partition(b'\r\n\r\n')[2]) < int(
+            (re.findall(rb'Content-Length: (\d+)', text) or [0])[0]
+        ):
+            more = self._socket.recv(65536)
+            assert more, text
+            text += more
+        return int(text.split()[1]), text.decode()
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+async def until_served(url: str) -> None:
+    """The process hears of a topic a moment after the page."""
+
+    def status() -> int:
+        with contextlib.closing(Player(url, None)) as player:
+            return player.ask('DESCRIBE')[0]
+
+    async def is_served() -> bool:
+        return await asyncio.to_thread(status) != 404
+
+    await until(is_served, 'a topic')
+
+
+def tos_of_packets(url: str, password: str, count: int) -> tuple[str, set[int]]:
+    """The description of what is played, and the marks of so many RTP packets."""
+    with contextlib.ExitStack() as stack:
+        player = stack.enter_context(contextlib.closing(Player(url, password)))
+        rtp, rtcp = (stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        for one in (rtp, rtcp):
+            one.bind(('127.0.0.1', 0))
+            one.settimeout(30.0)
+        rtp.setsockopt(socket.IPPROTO_IP, socket.IP_RECVTOS, 1)
+        status, described = player.ask('DESCRIBE')
+        assert status == 200, described
+        control = re.findall(r'a=control:(\S+)', described)[-1]
+        ports = f'{rtp.getsockname()[1]}-{rtcp.getsockname()[1]}'
+        status, text = player.ask(
+            'SETUP', control if '://' in control else f'{url}/{control}', Transport=f'RTP/AVP;unicast;client_port={ports}'
+        )
+        assert status == 200, text
+        session = re.findall(r'Session: ([^;\s]+)', text)[0]
+        assert player.ask('PLAY', Session=session)[0] == 200
+        marks = {int(rtp.recvmsg(2048, 64)[1][0][2][0]) for _ in range(count)}
+        player.ask('TEARDOWN', Session=session)
+        return described, marks
+
+
+@pytest.mark.long("GStreamer's RTSP server")
+@pytest.mark.parametrize('encodes', [False, True], ids=['jpeg', 'h264'])
+def test_only_who_has_the_password_is_told_anything(encodes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without any it is 401, as with a wrong one; packets are marked as interactive video (AF41)."""
+    if not has_gstreamer():
+        pytest.skip(f'no GStreamer is installed here: {INSTALL}')
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch, rtsp=0, h264=software_encoder() if encodes else 'none') as found:
+            url, password = f'{found.server.rtsp_url}{CAMERA}', (tmp_path / 'live' / 'rtsp.password').read_text().strip()
+            await until_served(url)
+            for wrong in (None, '', 'a wrong one'):
+                for method in ('DESCRIBE', 'SETUP', 'PLAY'):
+                    player = await asyncio.to_thread(Player, url, wrong)
+                    status, text = await asyncio.to_thread(player.ask, method)
+                    player.close()
+                    assert status in ({401} if method == 'DESCRIBE' else {401, 454, 461}), text  # no session, no transport
+                    assert 'm=video' not in text
+            assert found.server._wanted == {}
+            described, marks = await asyncio.to_thread(tos_of_packets, url, password, 5)
+            assert ('H264/90000' if encodes else 'm=video 0 RTP/AVP 26') in described
+            assert marks == {34 << 2}
+
+    asyncio.run(run())
+
+
+@pytest.mark.long("GStreamer's RTSP server")
+def test_ffmpeg_plays_the_camera_as_h264(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also pictures that RFC 2435 cannot send; a player that comes later shares the encoder."""
+    av = pytest.importorskip('av')
+    encoder = software_encoder()
+
+    def play(url: str) -> tuple[str, list[tuple[int, int, int]]]:
+        """The codec, and width, height and brightness of some frames."""
+        with av.open(url, options={'rtsp_transport': 'tcp'}, timeout=60.0) as played:
+            frames: list[tuple[int, int, int]] = []
+            for frame in played.decode(video=0):
+                pixels = frame.to_ndarray(format='rgb24')
+                frames.append((frame.width, frame.height, int(pixels[frame.height // 2, frame.width // 2, 1])))
+                if len(frames) == 6:
+                    break
+            return played.streams.video[0].codec_context.name, frames
+
+    async def publish(found: Robot) -> None:
+        """Beside the camera of 4:2:0 one that RFC 2435 does not know: 4:4:4, with odd sides."""
+        while True:
+            picture = simplejpeg.encode_jpeg(np.full((241, 323, 3), 130, np.uint8), 90, colorsubsampling='444')
+            found.server._on_items([LiveItem('/odd', 'camera', head={'at': time.monotonic() * 1e3}, body=bytes(picture))])
+            await asyncio.sleep(0.1)
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch, rtsp=0, h264=encoder) as found:
+            assert found.server.h264 == encoder
+            found.server._on_graph({CAMERA: COMPRESSED_IMAGE, '/odd': COMPRESSED_IMAGE})
+            odd = asyncio.create_task(publish(found))
+            password = (tmp_path / 'live' / 'rtsp.password').read_text().strip()
+            for topic in (CAMERA, '/odd'):
+                await until_served(f'{found.server.rtsp_url}{topic}')
+            urls = [
+                f'{found.server.rtsp_url}{topic}'.replace('://', f'://viewer:{password}@') for topic in (CAMERA, '/odd', CAMERA)
+            ]
+            (codec, frames), (_, odds), (_, more) = await asyncio.gather(*(asyncio.to_thread(play, url) for url in urls))
+            assert codec == 'h264'
+            for width, height, level in frames + more:
+                assert (width, height) == (320, 240)
+                assert min(abs(level - (20 + 18 * number)) for number in range(LEVELS)) < 9
+            assert {(width, height) for width, height, _ in odds} == {(322, 240)}
+            assert all(abs(level - 130) < 9 for *_, level in odds)
+
+            async def is_idle() -> bool:
+                return found.server._wanted == {}
+
+            await until(is_idle, 'nothing is read')
+            odd.cancel()
+            await asyncio.gather(odd, return_exceptions=True)
+
+    asyncio.run(run())
+
+
 @pytest.mark.long("GStreamer's RTSP server and client")
 def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the password, the very JPEGs; without it, nothing. A topic is read while somebody plays it, from where is known."""
@@ -112,7 +281,7 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return b''.join(await said).decode()
 
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch, rtsp=0) as found:
+        async with robot(tmp_path, monkeypatch, rtsp=0, h264='none') as found:
             server, rtsp = found.server, found.server._rtsp
             assert rtsp is not None
             players: list[tuple[str, ...]] = []
