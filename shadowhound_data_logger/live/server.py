@@ -863,7 +863,7 @@ class LiveServer:
                 self.no_video = f'{NO_WEBRTC} ({error})'
             else:
                 if self._video is None:  # another viewer asked meanwhile
-                    self._video = webrtc.CameraVideo(self._rewatch)
+                    self._video = webrtc.CameraVideo(self._rewatch, self._h264)
         if self._video is None:
             tell({'problem': self.no_video})
         else:

@@ -1,10 +1,11 @@
-"""The camera as video: VP8 over WebRTC, encoded once for all who take it. Importing this loads aiortc (the extra ``webrtc``).
+"""The camera as video over WebRTC, encoded once for all who take it. Importing this loads aiortc (the extra ``webrtc``).
 
-The newest JPEG of a topic is decoded and encoded on a thread of its own, and its packets go to each peer. RTP timestamps are the
+The newest JPEG of a topic is decoded and encoded as VP8 on a thread of its own, or as H.264 in a process of its own where an
+encoder of GStreamer serves and the viewer takes H.264 (``h264.py``); its packets go to each peer. RTP timestamps are the
 times at which messages came, at 90 kHz, so the page knows how old each frame is. Packets go to the viewer's own address alone:
-candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for three things that are
-needed: the rate that a receiver can take, when it lacks a key frame, and where timestamps begin. They are read from the insides
-of the versions that setup.py names.
+candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for four things that are
+needed: the codec that was agreed on, the rate that a receiver can take, when it lacks a key frame, and where timestamps begin.
+They are read from the insides of the versions that setup.py names.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import logging
 import re
 import socket
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from ipaddress import ip_address
 from threading import Condition
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import av
 import numpy as np
@@ -29,6 +31,7 @@ from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCRtp
 from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationError
 from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
 
+from shadowhound_data_logger.live.h264 import KEY_EVERY_S, H264Element, H264Encoder
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.untrusted import check_pixels
 from shadowhound_data_logger.worker import Worker
@@ -48,11 +51,12 @@ RATE_SHARE: Final = 0.85
 """Of what a receiver says that its link carries."""
 RAISE_EVERY_S: Final = 4.0
 """A new rate begins with a key frame, so a better one waits."""
-KEY_EVERY_S: Final = 0.7
-"""Key frames that receivers ask for come no more often."""
+H264_AGAIN_S: Final = 300.0
+"""After an encoder of H.264 failed, viewers who come take VP8 for so long."""
 MOST_WAITING: Final = 10
 """Packets of a peer whose turn does not come; then it goes on with the next key frame."""
 CONNECT_S: Final = 10.0
+VP8, H264 = 'video/VP8', 'video/H264'
 _TICKS_PER_MS: Final = CLOCK_HZ // 1000
 _CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
 _MOST_CANDIDATES: Final = 8
@@ -70,13 +74,29 @@ class _Encoded:
     packet: Any
     """av.Packet."""
     at_ms: float
+    is_key: bool
+    """Whether it needs no other."""
 
 
-class _VideoEncoder:
+class _Encoder(Protocol):
+    """Encodes one topic, as VP8 or H.264. New; open once; close once."""
+
+    def open(self) -> None: ...
+
+    def offer(self, at_ms: float, jpeg: bytes) -> None: ...
+
+    def ask_key(self) -> None: ...
+
+    def set_rate(self, rate: int) -> None: ...
+
+    def close(self) -> Coroutine[Any, Any, None]: ...
+
+
+class _Vp8Encoder:
     """Makes VP8 of the newest JPEG of a topic, on the thread ``video``. The condition guards what waits and what is asked for."""
 
-    def __init__(self, topic: str, made: Callable[[str, _Encoded], None]) -> None:
-        self._topic, self._made = topic, made
+    def __init__(self, made: Callable[[_Encoded], None]) -> None:
+        self._made = made
         self._changed = Condition()
         self._waiting: tuple[float, bytes] | None = None
         self._wants_key = True
@@ -87,6 +107,9 @@ class _VideoEncoder:
         self.encoded = self.keys = 0
         """Frames so far, and those of them that need no other."""
         self.worker = Worker('video', self._step)
+
+    def open(self) -> None:
+        self.worker.start()
 
     def offer(self, at_ms: float, jpeg: bytes) -> None:
         with self._changed:
@@ -101,11 +124,11 @@ class _VideoEncoder:
         with self._changed:
             self._rate = rate
 
-    def close(self) -> None:
+    async def close(self) -> None:
         self.worker.stop()
         with self._changed:
             self._changed.notify()
-        if not self.worker.join(5.0):
+        if not await asyncio.to_thread(self.worker.join, 5.0):
             log.warning('the thread that encodes video does not end')
 
     def _step(self) -> None:
@@ -135,7 +158,7 @@ class _VideoEncoder:
             packet.pts, packet.time_base = pts, frame.time_base
             self.encoded += 1
             self.keys += bool(packet.is_keyframe)
-            self._made(self._topic, _Encoded(packet, at_ms))
+            self._made(_Encoded(packet, at_ms, bool(packet.is_keyframe)))
 
     def _codec_for(self, frame: Any, rate: int) -> Any:
         codec = self._codec
@@ -199,7 +222,7 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
                 self._waiting.get_nowait()
             self._needs_key = True
             self._ask_key()
-        if self._needs_key and not encoded.packet.is_keyframe:
+        if self._needs_key and not encoded.is_key:
             return
         self._needs_key = False
         self._waiting.put_nowait(encoded)
@@ -210,8 +233,10 @@ class _Peer:
 
     def __init__(self, topic: str, video: CameraVideo, tell: Callable[[Mapping[str, Any]], None]) -> None:
         self.topic, self._video, self._tell = topic, video, tell
+        self.codec = ''
+        """VP8 or H264, once it is answered."""
         self.pc = RTCPeerConnection(RTCConfiguration(iceServers=[]))
-        self.track = _PacketTrack(lambda: video.ask_key(topic), self._on_sent)
+        self.track = _PacketTrack(lambda: video.ask_key(self), self._on_sent)
         self.rate: float | None = None
         """Bits a second that its link carries, as it says."""
         self._is_told = False
@@ -219,10 +244,12 @@ class _Peer:
 
     async def answer(self, offer: str, own: str, remote: str) -> str:
         """Raises OfferRefused."""
-        await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
         (transceiver,) = self.pc.getTransceivers()
-        codecs = [codec for codec in RTCRtpSender.getCapabilities('video').codecs if codec.mimeType in ('video/VP8', 'video/rtx')]
-        transceiver.setCodecPreferences(codecs)
+        known = RTCRtpSender.getCapabilities('video').codecs
+        taken = (H264, VP8, 'video/rtx') if self._video.has_h264 else (VP8, 'video/rtx')
+        transceiver.setCodecPreferences([codec for name in taken for codec in known if codec.mimeType == name])
+        await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
+        self.codec = transceiver._codecs[0].mimeType
         _gather_at(self.sender.transport.transport.iceGatherer._connection, own)
         handle = self.sender._handle_rtcp_packet
 
@@ -248,7 +275,7 @@ class _Peer:
         if not isinstance(packet, RtcpPsfbPacket):
             return
         if packet.fmt in (RTCP_PSFB_PLI, RTCP_PSFB_FIR):
-            self._video.ask_key(self.topic)
+            self._video.ask_key(self)
         elif packet.fmt == RTCP_PSFB_APP:
             with suppress(ValueError):
                 self.rate = float(unpack_remb_fci(packet.fci)[0])
@@ -257,14 +284,16 @@ class _Peer:
 class CameraVideo:
     """Encodes the topics that peers take, and sends them. Used by one event loop. New; close once.
 
-    ``changed`` is called when other topics are to be read than before.
+    ``changed`` is called when other topics are to be read than before. ``h264`` is the encoder for peers that take H.264.
     """
 
-    def __init__(self, changed: Callable[[], None]) -> None:
-        self._changed = changed
+    def __init__(self, changed: Callable[[], None], h264: H264Element | None = None) -> None:
+        self._changed, self._h264 = changed, h264
         self._loop = asyncio.get_running_loop()
-        self._encoders: dict[str, _VideoEncoder] = {}
-        self._rates: dict[str, tuple[int, float]] = {}
+        self._encoders: dict[tuple[str, str], _Encoder] = {}
+        """By topic and codec."""
+        self._rates: dict[tuple[str, str], tuple[int, float]] = {}
+        self._h264_from_s = 0.0
         self._peers: dict[object, _Peer] = {}
         self._ending: set[asyncio.Task[None]] = set()
         for name in ('aioice', 'aiortc'):
@@ -273,15 +302,21 @@ class CameraVideo:
     @property
     def topics(self) -> frozenset[str]:
         """Those that somebody takes."""
-        return frozenset(self._encoders)
+        return frozenset(peer.topic for peer in self._peers.values())
+
+    @property
+    def has_h264(self) -> bool:
+        """Whether viewers who come may take H.264."""
+        return self._h264 is not None and time.monotonic() >= self._h264_from_s
 
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
-        if (encoder := self._encoders.get(item.topic)) is not None and item.head is not None:
-            encoder.offer(float(item.head['at']), item.body)
+        for (topic, _), encoder in list(self._encoders.items()):
+            if topic == item.topic and item.head is not None:
+                encoder.offer(float(item.head['at']), item.body)
 
-    def ask_key(self, topic: str) -> None:
-        if (encoder := self._encoders.get(topic)) is not None:
+    def ask_key(self, peer: _Peer) -> None:
+        if (encoder := self._encoders.get((peer.topic, peer.codec))) is not None:
             encoder.ask_key()
 
     async def take(self, who: object, said: Mapping[str, Any], addresses: tuple[str, str],
@@ -305,10 +340,9 @@ class CameraVideo:
             raise OfferRefused('a viewer takes a topic')
         if len(self._peers) >= MOST_PEERS:
             raise OfferRefused(f'{MOST_PEERS} viewers take video, which is the most there may be')
-        if topic not in self._encoders and len(self._encoders) >= MOST_ENCODED:
+        if topic not in self.topics and len(self.topics) >= MOST_ENCODED:
             raise OfferRefused(f'{MOST_ENCODED} cameras are encoded, which is the most there may be')
         peer = self._peers[who] = _Peer(topic, self, tell)
-        self._follow()
         return peer
 
     async def _answered(self, who: object, peer: _Peer, offer: Any, addresses: tuple[str, str]) -> str:
@@ -321,20 +355,25 @@ class CameraVideo:
         finally:
             if answer is None and self._peers.get(who) is peer:
                 self.end(who)
+        self._follow()
         return answer
 
     def end(self, who: object) -> None:
         """It takes no video any more."""
         if (peer := self._peers.pop(who, None)) is not None:
             self._follow()
-            task = self._loop.create_task(peer.pc.close())
-            self._ending.add(task)
-            task.add_done_callback(self._ending.discard)
+            self._end(peer.pc.close())
 
-    def lost(self, peer: _Peer, problem: str) -> None:
+    def _end(self, closing: Coroutine[Any, Any, None]) -> None:
+        task = self._loop.create_task(closing)
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+
+    def lost(self, peer: _Peer, problem: str, *, again: bool = False) -> None:
+        """``again``: who asks again is given another codec."""
         for who, one in list(self._peers.items()):
             if one is peer:
-                peer._tell({'problem': problem})
+                peer._tell({'problem': problem, 'again': True} if again else {'problem': problem})
                 self.end(who)
 
     def has(self, who: object) -> bool:
@@ -344,14 +383,14 @@ class CameraVideo:
     def tick(self) -> None:
         """Once a second: the rate of each topic is what the slowest of its links carries."""
         now_s = time.monotonic()
-        for topic, encoder in self._encoders.items():
-            told = [peer.rate for peer in self._peers.values() if peer.topic == topic and peer.rate is not None]
+        for key, encoder in self._encoders.items():
+            told = [peer.rate for peer in self._peers.values() if (peer.topic, peer.codec) == key and peer.rate is not None]
             if not told:
                 continue
-            rate, since_s = self._rates.get(topic, (FIRST_RATE, -RAISE_EVERY_S))
+            rate, since_s = self._rates.get(key, (FIRST_RATE, -RAISE_EVERY_S))
             wanted = int(min(max(min(told) * RATE_SHARE, LEAST_RATE), MOST_RATE))
             if wanted < 0.9 * rate or (wanted > 1.25 * rate and now_s - since_s >= RAISE_EVERY_S):
-                self._rates[topic] = wanted, now_s
+                self._rates[key] = wanted, now_s
                 encoder.set_rate(wanted)
 
     async def close(self) -> None:
@@ -365,25 +404,42 @@ class CameraVideo:
             self.lost(peer, f'no connection for video (UDP) within {CONNECT_S:.0f} s')
 
     def _follow(self) -> None:
-        """Encoders of the topics that are taken, and of no others."""
-        wanted = {peer.topic for peer in self._peers.values()}
-        for topic in self._encoders.keys() - wanted:
-            self._rates.pop(topic, None)
-            encoder = self._encoders.pop(topic)
-            self._loop.run_in_executor(None, encoder.close)
-        for topic in wanted - self._encoders.keys():
-            encoder = self._encoders[topic] = _VideoEncoder(topic, self._on_encoded)
-            encoder.worker.start()
+        """Encoders of the topics that are taken, in each codec in which they are, and no others."""
+        wanted = {(peer.topic, peer.codec) for peer in self._peers.values() if peer.codec}
+        for key in self._encoders.keys() - wanted:
+            self._rates.pop(key, None)
+            self._end(self._encoders.pop(key).close())
+        for key in wanted - self._encoders.keys():
+            encoder = self._encoders[key] = self._encoder(*key)
+            encoder.open()
         self._changed()
 
-    def _on_encoded(self, topic: str, encoded: _Encoded) -> None:
+    def _encoder(self, topic: str, codec: str) -> _Encoder:
+        if codec == H264 and self._h264 is not None:
+            return H264Encoder(self._h264, FIRST_RATE, partial(self._on_h264, topic), partial(self._on_failed, topic))
+        return _Vp8Encoder(partial(self._on_vp8, topic))
+
+    def _on_vp8(self, topic: str, encoded: _Encoded) -> None:
         """On the thread of the encoder."""
         with suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._share, topic, encoded)
+            self._loop.call_soon_threadsafe(self._share, topic, VP8, encoded)
 
-    def _share(self, topic: str, encoded: _Encoded) -> None:
+    def _on_h264(self, topic: str, at_ms: float, is_key: bool, unit: bytes) -> None:
+        packet = av.Packet(unit)
+        packet.pts, packet.time_base = round(at_ms * _TICKS_PER_MS), Fraction(1, CLOCK_HZ)
+        self._share(topic, H264, _Encoded(packet, at_ms, is_key))
+
+    def _on_failed(self, topic: str, why: str) -> None:
+        """Of the encoder of H.264: its viewers ask again, and who asks takes VP8 for a while."""
+        log.warning('%s is not encoded as H.264: %s; for %.0f s viewers who come take VP8', topic, why, H264_AGAIN_S)
+        self._h264_from_s = time.monotonic() + H264_AGAIN_S
+        for peer in list(self._peers.values()):
+            if (peer.topic, peer.codec) == (topic, H264):
+                self.lost(peer, f'the encoder of H.264 failed: {why}', again=True)
+
+    def _share(self, topic: str, codec: str, encoded: _Encoded) -> None:
         for peer in self._peers.values():
-            if peer.topic == topic:
+            if (peer.topic, peer.codec) == (topic, codec):
                 peer.track.offer(encoded)
 
 

@@ -1,9 +1,11 @@
-"""The camera as video over WebRTC, to a real Chromium: from a server with frames of our own."""
+"""The camera as video over WebRTC, to a real Chromium and to receivers of aiortc: from a server with frames of our own."""
 
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,7 +15,9 @@ import numpy as np
 import pytest
 import simplejpeg
 from live.test_access import Page, serving
+from live.test_h264 import software_encoder
 
+from shadowhound_data_logger.live import h264
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.options import COMPRESSED_IMAGE
@@ -92,7 +96,8 @@ async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) 
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize('codec', ['video/VP8', 'video/H264'])
+def test_two_browsers_take_the_camera_as_video(codec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is encoded once for both; each frame has the time at which it came to the robot; JPEGs are not sent beside it.
 
     When a viewer goes back to JPEG it gets those, and without viewers nothing is encoded.
@@ -103,8 +108,10 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
     shown = """() => [document.querySelector('.camera canvas').getContext('2d').getImageData(160, 120, 1, 1).data[1],
                       shadowhound.at().camera, shadowhound.video.frames]"""
 
+    named = 'none' if codec == 'video/VP8' else software_encoder()
+
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch) as found, api.async_playwright() as playwright:
+        async with robot(tmp_path, monkeypatch, h264=named) as found, api.async_playwright() as playwright:
             browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
             tabs = [await browser.new_page() for _ in range(2)]
             for tab in tabs:
@@ -117,6 +124,7 @@ def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pyte
             assert video is not None
             assert len(video._peers) == 2
             assert video.topics == {CAMERA}
+            assert video._encoders.keys() == {(CAMERA, codec)}
             (encoder,) = video._encoders.values()
             assert encoder.encoded <= len(found.at)
             assert all(CAMERA not in one.viewer.watched for one in found.server._viewers)
@@ -164,6 +172,228 @@ def test_a_page_without_the_extra_shows_jpegs_and_says_why(tmp_path: Path, monke
             before = await tab.evaluate('shadowhound.count.camera')
             await until(lambda: tab.evaluate(f'shadowhound.count.camera > {before} + 5'), 'frames as JPEG')
             await browser.close()
+
+    asyncio.run(run())
+
+
+class Receiver:
+    """A viewer without a browser, which takes one codec. aiortc gives a frame when the next one begins to arrive."""
+
+    def __init__(self, video: Any, *codecs: str) -> None:
+        import aiortc
+
+        self.video, self.codecs = video, codecs
+        self.told: list[dict[str, Any]] = []
+        self.seen: list[tuple[float, int]] = []
+        """When frames came to the robot, ms, and how bright they are."""
+        self.pc = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
+        self._task: asyncio.Task[None] | None = None
+
+    async def ask(self) -> dict[str, Any]:
+        """For the camera; what is told at once."""
+        import aiortc
+
+        from shadowhound_data_logger.live.webrtc import _gather_at
+
+        transceiver = self.pc.addTransceiver('video', direction='recvonly')
+        known = aiortc.RTCRtpReceiver.getCapabilities('video').codecs
+        transceiver.setCodecPreferences([one for name in (*self.codecs, 'video/rtx') for one in known if one.mimeType == name])
+        _gather_at(transceiver.receiver.transport.transport.iceGatherer._connection, '127.0.0.1')
+
+        @self.pc.on('track')  # type: ignore[misc]
+        def on_track(track: Any) -> None:
+            self._task = asyncio.create_task(self._read(track))
+
+        await self.pc.setLocalDescription(await self.pc.createOffer())
+        said = {'topic': CAMERA, 'offer': self.pc.localDescription.sdp}
+        await self.video.take(self, said, ('127.0.0.1', '127.0.0.1'), lambda what: self.told.append(dict(what)))
+        if answer := self.told[0].get('answer'):
+            await self.pc.setRemoteDescription(aiortc.RTCSessionDescription(answer, 'answer'))
+        return self.told[0]
+
+    async def _read(self, track: Any) -> None:
+        while True:
+            frame = await track.recv()  # its pts begin with 0
+            if first := [what['at'] for what in self.told if 'rtp' in what]:
+                self.seen.append((first[0] + frame.pts / 90, int(frame.to_ndarray(format='rgb24')[120, 160, 1])))
+
+    async def has_seen(self) -> bool:
+        return len(self.seen) >= 10
+
+    async def close(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        await self.pc.close()
+
+
+@asynccontextmanager
+async def encoded(named: str) -> AsyncIterator[tuple[Any, list[float]]]:
+    """The video of a camera of ten frames a second, and when each came, ms."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    video = webrtc.CameraVideo(lambda: None, await h264.find_h264(named))
+    at: list[float] = []
+
+    async def publish() -> None:
+        while True:
+            at.append(round(asyncio.get_running_loop().time() * 1e3, 1))
+            video.offer(LiveItem(CAMERA, 'camera', head={'at': at[-1]}, body=picture(len(at) - 1)))
+            video.tick()
+            await asyncio.sleep(0.1)
+
+    task = asyncio.create_task(publish())
+    try:
+        yield video, at
+    finally:
+        await video.close()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+def assert_is_of_its_time(seen: list[tuple[float, int]], at: list[float]) -> None:
+    for at_ms, level in seen:
+        number = min(range(len(at)), key=lambda place: abs(at[place] - at_ms))
+        assert abs(at[number] - at_ms) < 0.5, 'a time at which no frame came'
+        assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
+
+
+@pytest.mark.long("GStreamer's encoder of H.264")
+def test_viewers_of_h264_share_an_encoder_and_one_without_it_takes_vp8() -> None:
+    """Each frame has the time at which it came to the robot, in either codec; the last to go ends its encoder's process."""
+    named = software_encoder()
+
+    async def run() -> None:
+        async with encoded(named) as (video, at):
+            receivers = [Receiver(video, 'video/VP8', 'video/H264'), Receiver(video, 'video/H264'), Receiver(video, 'video/VP8')]
+            for receiver in receivers:
+                assert 'answer' in await receiver.ask()
+            assert video._encoders.keys() == {(CAMERA, 'video/H264'), (CAMERA, 'video/VP8')}
+            encoder = video._encoders[CAMERA, 'video/H264']
+            for receiver in receivers:
+                await until(receiver.has_seen, 'frames of video')
+                assert_is_of_its_time(receiver.seen, at)
+            assert encoder.encoded <= len(at)
+            pid = encoder.pid
+            for receiver in receivers:
+                video.end(receiver)
+                await receiver.close()
+            assert not video._encoders
+
+            async def is_over() -> bool:
+                try:
+                    os.kill(pid, 0)
+                except ProcessLookupError:
+                    return True
+                return False
+
+            await until(is_over, 'the process has ended')
+
+    asyncio.run(run())
+
+
+@pytest.mark.long("GStreamer's encoder of H.264")
+def test_vp8_takes_over_where_the_encoder_of_h264_is_killed() -> None:
+    """Its viewers are told to ask again, and are given VP8, as whoever comes; those of VP8 see no difference."""
+    named = software_encoder()
+
+    async def run() -> None:
+        async with encoded(named) as (video, at):
+            first, other = Receiver(video, 'video/H264', 'video/VP8'), Receiver(video, 'video/VP8')
+            for receiver in (first, other):
+                await receiver.ask()
+                await until(receiver.has_seen, 'frames of video')
+            os.kill(video._encoders[CAMERA, 'video/H264'].pid, signal.SIGKILL)
+
+            async def is_told() -> bool:
+                return 'problem' in first.told[-1]
+
+            await until(is_told, 'a problem')
+            assert first.told[-1]['again']
+            assert named in first.told[-1]['problem']
+            assert not video.has_h264
+            again = Receiver(video, 'video/H264', 'video/VP8')
+            assert 'VP8' in (await again.ask())['answer']
+            assert video._encoders.keys() == {(CAMERA, 'video/VP8')}
+            await until(again.has_seen, 'frames of VP8')
+            assert_is_of_its_time(again.seen + other.seen, at)
+            assert not [what for what in other.told if 'problem' in what]
+            for receiver in (first, other, again):
+                await receiver.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_a_browser_goes_on_with_vp8_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When the encoder of H.264 is killed: nobody has to choose video again."""
+    api = pytest.importorskip('playwright.async_api')
+    pytest.importorskip('aiortc')
+    named = software_encoder()
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch, h264=named) as found, api.async_playwright() as playwright:
+            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
+            tab = await browser.new_page()
+            tab.set_default_timeout(90_000)
+            await tab.goto(found.page.origin)
+            await tab.select_option('[data-video]', 'video')
+            await until(lambda: tab.evaluate('shadowhound.video.frames > 5'), 'frames of video')
+            video = found.server._video
+            assert video is not None
+            (encoder,) = video._encoders.values()
+            os.kill(encoder.pid, signal.SIGKILL)
+
+            async def is_vp8() -> bool:
+                return set(video._encoders) == {(CAMERA, 'video/VP8')}
+
+            await until(is_vp8, 'VP8')
+            before = await tab.evaluate('shadowhound.video.frames')
+            await until(lambda: tab.evaluate(f'shadowhound.video.frames > {before} + 5'), 'frames of VP8')
+            assert await tab.evaluate('shadowhound.video.problem.value') == ''
+            await browser.close()
+
+    asyncio.run(run())
+
+
+def test_a_viewer_that_prefers_h264_is_sent_what_was_agreed_on() -> None:
+    """Without an encoder of H.264 that is VP8, although the offer has it last; with none of both there is no video."""
+    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
+    lines = 'a=rtpmap:97 H264/90000\na=fmtp:97 packetization-mode=1;profile-level-id=42e01f\n'
+    both = OFFER.replace('SAVPF 96', 'SAVPF 97 96').replace('a=rtpmap:96', f'{lines}a=rtpmap:96')
+    alone = OFFER.replace('SAVPF 96', 'SAVPF 97').replace('a=rtpmap:96 VP8/90000\n', lines)
+    other = both.replace('packetization-mode=1', 'packetization-mode=0')
+
+    class Encoder:
+        """In the place of a process."""
+
+        def __init__(self, *_: Any) -> None: ...
+
+        def open(self) -> None: ...
+
+        async def close(self) -> None: ...
+
+    async def taken(offer: str, element: h264.H264Element | None) -> set[str]:
+        video = webrtc.CameraVideo(lambda: None, element)
+        told: list[dict[str, Any]] = []
+        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), told.append)
+        codecs = {codec for _, codec in video._encoders}
+        assert bool(codecs) is ('answer' in told[0])
+        if codecs:
+            lines = told[0]['answer'].splitlines()
+            first = next(line.split()[3] for line in lines if line.startswith('m=video'))
+            (name,) = [line.split()[1] for line in lines if line.startswith(f'a=rtpmap:{first} ')]
+            assert codecs == {f'video/{name.partition("/")[0]}'}
+        await video.close()
+        return codecs
+
+    async def run() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(webrtc, 'H264Encoder', Encoder)
+            cases = (both, 'H264', 'VP8'), (alone, 'H264', ''), (other, 'VP8', 'VP8'), (OFFER, 'VP8', 'VP8')
+            for offer, with_h264, without in cases:
+                assert await taken(offer, h264.HARDWARE[0]) == {f'video/{with_h264}'}
+                assert await taken(offer, None) == ({f'video/{without}'} if without else set())
 
     asyncio.run(run())
 
