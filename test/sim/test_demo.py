@@ -356,7 +356,7 @@ stop.wait()
 
 def asked(address: str, path: str) -> bytes:
     """What the live page answers."""
-    with build_opener(ProxyHandler({})).open(address + path, timeout=60) as answer:
+    with build_opener(ProxyHandler({})).open(address + path, timeout=90) as answer:
         assert answer.status == 200
         return bytes(answer.read())
 
@@ -397,6 +397,7 @@ def test_a_short_demo_ends_well(tmp_path: Path) -> None:
         assert '"published"' not in walking.read_text(), 'the robot walks no more'
 
         assert address in heard('Ctrl-C ends it').split()[-20:]
+        assert 'doctor' in json.loads(asked(address, 'api/doctor'))  # which takes it seconds
         assert b'<html' in asked(address, '')
         run.send_signal(signal.SIGINT)
         said += run.stdout.read()
