@@ -11,6 +11,7 @@ import hashlib
 import hmac
 import socket
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
 from typing import IO, Any, Final
 from urllib.parse import quote, urlsplit
@@ -171,6 +172,14 @@ class _Sending(_Awaiting):  # type: ignore[misc]
     _head = b''
     """Of a request that has a body: it leaves with the first piece of that."""
     _is_head_kept = False
+
+    def _new_conn(self) -> socket.socket:
+        """Only now it is known whether it is one of IPv6, which has the mark elsewhere."""
+        connection: socket.socket = super()._new_conn()
+        if connection.family == socket.AF_INET6:
+            with suppress(OSError):
+                connection.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, CS1)
+        return connection
 
     def request(self, method: str, url: str, body: Any = None, headers: Any = None, *args: Any, **kwargs: Any) -> None:
         sent = headers or {}

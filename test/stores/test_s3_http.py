@@ -111,3 +111,16 @@ def test_uploads_are_marked_as_background(bucket: str, spool: Spool, opened: Cal
     with served(server):
         opened(server.url).put(spool('robot/imu/one.json', b'one'))
     assert marks[f'/{bucket}/robot/imu/one.json'] == CS1
+
+
+def test_uploads_over_ipv6_are_marked_as_well() -> None:
+    """The option is another one there."""
+    try:
+        listener = socket.create_server(('::1', 0), family=socket.AF_INET6)
+    except OSError as error:
+        pytest.skip(f'no IPv6 here: {error}')
+    with listener:
+        connection: Any = _Connection('::1', listener.getsockname()[1])
+        connection.connect()
+        assert connection.sock.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS) == CS1
+        connection.close()
