@@ -215,6 +215,14 @@ def in_browser(url: str, token: str, machines: Machines, folder: Path, seconds: 
         page.reload()  # signed in: how long until there is a frame
         until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
         found: dict[str, Any] = {'first_frame_ms': round(page.evaluate('shadowhound.first'))}
+        with browser.new_context(viewport={'width': 1280, 'height': 800}, storage_state=page.context.storage_state()) as cold:
+            page.goto('about:blank')  # it draws nothing meanwhile
+            fresh = cold.new_page()
+            fresh.goto(url)  # signed in, and nothing of the page is in its cache
+            until(lambda: fresh.evaluate('window.shadowhound?.first ?? 0') > 0, 'there is a frame')
+            found['first_frame_cold_ms'] = round(fresh.evaluate('shadowhound.first'))
+        page.goto(url)
+        until(lambda: page.evaluate('shadowhound.drawn.cloud?.length > 20'), 'clouds are drawn')
         page.evaluate('for (const late of [shadowhound.came, shadowhound.drawn]) for (const kind in late) late[kind] = []')
         page.wait_for_timeout(seconds * 1e3)
         for where, kinds in page.evaluate('({came: shadowhound.came, drawn: shadowhound.drawn})').items():
