@@ -2,7 +2,7 @@
 import { html, useEffect, useRef, useState } from './vendor/preact.js';
 import { busy, days, go, leave, list, look, openDay, openRobot, past, playing, problem as pastProblem, range, robots, speed, told } from './past.js';
 import { Pull } from './pull.js';
-import { CAUSES, clock, digits, hue, moment, span } from './words.js';
+import { clock, digits, meaning, moment, shade, span } from './words.js';
 
 const SPANS = [[15, '15 min'], [60, '1 h'], [360, '6 h'], [0, 'Today']];
 const ZOOMS = [[1, '1 min'], [15, '15 min'], [60, '1 h'], [360, '6 h'], [1440, '24 h']];
@@ -30,6 +30,23 @@ function lanes(marks, x) {
     ends[lane] = Math.max(ends[lane] ?? 0, right + 4);
     return { ...mark, lane };
   });
+}
+
+// What is drawn in the hue of a cause, on a tile of 6 by 6.
+const MARKS = { bands: 'M0 3h6v2.4h-6z', stripes: 'M0 6L6 0H3L0 3zM6 6V3L3 6z', dots: 'M1.3 3a1.7 1.7 0 1 0 3.4 0a1.7 1.7 0 1 0-3.4 0z', checks: 'M0 0h3v3h-3zM3 3h3v3h-3z' };
+
+function Patterns({ shades }) {
+  return shades.filter(([, pattern]) => MARKS[pattern]).map(([hue, pattern]) => html`<pattern id=${`${hue}-${pattern}`} class=${`hue-${hue}`} width="6" height="6" patternUnits="userSpaceOnUse">
+    <rect class="solid" width="6" height="6" /><path class="pattern-mark" d=${MARKS[pattern]} /></pattern>`);
+}
+
+function paint(cause, also = '') {
+  const [hue, pattern] = shade(cause);
+  return MARKS[pattern] ? { class: also, fill: `url(#${hue}-${pattern})` } : { class: `${also} hue-${hue} solid` };
+}
+
+function Swatch({ cause }) {
+  return html`<svg class="swatch" width="12" height="12" data-swatch=${cause} aria-hidden="true"><rect ...${paint(cause)} width="12" height="12" /></svg>`;
 }
 
 export function Copy({ text }) {
@@ -170,6 +187,7 @@ export function Timeline({ session }) {
   const top = marks.length ? (Math.max(...marks.map((mark) => mark.lane)) + 1) * LANE + 6 : 0;
   const height = top + topics.length * ROW + 26;
   const seen = new Map();
+  const shades = [...new Map([...gaps, ...(chosen ? [chosen] : [])].map(({ cause }) => [shade(cause).join(), shade(cause)])).values()];
   for (const gap of gaps) {
     const name = `${gap.kind} ${gap.cause}`;
     const known = seen.get(name) ?? { ...gap, messages: 0, rows: 0 };
@@ -234,7 +252,7 @@ export function Timeline({ session }) {
           aria-valuemin=${Math.round(from)} aria-valuemax=${Math.round(to)} aria-valuenow=${Math.round(past.value?.at ?? now)} aria-valuetext=${moment(past.value?.at ?? now)}
           onPointerDown=${down} onPointerMove=${drag} onPointerUp=${() => { drags.current = false; }} onPointerCancel=${() => { drags.current = false; }} onKeyDown=${key}>
         <defs><pattern id="unknown" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">
-          <rect class="unknown-back" width="6" height="6" /><rect class="unknown-line" width="2" height="6" /></pattern></defs>
+          <rect class="unknown-back" width="6" height="6" /><rect class="unknown-line" width="2" height="6" /></pattern><${Patterns} shades=${shades} /></defs>
         ${ticks(from, to).map((at) => html`<g><line class="tick" x1=${x(at)} x2=${x(at)} y1="0" y2=${height - 22} />
           <text class="tick-label" x=${x(at)} y=${height - 6}>${clock(at, to - from < 600000)}</text></g>`)}
         ${marks.map((mark) => html`<g class=${`mark-of-${mark.kind}`} data-mark=${mark.kind} data-from=${mark.from} data-to=${mark.to} data-name=${mark.name} transform=${`translate(0 ${mark.lane * LANE})`}>
@@ -251,7 +269,7 @@ export function Timeline({ session }) {
             x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1" />`)}
           ${kept.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="kept" data-topic=${topic} data-from=${since} data-to=${until}
             x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1"><title>kept on the robot</title></rect>`)}
-          ${gaps.filter((gap) => gap.topic === topic).map((gap) => html`<rect class=${`gap hue-${hue(gap.kind, gap.cause)}`} data-topic=${topic} data-kind=${gap.kind}
+          ${gaps.filter((gap) => gap.topic === topic).map((gap) => html`<rect ...${paint(gap.cause, 'gap')} data-topic=${topic} data-kind=${gap.kind}
             data-cause=${gap.cause} data-from=${gap.from} data-to=${gap.to} data-count=${gap.count} x=${x(gap.from)} y="3"
             width=${Math.max(2.5, x(gap.to) - x(gap.from))} height=${ROW - 6} rx="1.5" onPointerEnter=${() => setChosen(gap)}>
             <title>${`${topic}: ${gap.count} ${gap.kind} (${gap.cause}), ${clock(gap.from)} for ${span((gap.to - gap.from) / 1000)}`}</title></rect>`)}
@@ -265,13 +283,13 @@ export function Timeline({ session }) {
       ${isPast && html`<span><i class="swatch recorded"></i>recorded</span>`}
       ${kept.length > 0 && html`<span><i class="swatch kept"></i>kept on the robot</span>`}
       <span><i class="swatch known"></i>nothing else is missing</span><span><i class="swatch unknown"></i>not known yet</span>
-      ${[...seen.values()].map((each) => html`<span title=${CAUSES[each.cause] ?? ''}><i class=${`swatch hue-${hue(each.kind, each.cause)}`}></i>${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
+      ${[...seen.values()].map((each) => html`<span title=${meaning(each.cause)}><${Swatch} cause=${each.cause} />${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
       ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
       ${found && !gaps.length && topics.length > 0 && html`<span class="good">no gap is known in this time</span>`}
       ${!isPast && topics.length > 0 && html`<span class="unit">click on a time to see it again</span>`}
     </div>
-    ${chosen && html`<p class="chosen" aria-live="polite"><i class=${`swatch hue-${hue(chosen.kind, chosen.cause)}`}></i><b>${chosen.topic}</b> ${digits(chosen.count)} messages
-      ${chosen.kind}, ${CAUSES[chosen.cause] ?? chosen.cause.replaceAll('_', ' ')}: from ${clock(chosen.from)} for ${span((chosen.to - chosen.from) / 1000)}${chosen.grade === 'exact' ? '' : ' (estimated)'}</p>`}
+    ${chosen && html`<p class="chosen" aria-live="polite"><${Swatch} cause=${chosen.cause} /><b>${chosen.topic}</b> ${digits(chosen.count)} messages
+      ${chosen.kind}, ${meaning(chosen.cause)}: from ${clock(chosen.from)} for ${span((chosen.to - chosen.from) / 1000)}${chosen.grade === 'exact' ? '' : ' (estimated)'}</p>`}
     ${isPast && html`<${Commands} />`}
     ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
       <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td>${clock(gap.from)}</td>

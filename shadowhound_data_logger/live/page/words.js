@@ -32,10 +32,32 @@ export const clock = (ms, seconds = true) => new Date(ms).toISOString().slice(11
 
 export const moment = (ms) => `${new Date(ms).toISOString().slice(0, 10)} ${new Date(ms).toISOString().slice(11, 21)}`;
 
-export const CAUSES = {
-  restart: 'The node was not running', transport: 'Lost on the way to the node', no_room: 'The disk was full', queue_full: 'The queue was full',
-  paused: 'The node was paused', unknown: 'Of unknown cause',
+// Of each cause what it means, and how gaps of it look: a hue, and what is drawn in it. No two look the same.
+const CAUSES = {
+  transport: ['Lost on the way to the node', 'red', 'solid'], silence: ['None came for long', 'sky', 'solid'], restart: ['The node was not running', 'purple', 'solid'],
+  paused: ['The node was paused', 'blue', 'solid'], queue_full: ['The queue was full', 'yellow', 'solid'], no_room: ['The disk was full', 'brown', 'solid'],
+  damaged: ['The file in the spool was damaged', 'ink', 'solid'], keep_limit: ['More was kept than keep.max_bytes allows', 'pink', 'solid'], unknown: ['Of unknown cause', 'grey', 'solid'],
+  ring_full: ['The ring of events was full', 'yellow', 'bands'], unwritable: ['The disk took nothing', 'brown', 'bands'], shutdown: ['The node ended before they were stored', 'purple', 'bands'],
+  stopped: ['The bag had ended', 'purple', 'stripes'], keep_days: ['They were kept for long enough', 'pink', 'bands'], thinned: ['Room ran short: others of that time are kept', 'pink', 'stripes'],
+  retention: ['Removed from the store by a rule', 'pink', 'dots'], sampler_failed: ['The node failed to sort them', 'red', 'bands'], encoder_failed: ['The node failed to encode them', 'red', 'stripes'],
+  unsafe_key: ['Their key cannot be stored', 'red', 'dots'], wrong_type: ['Messages of another type', 'blue', 'bands'], unknown_type: ['The type is not known to the node', 'blue', 'stripes'],
+  unknown_field: ['The type has no such field', 'blue', 'dots'], surplus: ['The format holds one message', 'blue', 'checks'], malformed: ['The messages were broken', 'sky', 'bands'],
+  size_mismatch: ['Their sizes contradict one another', 'sky', 'stripes'], too_large: ['The pictures were too large', 'sky', 'dots'], empty: ['They held nothing', 'sky', 'checks'],
+  unsupported_encoding: ['Their encoding is not supported', 'yellow', 'stripes'], missing: ['The file in the spool is gone', 'ink', 'bands'], foreign: ['Another object has their key', 'ink', 'stripes'],
+  access_denied: ['The store denied them', 'ink', 'dots'], refused: ['The store refused them', 'ink', 'checks'], name: ['The store cannot have their name', 'brown', 'stripes'],
+  size: ['They were larger than the store takes', 'brown', 'dots'], changed: ['They changed while they were sent', 'brown', 'checks'],
 };
-const HUES = { restart: 'violet', transport: 'red', paused: 'blue', no_room: 'orange', queue_full: 'orange', unknown: 'grey' };
-const KINDS = { dropped: 'orange', rejected: 'pink', evicted: 'brown', quarantined: 'brown', missed: 'red' };
-export const hue = (kind, cause) => HUES[cause] || KINDS[kind] || 'grey';
+const PATTERNS = ['solid', 'bands', 'stripes', 'dots', 'checks'];
+const taken = Object.values(CAUSES).map(([, hue, pattern]) => `${hue} ${pattern}`);
+const HUES = [...new Set(Object.values(CAUSES).map(([, hue]) => hue))];
+const free = PATTERNS.flatMap((pattern) => HUES.map((hue) => [hue, pattern])).filter((each) => !taken.includes(each.join(' ')));
+const others = new Map(); // what a server calls it, say: as they come, each its own look while there are any
+
+const known = (cause) => (Object.hasOwn(CAUSES, cause || 'unknown') ? CAUSES[cause || 'unknown'] : null);
+
+export function shade(cause) {
+  if (!known(cause) && !others.has(cause)) others.set(cause, free[others.size % free.length]);
+  return known(cause)?.slice(1) ?? others.get(cause);
+}
+
+export const meaning = (cause) => known(cause)?.[0] ?? cause.replaceAll('_', ' ');
