@@ -1,7 +1,9 @@
 // Back in time: which moment is shown, what the robot recorded then, and playing on from there.
 import { batch, signal } from './vendor/preact.js';
 
-const PIECE_MS = 250;
+const PIECE_MS = 150; // between two moments that are played, where they can be read that fast
+const LONGEST_MS = 1000; // what takes longer plays slower
+const TICK_MS = 20;
 
 export const past = signal(null); // null: now; else { robot, at, mission, shown, commands }
 export const range = signal(null); // what the timeline shows of the past: { robot, from, to }
@@ -42,8 +44,12 @@ function parts(content) {
   return [head, items];
 }
 
+const read = async (robot, at) => parts(await (await ask('moment', { robot, at: Math.round(at) })).arrayBuffer());
+
 let wanted = null;
 let asking = false;
+let ahead = null; // the moment that is played next, asked for while the one before it is shown: { robot, at, answer }
+let shownAt = 0;
 async function load() {
   if (asking) return;
   asking = true;
@@ -52,8 +58,10 @@ async function load() {
     wanted = null;
     busy.value = true;
     try {
-      const [head, items] = parts(await (await ask('moment', { robot, at: Math.round(at) })).arrayBuffer());
+      const isNext = ahead?.robot === robot && ahead.at === at;
+      const [head, items] = await (isNext ? ahead.answer : read(robot, at));
       if (past.value === null) break;
+      if (playing.value && !wanted) askAhead(robot, at);
       batch(() => {
         past.value = { ...past.value, ...head, robot, at: wanted?.at ?? past.value.at, read: head.at };
         problem.value = '';
@@ -124,14 +132,31 @@ export async function openRobot(robot) {
   else problem.value = `nothing of ${chosen} is stored yet`;
 }
 
-let lastAt = 0;
-setInterval(() => {
+const end = () => Math.min(range.value?.to ?? Infinity, told.value?.now ?? Infinity);
+
+// The moment after this one, which is as far from it as the last one took to come.
+function askAhead(robot, at) {
   const now = performance.now();
-  const passed = Math.min(1000, now - lastAt);
-  lastAt = now;
-  if (!playing.value || !past.value || document.hidden || asking) return;
-  const at = past.value.at + passed * speed.value;
-  const end = Math.min(range.value?.to ?? at, told.value?.now ?? at);
-  if (at >= end) playing.value = false;
-  go(past.value.robot, Math.min(at, end));
-}, PIECE_MS);
+  const passed = Math.min(LONGEST_MS, Math.max(PIECE_MS, now - shownAt));
+  shownAt = now;
+  const next = Math.min(at + passed * speed.value, end());
+  ahead = { robot, at: next, answer: read(robot, next) };
+  ahead.answer.catch(() => {}); // whoever waits for it is told; nobody may
+}
+
+function play() {
+  if (!past.value || document.hidden || asking) return;
+  if (!ahead) askAhead(past.value.robot, past.value.at);
+  if (performance.now() < shownAt + PIECE_MS) return;
+  const { robot, at } = ahead;
+  if (at >= end()) playing.value = false;
+  go(robot, at);
+}
+
+let player;
+playing.subscribe((isOn) => {
+  clearInterval(player);
+  ahead = null;
+  shownAt = performance.now();
+  if (isOn) player = setInterval(play, TICK_MS);
+});
