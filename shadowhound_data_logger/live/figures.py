@@ -27,7 +27,7 @@ _HEAD: Final = (
     'spool',
     'session',
 )
-_OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered')
+_OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered', 'waits_for', 'left_s')
 _OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
 MOST_GAPS: Final = 4000
 """Rows of the timeline; of more, neighbours of a topic and cause are one."""

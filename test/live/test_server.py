@@ -12,8 +12,11 @@ import aiohttp
 import pytest
 from e2e.live_frames import Frames
 from live.test_access import serving
+from spool.making import FakeClock
+from spool.test_status import written
 
 from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live.figures import SpoolFigures
 from shadowhound_data_logger.live.kinds import FULL, HALF, LiveItem
 from shadowhound_data_logger.live.server import NARROW_S, LiveServer, LiveSettings
 from shadowhound_data_logger.live.viewer import Viewer
@@ -163,3 +166,11 @@ def test_a_page_on_a_narrow_link_is_told_so(tmp_path: Path, monkeypatch: pytest.
                             return head
 
     assert asyncio.run(run()) == {'topic': '', 'kind': 'video', 'narrow': True}
+
+
+def test_figures_say_what_uploads_wait_for(tmp_path: Path) -> None:
+    """The rule and why it does not hold, and how long it takes until all has arrived, as the node's status has them."""
+    said = {'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}, 'left_s': 754}
+    written(tmp_path, store={'state': 'waiting', **said})
+    store = SpoolFigures(tmp_path, 'thor', FakeClock()).now(with_ledger=False)['store']
+    assert {name: store[name] for name in said} == said

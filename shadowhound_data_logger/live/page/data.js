@@ -49,15 +49,16 @@ export function Cards({ figures }) {
   const { queue, spool, store, objects } = figures;
   const waiting = spool?.pending ?? objects?.pending ?? 0;
   const bytes = figures.bytes?.pending ?? 0;
-  const pace = store?.mbps ? (bytes * 8e-6) / store.mbps : null;
+  const rules = Object.entries(store?.waits_for ?? {});
+  const left = store?.left_s ?? null;
   const storeState = store?.state ? store.state.replaceAll('_', ' ') : 'no node runs';
   const isFine = ['idle', 'shipping', 'not_draining', 'waiting'].includes(store?.state);
   return html`<div class="cards">
     <div class="panel card"><h3>Delivery</h3><p class="big"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
       <dl><dt>to</dt><dd>${store?.target || '–'}</dd><dt>sends</dt><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
-      <dt>delivered</dt><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${Object.entries(store?.waits_for ?? {}).map(([name, why]) => html`<p class="note">waits for ${name}: ${why}</p>`)}</div>
+      <dt>delivered</dt><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${name}>waits for ${why}</p>`)}</div>
     <div class="panel card"><h3>Waiting</h3><p class="big">${digits(waiting)} <small>objects</small></p>
-      <dl><dt>size</dt><dd>${volume(bytes)}</dd><dt>there in</dt><dd>${waiting === 0 ? 'nothing waits' : pace !== null ? span(pace) : 'not at today’s pace'}</dd>
+      <dl><dt>size</dt><dd>${volume(bytes)}</dd><dt>there in</dt><dd data-field="left">${waiting === 0 ? 'nothing waits' : left !== null ? span(left) : rules.length ? 'once a rule holds' : 'not at today’s pace'}</dd>
       <dt>oldest</dt><dd>${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</dd></dl></div>
     <div class="panel card"><h3>Spool</h3><p class="big">${volume(spool?.bytes)}</p>
       <${Bar} part=${spool?.bytes ?? 0} whole=${spool?.max_bytes} label="how full the spool is" />
