@@ -7,6 +7,7 @@ stays while it has a publisher. Whatever else is published there is counted wher
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
@@ -175,6 +177,7 @@ class Subscriber:
         self._stream: SensorStream | TopicStream | None = None
         self.paused = False
         """Whether messages are only counted."""
+        self._last_taken_s: float | None = None
         self._last_received_s: float | None = None
         self._unavailable = ''
         self._told: set[str] = set()
@@ -383,10 +386,17 @@ class Subscriber:
         before_s, reader.drained_s = reader.drained_s, now_s
         if not taken or self._stream is None:
             return
-        self._history.hear([len(message.cdr) for message in taken], POLL_S if before_s is None else now_s - before_s)
-        last_s, self._last_received_s = self._last_received_s, now_s
+        since_s = POLL_S if before_s is None else now_s - before_s
+        self._history.hear([len(message.cdr) for message in taken], since_s)
+        last_s, self._last_taken_s = self._last_taken_s, now_s
+        self._last_received_s = now_s - _waited_s(taken[-1].received_ns, since_s)
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
             gids = [each.gid for each in self._publishers_of(self._chosen) if each.type == self._type]
             self._senders.look(gids, now_s)
         self._stream.add(taken, self._senders, now_s, paused=self.paused)
+
+
+def _waited_s(received_ns: int, most_s: float) -> float:
+    """How long a message lay in the middleware, by the wall clock that stamped it there, which may have stepped meanwhile."""
+    return min(max(0.0, (time.time_ns() - received_ns) / SECOND), most_s) if received_ns else 0.0

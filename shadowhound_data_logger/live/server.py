@@ -502,10 +502,14 @@ class LiveServer:
 
     async def _tell_figures(self, *, with_ledger: bool) -> None:
         async with self._reading:
-            figures = await self._loop.run_in_executor(self._pool, partial(self._figures.now, with_ledger=with_ledger))
-        item = LiveItem('', 'figures', head={'at': round(time.monotonic() * 1e3, 1), 'figures': figures})
+            item = await self._loop.run_in_executor(self._pool, partial(self._read_figures, with_ledger=with_ledger))
         for one in self._viewers:
             one.tell(item)
+
+    def _read_figures(self, *, with_ledger: bool) -> LiveItem:
+        """``at`` is when their ages were right: the ledger may take a while."""
+        at_ms = round(time.monotonic() * 1e3, 1)
+        return LiveItem('', 'figures', head={'at': at_ms, 'figures': self._figures.now(with_ledger=with_ledger)})
 
     @property
     def _is_watched_from_afar(self) -> bool:

@@ -28,6 +28,8 @@ const IN_MEMORY = { willReadFrequently: true };
 const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])) });
 let link;
 let video;
+const present = signal(null); // the robot's time, ms
+setInterval(() => { if (!document.hidden) present.value = link?.now() ?? null; }, 100);
 
 function note(where, kind, at) {
   const now = link?.now() ?? null;
@@ -104,7 +106,7 @@ function onItem(head, body) {
     });
     rewatch();
   } else if (kind === 'figures') {
-    figures.value = head.figures;
+    figures.value = { ...head.figures, at: head.at };
     document.title = `${head.figures.robot} · live`;
     rewatch();
   } else if (kind === 'camera') {
@@ -308,7 +310,7 @@ function App() {
         <${Chart} title="Joints" kind="joints" lines=${null} options=${{ unit: 'rad' }} figure="joints, rad" />
         <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
         <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
-      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} />
+      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} />
         <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}><${Foxglove} />` : html`<p class="empty">…</p>`}</section>`}
       <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>

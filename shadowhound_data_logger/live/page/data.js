@@ -18,12 +18,23 @@ export function Mark({ kind, why }) {
   return html`<span class=${`mark ${kind}`} role="img" aria-label=${why || MARKS[kind][1]} title=${why || MARKS[kind][1]}>${MARKS[kind][0]}</span>`;
 }
 
-export function TopicTable({ figures }) {
+// The node looks once a second. What comes more often is at most a period old until it looks again; what is silent ages on.
+const LOOKS_HZ = 1;
+const POLL_S = 0.3; // the node may learn of a message so late
+const STALE_S = 3;
+function TopicAge({ row, figures, now }) {
+  if (row.age_s === null || row.age_s === undefined) return '–';
+  const since = (figures.age_s ?? 0) + Math.max(0, (now.value ?? figures.at) - figures.at) / 1e3;
+  const goesOn = row.rate_hz >= LOOKS_HZ && row.age_s < POLL_S + 2 / row.rate_hz && since < STALE_S;
+  return (goesOn ? Math.min(row.age_s, 1 / row.rate_hz) : row.age_s + since).toFixed(1);
+}
+
+export function TopicTable({ figures, now }) {
   const rows = figures.topics;
   if (!rows.length) return html`<div class="panel"><p class="empty">No topic has been heard yet.</p></div>`;
   const cell = (row, name) => {
     if (name === 'rate') return row.rate_hz === null || row.rate_hz === undefined ? '–' : row.rate_hz.toFixed(1);
-    if (name === 'age') return row.age_s === null || row.age_s === undefined ? '–' : row.age_s.toFixed(1);
+    if (name === 'age') return html`<${TopicAge} row=${row} figures=${figures} now=${now} />`;
     if (name === 'missed' && row.missed === null && row.missed_estimated !== null) return html`~${digits(row.missed_estimated)}`;
     return digits(row[name]);
   };
