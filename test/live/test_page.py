@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import json
+import math
+import re
 import secrets
 import shlex
 import shutil
@@ -18,28 +21,49 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from domains import free_domain
 from e2e.machines import ROBOT, Machines
 from e2e.processes import Node, Processes, until
 from lake.making import add, add_part, folder_store
 from lake.test_pull import Field
-from live.test_history import jpeg, patrol, told
+from live.test_history import ODOMETRY, jpeg, odometry, patrol, told
+from live.test_kinds import cdr, header, new
+from spool.test_status import written
 
+import shadowhound_data_logger
+from shadowhound_data_logger.bags.recording import UNWRITABLE
+from shadowhound_data_logger.bags.ring import RING_FULL
+from shadowhound_data_logger.capture.encode_pool import ENCODER_FAILED
+from shadowhound_data_logger.capture.sampling import QUEUE_FULL, SAMPLER_FAILED
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.lake.prune import CAUSE as RETENTION
 from shadowhound_data_logger.live import server as server_module
 from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
+from shadowhound_data_logger.ros.endpoints import POLL_S
+from shadowhound_data_logger.spool.accounts import PAUSED, WRONG_TYPE
+from shadowhound_data_logger.spool.estimator import RESTART, SILENCE, TRANSPORT
+from shadowhound_data_logger.spool.index import MISSING
+from shadowhound_data_logger.spool.recovery import DAMAGED
+from shadowhound_data_logger.spool.retention import KEEP_DAYS, KEEP_LIMIT, NO_ROOM, THINNED
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
 
+    from shadowhound_data_logger.stores.base import ObjectStore
+
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 FLAGS = ['--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--no-sandbox']
 RATES = 'rate_scale:=0.2'
-IMU = 'sensor_msgs/msg/Imu'
+SHOWN_HZ = {'/imu': 20.0, '/odom': 10.0, '/joint_states': 10.0, '/lowstate': 4.0, '/camera/compressed': 6.0}
+"""What the simulator publishes at that scale, of some topics."""
+EVENTS = {'events.topics': ['/imu'], 'events.pre_s': 2.0, 'events.post_s': 0.5}
+IMU, JOINTS = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.long('a Chromium, a robot and a node'),
@@ -52,7 +76,7 @@ class Watching:
 
     def __init__(self, processes: Processes) -> None:
         self.processes = processes
-        self.node: Node = processes.node()
+        self.node: Node = processes.node(parameters=EVENTS)
         self.sim = processes.sim(RATES)
         self.home = self.node.home
         self.serve(0)
@@ -62,6 +86,10 @@ class Watching:
 
     def ledger(self) -> dict[str, Any]:
         return self.node.ledger()['topics']
+
+    def bagged(self) -> int:
+        """Messages that came for bags."""
+        return sum(row['received'] for row in self.node.ledger()['bags'].values())
 
 
 @pytest.fixture(scope='module')
@@ -127,9 +155,41 @@ def test_everything_is_shown(page: Page) -> None:
     assert page.wrong == []
 
 
+def cell(page: Page, topic: str, field: str) -> float:
+    """What the table says of a topic; NaN for a dash."""
+    text = page.locator(f'td[data-topic="{topic}"][data-field="{field}"]').inner_text()
+    return float(text) if text.replace('.', '').isdecimal() else math.nan
+
+
+def test_the_rates_are_the_robots(page: Page) -> None:
+    """Within a tenth of what is published; what comes ten times a second is at most 0.2 s too old, for two looks of the node."""
+
+    def wrong() -> dict[str, tuple[float, float]]:
+        found = {}
+        end_s = time.monotonic() + 2.5
+        while not found and time.monotonic() < end_s:
+            told = {topic: (cell(page, topic, 'rate'), cell(page, topic, 'age'), hz) for topic, hz in SHOWN_HZ.items()}
+            found = {topic: (rate, age_s) for topic, (rate, age_s, hz) in told.items()
+                     if not (abs(rate - hz) <= hz / 10 and age_s <= (0.3 if hz >= 10 else 1.0))}  # fmt: skip
+        return found
+
+    until(lambda: not wrong(), lambda: f'rates and ages are shown as {wrong()}')
+
+
 def test_a_viewer_has_no_buttons_that_act(page: Page) -> None:
-    """Until somebody signs in with the operator's token; then the node answers, and says in its log who asked."""
+    """Only one to sign in as operator: a viewer may watch."""
+    page.locator('.controls').wait_for()
+    assert page.locator('.controls button').all_inner_texts() == ['Sign in as operator']
     assert page.locator('[data-act]').count() == 0
+
+
+def answer_to(page: Page, act: str) -> str:
+    """The node's newest answer on the page, once it is to this; the button can be pressed again then."""
+    holds(page, f'document.querySelector(".answers li b")?.textContent === {json.dumps(act)}')
+    holds(page, 'document.querySelectorAll(".controls button:disabled").length === 0')
+    first = page.locator('.answers li').first
+    assert first.get_attribute('class') != 'bad', first.inner_text()
+    return first.inner_text()
 
 
 def test_an_operator_acts(page: Page, watching: Watching) -> None:
@@ -141,18 +201,89 @@ def test_an_operator_acts(page: Page, watching: Watching) -> None:
     page.locator('dialog [role=alert]').wait_for()
     page.locator('dialog input[name=token]').fill(token)
     press(page.locator('dialog button.primary'))
-    for act, words in (('flush', 'spooled'), ('bag start', ''), ('bag stop', '')):
-        before = page.locator('.answers li').count()
+    page.get_by_label('Name of the event').fill('bump')
+    page.get_by_label('Note', exact=True).fill('against the shelf')
+    for act, words in (
+        ('bag start', ''), ('event', 'event_bump_'), ('bag split', 'has 1 slices that are closed'), ('pause', 'are counted'),
+        ('resume', 'messages are stored again'), ('bag stop', ' messages in 2 slices'), ('flush', ' spooled'),
+    ):  # fmt: skip
+        if act in {'bag split', 'bag stop'}:  # there is something in the slice
+            recorded = watching.bagged()
+            until(lambda recorded=recorded: watching.bagged() > recorded, 'messages come into the bag')
         press(page.locator(f'[data-act="{act}"]'))
-        holds(page, f'document.querySelectorAll(".answers li").length > {before}')
-        answer = page.locator('.answers li').first.inner_text()
-        assert act in answer
-        assert words in answer
-        assert page.locator('.answers li').first.get_attribute('class') != 'bad', answer
-    until(lambda: 'operator at 127.0.0.1: flush' in watching.node.log, 'the log names the operator')
+        assert words in answer_to(page, act)
+        assert watching.node.log.count(f'operator at 127.0.0.1: {act}: ') == 1
+        if act == 'pause':
+            page.locator('.pill', has_text='paused').wait_for()
+    page.locator('[data-act=pause]').wait_for()
+    assert 'event bump (page)' in watching.node.log
     assert not any(token in url for url in page.asked)
     assert token not in watching.live.log
     page.wrong.clear()  # the browser's own line about the wrong token (401)
+
+
+def tabbed(page: Page, selector: str) -> None:
+    """Press Tab until that has the focus, as one sees."""
+    for _ in range(80):
+        page.keyboard.press('Tab')
+        if page.evaluate(f'document.activeElement.matches({json.dumps(selector)})'):
+            assert page.evaluate('getComputedStyle(document.activeElement).outlineStyle') == 'solid'
+            return
+    raise AssertionError(f'no Tab leads to {selector}')
+
+
+def test_the_keyboard_presses_and_scrubs(page: Page) -> None:
+    """A button that Tab leads to acts, by space as by enter; on the timeline arrows move the moment by one second and by ten."""
+    page.evaluate('document.activeElement.blur()')
+    for act, key in (('pause', 'Space'), ('resume', 'Enter')):
+        page.locator(f'[data-act={act}]').wait_for()
+        tabbed(page, f'[data-act={act}]')
+        page.keyboard.press(key)
+        answer_to(page, act)
+        page.evaluate('document.activeElement.blur()')
+    page.locator('[data-act=pause]').wait_for()
+    page.locator('svg[role=slider]').wait_for()
+    tabbed(page, 'svg[role=slider]')
+    page.keyboard.press('ArrowLeft')
+    moment = page.locator('[data-moment]')
+    at_ms = int(moment.get_attribute('data-moment') or 0)
+    for key, moved_ms in (('ArrowLeft', -1000), ('Shift+ArrowLeft', -11_000), ('ArrowRight', -10_000), ('Shift+ArrowRight', 0)):
+        page.keyboard.press(key)
+        holds(page, f'Number(document.querySelector("[data-moment]").dataset.moment) === {at_ms + moved_ms}')
+    holds(page, '(shadowhound.past?.count ?? 0) > 0')
+    tabbed(page, '.timeline .panel-head button.primary')
+    page.keyboard.press('Enter')
+    page.locator('#data').wait_for()
+
+
+def test_motion_and_colours_are_as_the_user_wants_them(page: Page) -> None:
+    """Nothing moves by itself for who asked for that; and the page is dark in a dark system."""
+    moving = """() => [...document.querySelectorAll('*')].filter((each) => {
+        const style = getComputedStyle(each);
+        return style.animationName !== 'none' || !/^0s(, 0s)*$/.test(style.transitionDuration) || style.scrollBehavior !== 'auto';
+    }).map((each) => each.tagName)"""
+    try:
+        page.emulate_media(reduced_motion='no-preference')
+        assert page.evaluate(moving) == ['HTML']  # it scrolls smoothly to the part that was clicked
+        page.emulate_media(reduced_motion='reduce')
+        assert page.evaluate(moving) == []
+        assert page.evaluate('document.getAnimations().length') == 0
+        shades = {}
+        for scheme in ('light', 'dark'):
+            page.emulate_media(color_scheme=scheme)
+            for part in ('body', '.panel'):
+                style = f'getComputedStyle(document.querySelector("{part}"))'
+                colours = page.evaluate(f'[{style}.backgroundColor, {style}.color]')
+                shades[scheme, part] = [sum(rgb(colour)) for colour in colours]
+        assert all(back > text + 300 for (scheme, _), (back, text) in shades.items() if scheme == 'light')
+        assert all(back < text - 300 for (scheme, _), (back, text) in shades.items() if scheme == 'dark')
+    finally:
+        page.emulate_media(reduced_motion='no-preference', color_scheme='light')
+
+
+def rgb(colour: str) -> list[int]:
+    """Of a computed colour."""
+    return [int(part) for part in re.findall(r'\d+', colour)[:3]]
 
 
 @pytest.fixture
@@ -228,7 +359,38 @@ def test_the_figures_are_those_of_the_ledger(page: Page, watching: Watching) -> 
         )
 
     until(same, lambda: f'{shown()} is {watching.ledger()}')
-    assert all({'rate', 'age'} <= fields.keys() for fields in shown().values())
+
+
+def test_the_age_of_a_silent_topic_is_the_publishers(page: Page, watching: Watching) -> None:
+    """Within 200 ms, counted from the last message that was published, whenever that was between two polls of the node."""
+    turned = np.array([0.5])
+    message = cdr(new(JOINTS, header=header(), name=['hip'], position=turned, velocity=turned, effort=turned), JOINTS)
+    publisher = watching.processes.publisher()
+    publisher.create('/joint_states', JOINTS)
+    publisher.heard('/joint_states', watching.node, message)
+    for phase_s in (0.17, 0.05):  # the last one comes just after a poll, and just before one
+        until(lambda phase_s=phase_s: (time.time() - phase_s) % POLL_S < 0.02, 'it is time')
+        publisher.publish('/joint_states', [message] * 60, 0.05)
+        sent_s = time.monotonic()
+
+        def is_told(sent_s: float = sent_s) -> bool:
+            silent_s = time.monotonic() - sent_s
+            return silent_s > 0.5 and abs(cell(page, '/joint_states', 'age') - silent_s) < 0.3
+
+        until(is_told, lambda: f'the page tells its age: {cell(page, "/joint_states", "age")}', 10.0)
+        wrong_s = []
+        while time.monotonic() < sent_s + 5.0:
+            before_s = time.monotonic()
+            age_s, after_s = cell(page, '/joint_states', 'age'), time.monotonic()
+            wrong_s.append(max(0.0, abs(age_s - ((before_s + after_s) / 2 - sent_s)) - (after_s - before_s) / 2))
+        print(f'its age differs by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth')  # noqa: T201 - for whoever measures
+        assert most_of(wrong_s) <= 0.2
+    publisher.end()
+
+
+def most_of(found: list[float]) -> float:
+    """19 of 20 are no larger: now and then two busy cores let a page wait."""
+    return sorted(found)[len(found) * 19 // 20]
 
 
 def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching) -> None:
@@ -238,7 +400,7 @@ def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching
     watching.node.received('/imu', received + 20)
     watching.node.kill()
     time.sleep(3.0)  # for this long messages are lost: it is what is tested
-    watching.node = watching.processes.node()
+    watching.node = watching.processes.node(parameters=EVENTS)
     received = watching.node.topic('/imu')['received']
     watching.node.received('/imu', received + 20)
 
@@ -267,10 +429,11 @@ def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching
 
 
 @pytest.mark.slow
-def test_back_in_time(page: Page, watching: Watching) -> None:
+def test_back_in_time(page: Page, watching: Watching, tmp_path: Path) -> None:
     """A click on the timeline shows that moment: frame, cloud, path and plots of then; it plays on from there.
 
-    The commands that the page tells do what they say, once the catalogue of that minute has arrived.
+    The commands that the page tells run as they stand there, once the catalogue of that minute has arrived: query finds it, fetch
+    and bag cut give files.
     """
     press(page.get_by_role('button', name='Back in time'))
     holds(page, '(shadowhound.past?.count ?? 0) > 0')
@@ -290,6 +453,7 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
     before = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
     press(page.locator('[data-play]'))
     holds(page, f'shadowhound.past.at > {before + 1000}')
+    print(f'{played(page, 5)[0]:.1f} moments a second of camera, cloud and plots')  # noqa: T201 - for whoever measures
     press(page.locator('[data-play]'))
     assert counted(page, 'imu') <= live + 3  # nobody watches the live topics meanwhile
     home = {**watching.processes.environ, 'SHADOWHOUND_HOME': str(watching.home)}
@@ -302,6 +466,29 @@ def test_back_in_time(page: Page, watching: Watching) -> None:
         return {'camera', 'imu'} <= {row['sensor'] for row in json.loads(ran.stdout)}
 
     until(answered, f'{query} finds what is shown', 240.0)
+    (bag,) = [
+        name
+        for name in page.locator('[data-mark=bag]').evaluate_all('all => all.map(mark => mark.dataset.name)')
+        if not name.startswith('event_')
+    ]
+    of_bag = page.locator(f'[data-mark=bag][data-name="{bag}"] rect')
+    cut = page.locator('[data-command="bag cut"]', has_text=bag)
+    for minutes in (15, 1):  # by a click on the bag; the second time there is little else on the timeline
+        press(page.get_by_role('button', name=f'{minutes} min', exact=True))
+        at_ms = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
+        for end, there in (('Min', at_ms - minutes * 30_000), ('Max', at_ms + minutes * 30_000)):
+            holds(page, f'Math.abs({slider}.ariaValue{end} - {there}) < 10')
+        page.evaluate('scrollTo({top: 0, behavior: "instant"})')
+        spot = of_bag.bounding_box()
+        assert spot is not None
+        page.mouse.click(spot['x'] + spot['width'] / 2, spot['y'] + spot['height'] / 2)
+        cut.wait_for()
+    fetch = page.locator('[data-command=fetch]').inner_text()
+    for line, folder, kinds in ((fetch, 'data', {'.jpg', '.json'}), (cut.inner_text(), 'cut', {'.mcap', '.yaml'})):
+        shell = ['sh', '-c', line]
+        ran = subprocess.run(shell, cwd=tmp_path, env=home, capture_output=True, text=True, check=False, timeout=120)
+        assert ran.returncode == 0, (line, ran.stdout, ran.stderr)
+        assert kinds <= {path.suffix for path in (tmp_path / folder).rglob('*') if path.stat().st_size}, (line, ran.stdout)
     press(page.get_by_role('button', name='Back to now'))
     page.locator('#data').wait_for()
 
@@ -376,7 +563,17 @@ class Served:
 
 
 def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the link, of which nobody is told: the page goes on by itself, and its ages are meanwhile those of the robot's clock."""
+    """Of the link, of which nobody is told: the page goes on by itself within 2 s, without a reload.
+
+    The ages that it shows meanwhile are within 200 ms of the truth: when the publisher sent the message that is shown.
+    """
+    sent_s: list[float] = []
+
+    def numbered() -> list[LiveItem]:
+        """A message whose roll is its number, in degrees."""
+        sent_s.append(time.monotonic())
+        return [table_item('/imu', KINDS[IMU], [(sent_s[-1] * 1e3, {'rpy.x': math.radians(len(sent_s) - 1)})])]
+
     with ExitStack() as stack:
         machines = Machines(stack)
         listener = machines.listener()
@@ -385,7 +582,7 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind=ROBOT), monkeypatch)
         stack.callback(served.close)
         served.loop.call_soon_threadsafe(served.server._on_graph, {'/imu': IMU})
-        stack.callback(served.every(0.03, lambda: [table_item('/imu', KINDS[IMU], [(time.monotonic() * 1e3, {'rpy.x': 1.0})])]))
+        stack.callback(served.every(0.03, numbered))
         program = machines.program(str(CHROMIUM), tmp_path)
         elsewhere = stack.enter_context(closing(browser.browser_type.launch(executable_path=program, args=FLAGS)))
         page = opened(elsewhere, served.server.url)
@@ -397,19 +594,25 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         page.evaluate('window.same = true')
         machines.cut()
         cut_s = time.monotonic()
-        wrong_ms = []
+        shown: list[tuple[float, float, float]] = []
         while time.monotonic() < cut_s + 10:
-            shown = "[Number(document.querySelector('[data-age=imu]').dataset.ms), shadowhound.at().imu]"
-            before_ms = time.monotonic() * 1e3
-            age_ms, at_ms = page.evaluate(shown)
-            true_ms = (before_ms + time.monotonic() * 1e3) / 2 - at_ms  # one machine: the page's robot has this very clock
-            wrong_ms.append(abs(true_ms - age_ms))
+            before_s = time.monotonic()
+            age_ms = page.evaluate("Number(document.querySelector('[data-age=imu]').dataset.ms)")
+            shown.append((before_s, time.monotonic(), age_ms / 1e3))
+        number = int(float(page.locator('section[aria-label=Attitude] .legend b').first.inner_text()))
+        assert cut_s - 1.5 < sent_s[number] <= cut_s  # the last one that came through
+        at_s = sent_s[number]
+        wrong_s = [max(before_s - at_s - age_s, age_s - (after_s - at_s)) for before_s, after_s, age_s in shown]
+        print(f'ages differ by at most {most_of(wrong_s) * 1e3:.0f} ms from the truth, in {len(wrong_s)} looks')  # noqa: T201 - for whoever measures
+        assert most_of(wrong_s) <= 0.2
         assert len(tried) > 3  # it waits for no connection that TCP still tries to revive
         count = counted(page, 'imu')
         machines.mend()
+        mended_s = time.monotonic()
         holds(page, f'shadowhound.count.imu > {count}')
+        print(f'it went on after {time.monotonic() - mended_s:.2f} s')  # noqa: T201 - for whoever measures
+        assert time.monotonic() - mended_s <= 2.0
         assert page.evaluate('window.same')
-        assert sorted(wrong_ms)[len(wrong_ms) // 2] < 2500  # ages that stand still would be off by 5 s; how exact: bench/live.py
 
 
 def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -534,6 +737,182 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         page.close()
     finally:
         served.close()
+
+
+def test_what_waits_says_for_which_rule_and_how_long(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the node's status has it: the rule and why it does not hold, or when all of it will have arrived."""
+    spool, clock = tmp_path / 'spool', SystemClock.of_this_machine()
+    served = Served(LiveSettings(spool=spool, robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
+    said: dict[str, Any] = {'state': 'waiting', 'waits_for': {'upload.when': 'wifi.ssid == "lab": it is "cafe"'}}
+
+    def shows() -> list[str]:
+        """What the page says, of a node that goes on."""
+        written(spool, boot_id=clock.boot_id, boot_ns=clock.boot_ns(), spool={'pending': 7}, store=said)
+        texts: list[str] = page.locator('[data-field=waits-for], [data-field=left]').all_inner_texts()
+        return texts
+
+    try:
+        page = opened(browser, served.server.url)
+        told = ['waits for wifi.ssid == "lab": it is "cafe"', 'once a rule holds']
+        until(lambda: shows() == told, lambda: f'the rule is shown: {shows()}')
+        said |= {'state': 'shipping', 'mbps': 2.0, 'left_s': 754, 'waits_for': {}}
+        until(lambda: shows() == ['13 min'], lambda: f'the time is shown: {shows()}')
+        page.close()
+    finally:
+        served.close()
+
+
+def literals(folder: str, error: str, keyword: str = '') -> set[str]:
+    """The words by which that part of the package raises an error."""
+    found: set[str] = set()
+    for path in (Path(shadowhound_data_logger.__file__).parent / folder).rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == error:
+                given = [each.value for each in node.keywords if each.arg == keyword] if keyword else node.args[:1]
+                found |= {str(each.value) for each in given if isinstance(each, ast.Constant)}
+    return found
+
+
+CAUSES = [
+    TRANSPORT, RESTART, SILENCE, PAUSED, WRONG_TYPE, DAMAGED, MISSING, NO_ROOM, KEEP_LIMIT, KEEP_DAYS, THINNED, QUEUE_FULL,
+    SAMPLER_FAILED, ENCODER_FAILED, UNWRITABLE, RING_FULL, RETENTION, 'shutdown', 'stopped', 'foreign', 'access_denied',
+    'refused', *literals('encode', 'Rejected'), *literals('stores', 'ObjectRefused', 'reason'),
+]  # fmt: skip
+"""Why messages are not in the store, as far as the code knows it; a server may have a word of its own."""
+BLINDNESS = {
+    'protan': ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)),
+    'deutan': ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
+    'tritan': ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.303900)),
+}
+"""What such an eye sees of linear RGB: Machado, Oliveira and Fernandes (2009), severity 1."""
+
+
+def seen(colour: str, kind: str) -> Any:
+    """A computed colour in CIE Lab."""
+    linear = np.array([(part / 255 + 0.055) ** 2.4 / 1.055**2.4 if part > 10 else part / 255 / 12.92 for part in rgb(colour)])
+    linear = np.clip(np.array(BLINDNESS[kind]) @ linear if kind else linear, 0, 1)
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear / (0.9505, 1, 1.089)
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def test_each_cause_of_a_gap_has_its_own_colour(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hue and pattern: on the timeline as in the legend, for words of a server too; most hues differ for the colour-blind too."""
+    causes = sorted({*CAUSES, 'unknown', 'EntityTooLarge', 'InvalidObjectState'})
+    now_ms = time.time() * 1e3
+    columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
+    rows = [['objects', '/imu', 'missed', cause, now_ms - 3e6 + 7e4 * place, now_ms - 3e6 + 7e4 * place + 3e4, 5, 'exact']
+            for place, cause in enumerate(causes)]  # fmt: skip
+    gaps = {'from': now_ms - 3.6e6, 'to': now_ms, 'now': now_ms, 'columns': columns, 'gaps': rows, 'known': []}
+    looks = """all => all.map((rect) => {
+        const fill = getComputedStyle(rect).fill, pattern = fill.match(/#([^")]+)/)?.[1];
+        if (!pattern) return [fill, '', ''];
+        const [hue, mark] = document.getElementById(pattern).children;
+        return [getComputedStyle(hue).fill, mark.getAttribute('d'), getComputedStyle(mark).fill];
+    })"""
+    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
+    try:
+        monkeypatch.setattr(served.server, '_figures', SimpleNamespace(now=served.server._figures.now, gaps=lambda *_: gaps))
+        page = opened(browser, served.server.url)
+        holds(page, f'document.querySelectorAll("rect.gap").length === {len(causes)}')
+        assert page.locator('rect.gap').evaluate_all('all => all.map(rect => rect.dataset.cause)') == causes
+        for scheme in ('light', 'dark'):
+            page.emulate_media(color_scheme=scheme)
+            drawn = [tuple(look) for look in page.locator('rect.gap').evaluate_all(looks)]
+            assert len(set(drawn)) == len(causes)
+            assert all(hue.startswith('rgb(') and mark in {'', page_rgb(page, '--panel')} for hue, _, mark in drawn)
+            swatches = page.locator('.legend svg[data-swatch] rect')
+            assert [tuple(look) for look in swatches.evaluate_all(looks)] == drawn
+            hues = sorted({hue for hue, _, _ in drawn})
+            for kind in ('', *BLINDNESS):
+                apart = {(one, other): float(np.linalg.norm(seen(one, kind) - seen(other, kind)))
+                         for one in hues for other in hues if one < other}  # fmt: skip
+                assert min(apart.values()) > APART, (scheme, kind, min(apart, key=lambda pair: apart[pair]), min(apart.values()))
+        assert page.wrong == []
+        page.close()
+    finally:
+        served.close()
+
+
+APART = 20.0
+"""Between two hues, in CIE Lab: what one just sees is 2.3."""
+
+
+def page_rgb(page: Page, name: str) -> str:
+    """A colour of the style sheet as it is computed."""
+    script = """name => {
+        const probe = document.body.appendChild(document.createElement('i'));
+        probe.style.color = `var(${name})`;
+        const found = getComputedStyle(probe).color;
+        probe.remove();
+        return found;
+    }"""
+    return str(page.evaluate(script, name))
+
+
+def minute(store: ObjectStore, folder: Path) -> None:
+    """A minute of camera at 5 Hz and odometry, and the part that tells of it."""
+    rows = []
+    for number in range(300):
+        rows.append(told(number / 5, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg'))
+        rows[-1]['key'] = f'thor/camera/{number}.jpg'
+        add(store, folder, rows[-1]['key'], jpeg(number % 256))
+    for second in range(60):
+        rows.append(told(second, 'odom', '/odom', ODOMETRY, 'json'))
+        add(store, folder, rows[-1]['key'], odometry(second))
+    add_part(store, rows, 'minute', folder)
+
+
+def test_what_is_played_is_asked_for_ahead(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a recorded minute at least five moments a second are shown at its own pace, though each takes 0.08 s more to be read."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        minute(store, tmp_path / 'tmp')
+    store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
+    served = Served(store_page, monkeypatch)
+    ask = served.server._history.ask
+
+    wanted_ms: list[int] = []
+
+    async def ask_slowly(asked: dict[str, Any]) -> Any:
+        if asked['do'] == 'moment':
+            wanted_ms.append(asked['at'])
+            await asyncio.sleep(0.08)
+        return await ask(asked)
+
+    monkeypatch.setattr(served.server._history, 'ask', ask_slowly)
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, '(shadowhound.past?.count ?? 0) > 0')
+        for _ in range(5):
+            press(page.get_by_role('button', name='10 seconds back'))
+        at_ms = int(page.locator('[data-moment]').get_attribute('data-moment') or 0)
+        holds(page, f'Math.abs(shadowhound.past.at - {at_ms}) < 1')
+        press(page.locator('[data-play]'))
+        hz, pace = played(page, 10)
+        print(f'{hz:.1f} moments a second, at {pace:.2f} of the pace of a clock')  # noqa: T201 - for whoever measures
+        assert hz >= 5
+        assert 0.9 <= pace <= 1.1
+        is_ahead = [page.evaluate('shadowhound.past.at') < wanted_ms[-1] for _ in range(100)]
+        assert is_ahead.count(True) > 80
+        assert page.wrong == []
+        page.close()
+    finally:
+        served.close()
+
+
+def played(page: Page, seconds: int) -> tuple[float, float]:
+    """Moments a second while it plays, and how much time passes on the page in a second."""
+    script = """async (seconds) => {
+        const now = () => [shadowhound.past.count, shadowhound.past.at, performance.now()];
+        const [count, at, began] = now();
+        await new Promise((done) => setTimeout(done, seconds * 1000));
+        const [last, reached, ended] = now();
+        return [(last - count) / (ended - began) * 1000, (reached - at) / (ended - began)];
+    }"""
+    hz, pace = page.evaluate(script, seconds)
+    return hz, pace
 
 
 def test_the_page_of_a_store(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
