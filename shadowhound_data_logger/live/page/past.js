@@ -1,7 +1,7 @@
 // Back in time: which moment is shown, what the robot recorded then, and playing on from there.
 import { batch, signal } from './vendor/preact.js';
 
-const PIECE_MS = 150; // between two moments that are played, where they can be read that fast
+const PIECE_MS = 125; // between two moments that are played, where they can be read that fast
 const LONGEST_MS = 1000; // what takes longer plays slower
 const TICK_MS = 20;
 

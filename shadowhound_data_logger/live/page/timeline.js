@@ -129,6 +129,7 @@ export function Timeline({ session }) {
   const [begin, setBegin] = useState(null); // of the time that a label or a request is for, which ends at the moment
   const box = useRef(null);
   const drags = useRef(false);
+  const lately = useRef(null); // what the robot's clock was, and when: { now, at }
   const isPast = past.value !== null;
 
   useEffect(() => {
@@ -146,13 +147,16 @@ export function Timeline({ session }) {
     let isOver = false;
     const load = async () => {
       if (document.hidden) return;
-      const now = today?.now ?? Date.now();
+      const now = lately.current ? lately.current.now + performance.now() - lately.current.at : Date.now();
       const asked = minutes ? `?from=${Math.round(now + EVERY_MS - minutes * MINUTE)}&to=${Math.round(now + EVERY_MS)}` : '';
       try {
         const answer = await fetch(`/api/gaps${asked}`);
         const content = await answer.json();
         if (isOver) return;
-        if (answer.ok) setToday(content);
+        if (answer.ok) {
+          setToday(content);
+          lately.current = { now: content.now, at: performance.now() };
+        }
         setFailed(answer.ok ? '' : content.error);
       } catch {
         if (!isOver) setFailed('the robot cannot be reached');
