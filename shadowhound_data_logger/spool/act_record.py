@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.durable_files import replacing
+from shadowhound_data_logger.untrusted import from_json
 
 log = logging.getLogger(__name__)
 
 MOST_ACTS: Final = 200
+MOST_BYTES: Final = 1 << 20
+"""Of the file; it has a third of that where each answer is as long as it may be."""
 MOST_SAID: Final = 300
 """Letters of an answer."""
 
@@ -29,13 +32,17 @@ def file(spool: Path, robot: str) -> Path:
 def read(spool: Path, robot: str) -> list[dict[str, Any]]:
     """Each with ``at_ns`` (Unix, by the robot's clock), ``who``, ``do``, ``ok`` and ``said``, the node's answer; oldest first."""
     try:
-        given = json.loads(file(spool, robot).read_bytes())
+        with file(spool, robot).open('rb') as stream:
+            given = from_json(stream.read(MOST_BYTES + 1), MOST_BYTES)
         return [
-            {'at_ns': int(each['at_ns']), 'who': str(each['who']), 'do': str(each['do']), 'ok': bool(each['ok']),
-             'said': str(each['said'])}
+            {
+                'at_ns': int(each['at_ns']),
+                'ok': bool(each['ok']),
+                **{name: str(each[name])[:MOST_SAID] for name in ('who', 'do', 'said')},
+            }
             for each in given[-MOST_ACTS:]
-        ]  # fmt: skip
-    except (OSError, ValueError, TypeError, KeyError):
+        ]
+    except (OSError, ValueError, TypeError, KeyError, OverflowError):
         return []
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.spool import act_record
-from shadowhound_data_logger.spool.act_record import MOST_ACTS, MOST_SAID, ActRecord
+from shadowhound_data_logger.spool.act_record import MOST_ACTS, MOST_BYTES, MOST_SAID, ActRecord
 
 
 def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
@@ -28,7 +28,21 @@ def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
     assert act_record.read(tmp_path, 'loki') == []
 
 
-@pytest.mark.parametrize('damage', [b'', b'{', b'{"a": 1}', b'[1]', b'[{"at_ns": "x"}]', b'\xff', b'null'])
+@pytest.mark.parametrize(
+    'damage',
+    [
+        b'',
+        b'{',
+        b'{"a": 1}',
+        b'[1]',
+        b'[{"at_ns": "x"}]',
+        b'\xff',
+        b'null',
+        b'[{"at_ns": 1e999}]',
+        b'[' * 100_000,
+        b' ' * (MOST_BYTES + 1),
+    ],
+)
 def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
     """And the next act is kept."""
     act_record.file(tmp_path, 'thor').write_bytes(damage)
