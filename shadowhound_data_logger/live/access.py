@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 
 from shadowhound_data_logger.durable_files import flock, replacing, sync
 from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.untrusted import check_size
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,9 @@ MOST_ADDRESSES: Final = 1000
 LEAST_TOKEN: Final = 16
 """Letters of a token that somebody wrote into the file."""
 MOST_ENDED: Final = 1000
-"""Sign-ins that were signed out and are remembered one by one, in 28 bytes each."""
+"""Sign-ins of a role that were signed out and are remembered one by one, in 28 bytes each."""
+MOST_BYTES: Final = 100_000
+"""Of the file with these."""
 
 
 class TokenRefused(DataLoggerError):
@@ -75,11 +78,13 @@ def make_tokens(folder: Path, *, anew: bool = False) -> dict[str, Path]:
     paths = {role: folder / f'{role}.token' for role in ROLES}
     for path in (*paths.values(), folder / RTSP_FILE) if anew else paths.values():
         _make_token(path, anew=anew)
+    for role in ROLES if anew else ():  # no cookie of before is good any more
+        (folder / f'{role}.{ENDED_FILE}').unlink(missing_ok=True)
     return paths
 
 
 def rtsp_password(folder: Path) -> str:
-    """The password of RTSP, made where there is none; no token, because players keep it who knows where. Raises TokenRefused."""
+    """The password of RTSP, made where there is none; no token, because players may store it anywhere. Raises TokenRefused."""
     path = folder / RTSP_FILE
     _make_token(path)
     return token_of(path)
@@ -111,7 +116,7 @@ def token_of(path: Path) -> str:
 
 
 class _Ended:
-    """Sign-ins that were signed out, in a file that outlives the process as their cookies do.
+    """Sign-ins of a role that were signed out, in a file that outlives the process as their cookies do.
 
     Its lines: the SHA-256 of the rest, a time ``until``, and for each sign-in when its cookie expires and its nonce. Whatever
     expires no later than ``until`` counts as signed out. So an entry may leave, once it has expired or when there are too many,
@@ -138,9 +143,13 @@ class _Ended:
         return nonce in self._known or expires <= self._until  # in this order: an entry leaves once ``_until`` counts it
 
     def expiry(self) -> int:
-        """When a sign-in of now expires."""
+        """When a sign-in of now expires. Raises TokenRefused where the clock was far ahead when sign-ins were ended."""
         self._refresh()
-        return max(int(self._now()) + LASTS_S, self._until + 1)
+        now = int(self._now())
+        if self._until > now + 2 * LASTS_S:
+            raise TokenRefused(f'{self._path} ends all sign-ins until {time.ctime(self._until)}: the clock was ahead',
+                               remedy='set the clock, or make new tokens (--new-tokens)')  # fmt: skip
+        return max(now + LASTS_S, self._until + 1)
 
     def add(self, nonce: str, expires: int) -> None:
         """In this process at once; ``keep`` makes it last."""
@@ -175,7 +184,8 @@ class _Ended:
             return False
         known, until, is_damaged = dict[str, int](), 0, False
         try:
-            until, known = _ended_in(self._path.read_bytes())
+            with self._path.open('rb') as file:
+                until, known = _ended_in(file.read(MOST_BYTES + 1))
         except FileNotFoundError:
             pass
         except (OSError, ValueError) as error:
@@ -200,6 +210,7 @@ class _Ended:
 
 def _ended_in(content: bytes) -> tuple[int, dict[str, int]]:
     """Raises ValueError for what ``_Ended`` did not write."""
+    check_size(len(content), MOST_BYTES)
     digest, _, body = content.partition(b'\n')
     if sha256(body).hexdigest().encode() != digest:
         raise ValueError('its hash does not fit')
@@ -220,18 +231,22 @@ class Access:
         self._now = now
         self._failures: dict[str, deque[float]] = {}
         self._refused: dict[str, str] = {}
-        self._ended = _Ended(tokens[VIEWER].with_name(ENDED_FILE), now)
+        # One each: a viewer who signs out again and again ends no operator's sign-in.
+        self._ended = {role: _Ended(path.with_name(f'{role}.{ENDED_FILE}'), now) for role, path in tokens.items()}
 
     def sign_in(self, token: str, address: str) -> tuple[SignIn, str] | None:
-        """Of whoever knows a token, with the cookie; None for a wrong one."""
+        """Of whoever knows a token, with the cookie; None for a wrong one. Raises TokenRefused where nobody can sign in."""
         given = _bytes(token)
         for role in ROLES:
-            with suppress(TokenRefused):  # the other role's may be good
-                if hmac.compare_digest(given, self._token(role).encode()):
-                    nonce, expires = secrets.token_urlsafe(12), self._ended.expiry()
-                    text = f'{role}.{expires}.{nonce}'
-                    self._failures.pop(address, None)
-                    return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
+            try:
+                token = self._token(role)
+            except TokenRefused:  # the other role's may be good
+                continue
+            if hmac.compare_digest(given, token.encode()):
+                nonce, expires = secrets.token_urlsafe(12), self._ended[role].expiry()
+                text = f'{role}.{expires}.{nonce}'
+                self._failures.pop(address, None)
+                return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
         self._fail(address)
         return None
 
@@ -258,18 +273,18 @@ class Access:
     def sign_out(self, who: SignIn) -> None:
         """Its cookie and its tickets are worth nothing from now on; ``keep`` makes that last."""
         if who.nonce:
-            self._ended.add(who.nonce, who.expires)
+            self._ended[who.role].add(who.nonce, who.expires)
 
-    def keep(self) -> None:
-        """Write down who was signed out; waits for the disk, in any thread. Raises OSError."""
-        self._ended.keep()
+    def keep(self, role: str) -> None:
+        """Write down who of a role was signed out; waits for the disk, in any thread. Raises OSError."""
+        self._ended[role].keep()
 
     def ticket(self, who: SignIn, address: str) -> str:
         """What lets a program at this address watch, and nothing else, for as long as the sign-in lasts: it may stand in a URL.
 
         Raises TokenRefused.
         """
-        text = f'{who.role}.{who.expires or self._ended.expiry()}.{who.nonce}'
+        text = f'{who.role}.{who.expires or self._ended[who.role].expiry()}.{who.nonce}'
         return f'{text}.{self._sign(who.role, f"ticket.{text}.{address}")}'
 
     def of_ticket(self, ticket: str, address: str) -> str | None:
@@ -291,7 +306,7 @@ class Access:
         if role not in ROLES or not until.isdecimal() or len(until) >= 12:
             return False
         is_signed = hmac.compare_digest(_bytes(signature), self._sign(role, text).encode())
-        return is_signed and int(until) > self._now() and not self._ended.has(nonce, int(until))
+        return is_signed and int(until) > self._now() and not self._ended[role].has(nonce, int(until))
 
     def _of(self, role: str, nonce: str, expires: int) -> SignIn:
         return SignIn(role, nonce, expires, self._sign(role, f'csrf.{nonce}'))

@@ -78,8 +78,8 @@ MOST_WATCHED: Final = 16
 FIGURES_S: Final = 1.0
 LEDGER_EVERY: Final = 2
 """The ledger is read with each second status."""
-ASK_AGAIN_EVERY: Final = 5
-"""Whether those who watch still may is asked with each fifth status."""
+ASK_AGAIN_S: Final = 5.0
+"""How often it is asked whether those who watch still may."""
 SEND_BUFFER: Final = 32 << 10
 LEASE_EVERY_S: Final = 2.0
 DOCTOR_S: Final = 60.0
@@ -225,7 +225,7 @@ class LiveServer:
         self._runner: web.AppRunner | None = None
         self._listening: asyncio.Server | None = None
         self._silent: dict[asyncio.BaseProtocol, float] = {}  # connections that asked for nothing yet, and since when
-        self._ticker: asyncio.Task[None] | None = None
+        self._tickers: list[asyncio.Task[None]] = []
         self.port = settings.port
         self.ros_problem = ''
         """Why nothing but the data is shown; empty where topics are read."""
@@ -233,7 +233,6 @@ class LiveServer:
     async def open(self) -> None:
         """Raises OSError where nobody can listen there, or the certificate cannot be read; RtspUnavailable; H264Unavailable."""
         self._loop = asyncio.get_running_loop()
-        await self._find_h264()
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BODY)
         app.add_routes([
             web.get('/ws', self._watch), web.get('/api/session', self._session), web.post('/api/session', self._sign_in),
@@ -256,19 +255,20 @@ class LiveServer:
         self._listening = await self._loop.create_server(
             self._connected, sock=listener, ssl=secure, backlog=64, ssl_handshake_timeout=timeout_s
         )
+        self._open_topics()
+        self._tickers = [asyncio.create_task(each) for each in (self._tick(), self._end_unknown())]
+        await self._find_h264()  # which may take a while, meanwhile the page is served
         if self._settings.rtsp is not None:
             password = rtsp_password(self._settings.tokens)
             self._rtsp = RtspServer(self._settings.bind, self._settings.rtsp, password, self._rewatch, self._h264)
             await self._rtsp.open()
+            self._rtsp.serve(topic for topic in self._graph if self._kind_of(topic) == 'camera')
             self._rewatch()  # the topics of the graph are wanted even while nobody watches
-        self._open_topics()
-        self._ticker = asyncio.create_task(self._tick())
 
     async def close(self) -> None:
-        if self._ticker is not None:
-            self._ticker.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._ticker
+        for ticker in self._tickers:
+            ticker.cancel()
+        await asyncio.gather(*self._tickers, return_exceptions=True)
         _end((*self._viewers, *self._foxgloves))
         if self._listening is not None:
             self._listening.close()
@@ -314,6 +314,8 @@ class LiveServer:
         if not self._settings.h264 and (not has_cameras or (self._settings.rtsp is None and self.no_video)):
             return
         self._h264 = await find_h264(self._settings.h264)
+        if self._video is not None:
+            self._video.h264 = self._h264
         if self._h264 is not None:
             log.info('cameras are encoded as H.264 by %s where players and viewers take it', self.h264)
         else:
@@ -365,10 +367,12 @@ class LiveServer:
 
         _end(one for one in self._viewers if one.heard_s < time.monotonic() - SILENT_S)
 
-    def _end_unknown(self) -> None:
-        """A connection outlives neither the sign-in that it came by nor the token that signed it."""
-        _end(one for one in self._viewers if self._access.who(one.cookie) != one.who)
-        _end(one for one in self._foxgloves if self._access.of_ticket(one.ticket, one.address) is None)
+    async def _end_unknown(self) -> None:
+        """A connection outlives neither the sign-in that it came by nor the token that signed it, whatever else hangs."""
+        while True:
+            await asyncio.sleep(ASK_AGAIN_S)
+            _end(one for one in self._viewers if self._access.who(one.cookie) != one.who)
+            _end(one for one in self._foxgloves if self._access.of_ticket(one.ticket, one.address) is None)
 
     def _drop(self, handler: Any) -> None:
         self._silent.pop(handler, None)
@@ -456,14 +460,12 @@ class LiveServer:
                     source.wake()
 
     async def _tick(self) -> None:
-        """Once a second: the figures, the sizes, the lease, who may no longer watch, and threads that died."""
+        """Once a second: the figures, the sizes, the lease, and threads that died."""
         rounds = 0
         lease_s = 0.0
         while True:
             began_s = time.monotonic()
             self._drop_silent()
-            if rounds % ASK_AGAIN_EVERY == 0:
-                self._end_unknown()
             if self._topics is not None:
                 self._topics.worker.look()
             if self._video is not None:
@@ -584,7 +586,11 @@ class LiveServer:
         if wait_s := self._access.wait_s(address):
             return _problem(429, 'too many wrong tokens', {'Retry-After': str(round(wait_s))})
         token = (await _body(request)).get('token')
-        found = self._access.sign_in(token, address) if isinstance(token, str) else None
+        try:
+            found = self._access.sign_in(token, address) if isinstance(token, str) else None
+        except TokenRefused as error:
+            log.warning('nobody can sign in: %s', error)
+            return _problem(503, str(error))
         if found is None:
             log.warning('a wrong token from %s', address)
             return _problem(401, 'this is not the token of a viewer or operator')
@@ -602,7 +608,7 @@ class LiveServer:
         _end(one for one in self._viewers if one.who.nonce == who.nonce)
         _end(one for one in self._foxgloves if one.nonce == who.nonce)
         try:
-            await asyncio.to_thread(self._access.keep)
+            await asyncio.to_thread(self._access.keep, who.role)
             response = _json({})
         except OSError as error:
             log.error('a sign-out is forgotten when this page restarts: %s', error)  # noqa: TRY400 - an operator's matter

@@ -273,7 +273,7 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
 
 def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once all tabs of that browser and its Foxglove; those of another sign-in with the same token go on."""
-    monkeypatch.setattr(module, 'FIGURES_S', 3600.0)  # nobody else looks who may watch
+    monkeypatch.setattr(module, 'ASK_AGAIN_S', 3600.0)  # nobody else looks who may watch
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
@@ -309,7 +309,7 @@ def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.Monke
                 foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
                 assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
                 await ended(foxglove)
-            assert stat.S_IMODE((page.folder / ENDED_FILE).stat().st_mode) == 0o600
+            assert stat.S_IMODE((page.folder / f'viewer.{ENDED_FILE}').stat().st_mode) == 0o600
             cookies = dict(page.cookies)
         async with serving(tmp_path, monkeypatch) as page:
             page.cookies = cookies
@@ -327,7 +327,7 @@ def test_a_sign_out_that_the_disk_refuses_is_told(
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
-            (page.folder / f'{ENDED_FILE}.part').mkdir()
+            (page.folder / f'viewer.{ENDED_FILE}.part').mkdir()
             status, _, body = await page.ask('viewer', 'POST', '/api/sign-out')
             assert (status, b'until this page restarts' in body) == (503, True)
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
@@ -339,7 +339,7 @@ def test_a_sign_out_that_the_disk_refuses_is_told(
 @pytest.mark.parametrize('how', ['new tokens', 'others may read it', 'it is gone', 'twelve hours'])
 def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     """A viewer and a Foxglove, within some rounds; they cannot come back by it. The other role goes on if its token is good."""
-    monkeypatch.setattr(module, 'FIGURES_S', 0.01)
+    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
@@ -373,7 +373,7 @@ def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monk
 
 def test_who_needs_no_token_watches_on_whatever_becomes_of_the_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the loopback; an operator there is ended and may come back as a viewer."""
-    monkeypatch.setattr(module, 'FIGURES_S', 0.01)
+    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
 
     async def run() -> None:
         async with (
@@ -583,12 +583,12 @@ class Signing:
         who = access.who(cookie)
         assert who is not None
         access.sign_out(who)
-        access.keep()
+        access.keep(who.role)
 
     @property
     def entries(self) -> int:
         """Of the file, each of which has a line; the first two are none."""
-        return len((self.folder / ENDED_FILE).read_text().splitlines()) - 2
+        return len((self.folder / f'viewer.{ENDED_FILE}').read_text().splitlines()) - 2
 
 
 def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> None:
@@ -604,8 +604,8 @@ def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> N
         who = access.who(cookie)
         assert who is not None
         access.sign_out(who)
-    first.keep()
-    second.keep()
+    first.keep('viewer')
+    second.keep('viewer')
     assert [it.access().who(cookie) is None for cookie in cookies] == [True] * 5 + [False]
 
 
@@ -632,6 +632,38 @@ def test_what_is_remembered_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch:
     assert [cookie for cookie in (*ended, last) if it.access().who(cookie) is not None] == []
 
 
+def test_a_viewer_who_signs_out_again_and_again_ends_no_operator_s_sign_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is remembered beyond the most there may be counts for the role alone."""
+    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    it = Signing(tmp_path)
+    access = it.access()
+    operator = access.sign_in(it.tokens['operator'].read_text().strip(), '10.0.0.1')
+    assert operator is not None
+    it.now[0] += 1.0
+    for _ in range(9):
+        it.sign_out(access, it.cookie(access))
+    for each in (access, it.access()):
+        assert each.who(operator[1]) == operator[0]
+
+
+def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> None:
+    """Damage that is found then ends all sign-ins until then; it is said what to do, and new tokens are a way out."""
+    it = Signing(tmp_path)
+    it.now[0] += 70 * 365 * 86400.0
+    (tmp_path / f'viewer.{ENDED_FILE}').write_bytes(b'damaged')
+    it.cookie(it.access())
+    it.now[0] -= 70 * 365 * 86400.0
+    with pytest.raises(TokenRefused, match='the clock was ahead'):
+        it.cookie(it.access())
+    it.tokens = make_tokens(tmp_path, anew=True)
+    access = it.access()
+    found = access.who(it.cookie(access))
+    assert found is not None
+    assert found.expires == it.now[0] + LASTS_S
+
+
 @pytest.mark.parametrize('damage', [
     lambda content: content[:0], lambda content: content[:-9], lambda content: content + b'\n', lambda content: b'\xff' + content,
     lambda content: content[:-5] + bytes([content[-5] ^ 1]) + content[-4:], lambda content: content.replace(b'1', b'2'),
@@ -644,7 +676,7 @@ def test_damage_lets_nobody_in_and_locks_nobody_out(
     access = it.access()
     ended, living = it.cookie(access), it.cookie(access)
     it.sign_out(access, ended)
-    path = tmp_path / ENDED_FILE
+    path = tmp_path / f'viewer.{ENDED_FILE}'
     path.write_bytes(damage(path.read_bytes()))
     after = it.access()
     again = it.cookie(after)  # the very first request, within the same second
