@@ -7,7 +7,6 @@ others are left out, and an encoder is taken only after it has encoded a frame o
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import math
 import re
@@ -24,7 +23,7 @@ import simplejpeg
 
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
-from shadowhound_data_logger.untrusted import check_pixels
+from shadowhound_data_logger.untrusted import check_pixels, from_json
 
 log = logging.getLogger(__name__)
 
@@ -144,7 +143,9 @@ async def _found(tried: tuple[H264Element, ...]) -> dict[str, Any]:
         head, _ = await asyncio.wait_for(_record(process.output), FIND_S)
     except asyncio.TimeoutError:
         return {'error': f'it says nothing for {FIND_S:.0f} s'}
-    except (OSError, EOFError, ValueError, TypeError) as error:
+    except EOFError:
+        return {'error': 'its process has ended'}
+    except (OSError, ValueError, TypeError) as error:
         return {'error': f'{PYTHON}: {error}'}
     else:
         return head
@@ -153,7 +154,10 @@ async def _found(tried: tuple[H264Element, ...]) -> dict[str, Any]:
 
 
 def fitted(width: int, height: int, most_blocks: int) -> tuple[int, int]:
-    """Even sides of at most so many macroblocks: the frame's own, or smaller ones of about its shape. Raises ValueError."""
+    """Even sides of at most so many macroblocks: the frame's own, or smaller ones, of its shape where no side becomes tiny.
+
+    Raises ValueError.
+    """
     check_pixels(width, height)
     blocks = math.ceil(width / 16) * math.ceil(height / 16)
     if not blocks or min(width, height) < 2:
@@ -181,6 +185,7 @@ class H264Encoder:
         self._key_s = -KEY_EVERY_S
         self._fed_s: float | None = None
         """Since when nothing came for what was offered."""
+        self._first_ms = math.inf
         self._offered_ms = self._made_ms = -math.inf
         self.encoded = self.keys = 0
         """Frames so far, and those of them that need no other."""
@@ -194,11 +199,13 @@ class H264Encoder:
 
     async def close(self) -> None:
         self._is_over = True
-        if self._task is not None:
-            self._task.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._task
-        await self._process.end()
+        try:
+            if self._task is not None:
+                self._task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await self._task
+        finally:
+            await self._process.end()
 
     def offer(self, at_ms: float, jpeg: bytes) -> None:
         try:
@@ -217,7 +224,7 @@ class H264Encoder:
         if self._wants_key and now_s - self._key_s >= KEY_EVERY_S:
             self._wants_key, self._key_s = False, now_s
             self._process.tell({'key': True})
-        self._offered_ms = at_ms
+        self._first_ms, self._offered_ms = min(self._first_ms, at_ms), at_ms
         self._process.tell({'at': at_ms, 'width': width, 'height': height, 'size': size}, jpeg)
 
     def ask_key(self) -> None:
@@ -238,16 +245,15 @@ class H264Encoder:
             self._fail(str(error))
 
     def _take(self, head: Mapping[str, Any], unit: bytes) -> None:
-        """Raises ValueError for what is no access unit of a frame that was offered."""
+        """Raises ValueError for what is no access unit, or of no time at which frames were offered."""
         if 'error' in head:
             raise ValueError(str(head['error'])[:300])
         at_ms = float(head['at'])
-        if not at_ms < self._offered_ms + 1 or not unit.startswith(_STARTS):
+        if not self._first_ms - 1 < at_ms < self._offered_ms + 1 or not unit.startswith(_STARTS):
             raise ValueError('what comes is no H.264 of the camera')
-        self._fed_s = None
         if at_ms <= self._made_ms:
             return
-        self._made_ms = at_ms
+        self._fed_s, self._made_ms = None, at_ms
         self.encoded += 1
         self.keys += bool(head['key'])
         self._made(at_ms, bool(head['key']), unit)
@@ -263,4 +269,4 @@ async def _record(output: asyncio.StreamReader) -> tuple[dict[str, Any], bytes]:
     head, body = struct.unpack('<II', await output.readexactly(8))
     if head > MOST_HEAD or body > MOST_UNIT:
         raise ValueError(f'it says {head:,} and {body:,} bytes at once')
-    return dict(json.loads(await output.readexactly(head))), await output.readexactly(body)
+    return dict(from_json(await output.readexactly(head), MOST_HEAD)), await output.readexactly(body)

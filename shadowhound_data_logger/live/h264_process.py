@@ -23,7 +23,7 @@ PIPELINE = (
     'appsrc name=frames is-live=true format=time max-buffers=2 leaky-type=downstream ! {launch}'
     ' ! video/x-h264,stream-format=byte-stream,alignment=au ! appsink name=units emit-signals=true sync=false max-buffers=4'
 )
-TRIES, TRY_S = 50, 0.1
+TRIES, TRY_S = 30, 0.1
 """Frames that an encoder may take before the first comes out."""
 MOST_TEXT = 300
 writing = threading.Lock()

@@ -100,15 +100,22 @@ class Cameras:
             source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
 
     def _meet(self, _: Any, client: Any) -> None:
-        client.connect('play-request', self._follow)
-        client.connect('closed', self._follow)
+        client.connect('play-request', self._play)
+        for end in ('pause-request', 'teardown-request', 'closed'):
+            client.connect(end, self._stop)
 
-    def _follow(self, client: Any, context: Any = None) -> None:
-        """Say from where clients play; one that is closed plays no more."""
+    def _play(self, client: Any, _: Any) -> None:
+        self._follow(client, client.get_connection().get_ip())
+
+    def _stop(self, client: Any, *_: Any) -> None:
+        self._follow(client, '')
+
+    def _follow(self, client: Any, address: str) -> None:
+        """Say from where clients play; without an address it plays no more."""
         with self._lock:
             self._players.pop(client, None)
-            if context is not None:
-                self._players[client] = client.get_connection().get_ip()
+            if address:
+                self._players[client] = address
             say(players=sorted({*self._players.values()}))
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:

@@ -52,7 +52,7 @@ RATE_SHARE: Final = 0.85
 RAISE_EVERY_S: Final = 4.0
 """A new rate begins with a key frame, so a better one waits."""
 H264_AGAIN_S: Final = 300.0
-"""After an encoder of H.264 failed, viewers who come take VP8 for so long."""
+"""After an encoder of H.264 failed, viewers who come take its topic as VP8 for so long."""
 MOST_WAITING: Final = 10
 """Packets of a peer whose turn does not come; then it goes on with the next key frame."""
 CONNECT_S: Final = 10.0
@@ -246,7 +246,7 @@ class _Peer:
         """Raises OfferRefused."""
         (transceiver,) = self.pc.getTransceivers()
         known = RTCRtpSender.getCapabilities('video').codecs
-        taken = (H264, VP8, 'video/rtx') if self._video.has_h264 else (VP8, 'video/rtx')
+        taken = (H264, VP8, 'video/rtx') if self._video.has_h264(self.topic) else (VP8, 'video/rtx')
         transceiver.setCodecPreferences([codec for name in taken for codec in known if codec.mimeType == name])
         await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
         self.codec = transceiver._codecs[0].mimeType
@@ -288,12 +288,13 @@ class CameraVideo:
     """
 
     def __init__(self, changed: Callable[[], None], h264: H264Element | None = None) -> None:
-        self._changed, self._h264 = changed, h264
+        self._changed, self.h264 = changed, h264
         self._loop = asyncio.get_running_loop()
         self._encoders: dict[tuple[str, str], _Encoder] = {}
         """By topic and codec."""
         self._rates: dict[tuple[str, str], tuple[int, float]] = {}
-        self._h264_from_s = 0.0
+        self._h264_from_s: dict[str, float] = {}
+        """By topic: when H.264 is tried again after its encoder failed."""
         self._peers: dict[object, _Peer] = {}
         self._ending: set[asyncio.Task[None]] = set()
         for name in ('aioice', 'aiortc'):
@@ -304,10 +305,9 @@ class CameraVideo:
         """Those that somebody takes."""
         return frozenset(peer.topic for peer in self._peers.values())
 
-    @property
-    def has_h264(self) -> bool:
-        """Whether viewers who come may take H.264."""
-        return self._h264 is not None and time.monotonic() >= self._h264_from_s
+    def has_h264(self, topic: str) -> bool:
+        """Whether viewers who come may take the topic as H.264."""
+        return self.h264 is not None and time.monotonic() >= self._h264_from_s.get(topic, 0.0)
 
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
@@ -415,8 +415,8 @@ class CameraVideo:
         self._changed()
 
     def _encoder(self, topic: str, codec: str) -> _Encoder:
-        if codec == H264 and self._h264 is not None:
-            return H264Encoder(self._h264, FIRST_RATE, partial(self._on_h264, topic), partial(self._on_failed, topic))
+        if codec == H264 and self.h264 is not None:
+            return H264Encoder(self.h264, FIRST_RATE, partial(self._on_h264, topic), partial(self._on_failed, topic))
         return _Vp8Encoder(partial(self._on_vp8, topic))
 
     def _on_vp8(self, topic: str, encoded: _Encoded) -> None:
@@ -432,7 +432,7 @@ class CameraVideo:
     def _on_failed(self, topic: str, why: str) -> None:
         """Of the encoder of H.264: its viewers ask again, and who asks takes VP8 for a while."""
         log.warning('%s is not encoded as H.264: %s; for %.0f s viewers who come take VP8', topic, why, H264_AGAIN_S)
-        self._h264_from_s = time.monotonic() + H264_AGAIN_S
+        self._h264_from_s[topic] = time.monotonic() + H264_AGAIN_S
         for peer in list(self._peers.values()):
             if (peer.topic, peer.codec) == (topic, H264):
                 self.lost(peer, f'the encoder of H.264 failed: {why}', again=True)

@@ -51,7 +51,10 @@ def open_reader(settings: StoreSettings) -> ObjectStore:
 
 @contextmanager
 def _without_pyopenssl() -> Iterator[None]:
-    """Hide pyOpenSSL, which botocore loads and never uses: 12 MB in each process where the extra ``webrtc`` is installed."""
+    """Hide pyOpenSSL, which botocore loads and never uses: 12 MB in each process where the extra ``webrtc`` is installed.
+
+    Another thread that imports it meanwhile does not find it either.
+    """
     modules: dict[str, Any] = sys.modules
     if 'OpenSSL' in modules:
         yield

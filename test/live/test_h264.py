@@ -171,6 +171,8 @@ def wait():
     ('say({"at": 0.0, "key": True}, b"GIF89a"); wait()', 'no H.264'),
     ('say({"at": 1e9, "key": True}, b"\\0\\0\\0\\1e"); wait()', 'no H.264'),
     ('say({"at": float("nan"), "key": True}, b"\\0\\0\\0\\1e"); wait()', 'no H.264'),
+    ('say({"at": -1e300, "key": True}, b"\\0\\0\\0\\1e"); wait()', 'no H.264'),
+    ('say({}, text=b"[" * 2000); wait()', 'too deep'),
     ('wait()', 'nothing for 0.3 s'),
 ])  # fmt: skip
 def test_a_process_that_fails_is_told_of_once(script: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -310,7 +310,7 @@ def test_vp8_takes_over_where_the_encoder_of_h264_is_killed() -> None:
             await until(is_told, 'a problem')
             assert first.told[-1]['again']
             assert named in first.told[-1]['problem']
-            assert not video.has_h264
+            assert not video.has_h264(CAMERA)
             again = Receiver(video, 'video/H264', 'video/VP8')
             assert 'VP8' in (await again.ask())['answer']
             assert video._encoders.keys() == {(CAMERA, 'video/VP8')}
