@@ -78,8 +78,8 @@ class Worker:
         self._round_s = 0.0
 
     def start(self) -> None:
-        self._started = True
         self._launch()
+        self._started = True  # only now: who looks meanwhile, on another thread, would take it for one that has ended
 
     def stop(self) -> None:
         """Let the current round be the last one; does not wait."""

@@ -236,3 +236,20 @@ def test_one_that_fails_again_and_again_may_be_tried_rarely() -> None:
     """The pause doubles up to its own longest one."""
     worker = Worker('rare', lambda: None, longest_pause_s=0.003)
     assert [worker._longer_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]
+
+
+def test_who_looks_while_it_starts_sees_no_death(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is started by another thread than the one that supervises it."""
+    start = threading.Thread.start
+    worker = Worker('worker', lambda: time.sleep(0.01))
+
+    def looked_at(thread: threading.Thread) -> None:
+        start(thread)
+        worker.look()
+
+    monkeypatch.setattr(threading.Thread, 'start', looked_at)
+    worker.start()
+    worker.look()
+    worker.stop()
+    assert worker.join(10.0)
+    assert (worker.deaths, worker.failures, worker.last_error) == (0, 0, '')
