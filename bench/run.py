@@ -1,6 +1,6 @@
 """``make bench``: all benchmarks one after the other, then docs/performance.md with what they found.
 
-About fifteen minutes; ``--quick`` takes three or so and leaves docs/ alone. Exit code 1 when a bar is missed, or a benchmark
+About half an hour; ``--quick`` takes three or so and leaves docs/ alone. Exit code 1 when a bar is missed, or a benchmark
 fails (then docs/ stays as it is, too). Nothing else should run on the machine meanwhile.
 """
 

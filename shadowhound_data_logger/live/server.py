@@ -257,6 +257,8 @@ class LiveServer:
         )
         self._open_topics()
         self._tickers = [asyncio.create_task(each) for each in (self._tick(), self._end_unknown())]
+        for ticker in self._tickers:
+            ticker.add_done_callback(_tell_failure)
         await self._find_h264()  # which may take a while, meanwhile the page is served
         if self._settings.rtsp is not None:
             password = rtsp_password(self._settings.tokens)
@@ -878,6 +880,12 @@ class LiveServer:
             tell({'problem': self.no_video})
         else:
             await self._video.take(one, said, (one.at, one.address), tell)
+
+
+def _tell_failure(ticker: asyncio.Task[None]) -> None:
+    """Nobody waits for a task that goes on until the page ends: should it fail, the log says so at once."""
+    if not ticker.cancelled() and (error := ticker.exception()) is not None:
+        log.error('a task of the page has failed: start the page again', exc_info=error)
 
 
 def _end(connections: Iterable[_Connected | _Foxglove]) -> None:

@@ -174,3 +174,22 @@ def test_figures_say_what_uploads_wait_for(tmp_path: Path) -> None:
     written(tmp_path, store={'state': 'waiting', **said})
     store = SpoolFigures(tmp_path, 'thor', FakeClock()).now(with_ledger=False)['store']
     assert {name: store[name] for name in said} == said
+
+
+def test_a_task_that_fails_is_told_of_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nobody would notice that connections no longer end with their sign-in."""
+
+    async def fails(_: LiveServer) -> None:
+        raise ValueError('it cannot be asked')
+
+    monkeypatch.setattr(LiveServer, '_end_unknown', fails)
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch, '127.0.0.1'):
+            await asyncio.sleep(0)
+            assert 'has failed: start the page again' in caplog.text
+            assert 'it cannot be asked' in caplog.text
+
+    asyncio.run(run())
