@@ -133,7 +133,7 @@ class Soak:
 class Robot:
     """A simulated Go2, its node and its Tower, to which things happen. Life: New; run once."""
 
-    def __init__(self, tower: Tower, wire: Wire, processes: Processes, rng: random.Random) -> None:
+    def __init__(self, tower: Tower, wire: Wire, processes: Processes, rng: random.Random, scale: float) -> None:
         self._tower, self._wire, self._rng = tower, wire, rng
         self._behind = processes.folder / 'behind'
         shutil.copy(HERE / 'wrong_clock.py', processes.folder / 'sitecustomize.py')
@@ -141,7 +141,7 @@ class Robot:
         self.environ = tower.environment() | {'AWS_ENDPOINT_URL': wire.url}
         own = {'PYTHONPATH': path, 'WRONG_CLOCK': str(self._behind)}
         self.node: Node = processes.node(self.environ, PARAMETERS, environ=own)
-        self._sim: Process = processes.sim('image_raw:=false')
+        self._sim: Process = processes.sim('image_raw:=false', f'rate_scale:={scale}')
         self._began_s = time.monotonic()
         self.soak = Soak()
 
@@ -242,11 +242,11 @@ def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]]
         figure.savefig(target)
 
 
-def campaign(folder: Path, seconds: float, seed: int) -> Soak:
-    """Run and judge; ``folder`` needs some 250 MB a minute."""
+def campaign(folder: Path, seconds: float, seed: int, scale: float = 1.0) -> Soak:
+    """Run and judge; ``folder`` needs some 250 MB a minute at the robot's own rates."""
     with Tower(folder / 'tower') as tower:
         with Wire(tower.endpoint_url) as wire, running(folder) as processes:
-            robot = Robot(tower, wire, processes, random.Random(seed))
+            robot = Robot(tower, wire, processes, random.Random(seed), scale)
             robot.run(seconds)
         progress('every object is asked for')
         command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'ledger', '--verify', '--json']
@@ -260,12 +260,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The campaign; 0 when everything held."""
     options = parser('soak', __doc__ or '')
     options.add_argument('--minutes', type=float, default=0.0, help=f'how long, {MINUTES:g} unless told; 480 is a night')
+    options.add_argument('--scale', type=float, default=1.0, help="of the robot's rates: a night at 1 needs 120 GB (default 1)")
     options.add_argument('--picture', type=Path, metavar='FILE.png', help='draw what the node had over the time')
     given = options.parse_args(argv)
     minutes = given.minutes or (SHORT_MINUTES if given.short else MINUTES)
     progress(f'{minutes:g} minutes, seed {given.seed}')
     with workshop(given) as shop:
-        soak = campaign(shop.folder, 60.0 * minutes, given.seed)
+        soak = campaign(shop.folder, 60.0 * minutes, given.seed, given.scale)
         happened = asdict(soak)
         (shop.folder / 'soak.json').write_text(json.dumps(happened))
         if given.picture:
