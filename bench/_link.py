@@ -1,17 +1,22 @@
-"""Links to a server that carry so many bits a second, as the kernel shapes them (tc-htb(8)), in a network of the benchmark's own.
+"""Links to a server, in a network of the benchmark's own, that carry so many bits a second or are long.
 
-A link is a port on which what comes is passed on to the server; a token bucket on the loopback device holds all packets to it.
+The former is as the kernel shapes them (tc-htb(8)): a port on which what comes is passed on to the server; a token bucket on the
+loopback device holds all packets to it. The latter is a device of ours (tun), for not every kernel has tc-netem(8).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import threading
+import time
+from collections import deque
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
@@ -24,6 +29,13 @@ QUEUE: Final = 100
 """Packets that wait for the link at most, as in a radio: 0.4 s at 3 Mbit/s."""
 MTU: Final = 1500
 PIECE_BYTES: Final = 64 << 10
+NEAR, FAR = '10.79.0.1', '10.79.0.2'
+"""Who connects to the latter comes out at the former, and seems to be the latter there."""
+FAR_DEVICE: Final = 'far'
+_TUNSETIFF: Final = 0x400454CA
+_IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
+_SOURCE, _DESTINATION = slice(12, 16), slice(16, 20)
+"""In the header of IPv4. The two change places: a checksum is the same then."""
 _INSIDE: Final = 'SHADOWHOUND_BENCH_NETWORK'
 
 
@@ -99,6 +111,41 @@ class ShapedLinks:
         with contextlib.suppress(OSError, asyncio.CancelledError):
             to_server = await asyncio.open_connection(self._server.hostname, self._server.port)
             await asyncio.gather(_copy(reader, to_server[1]), _copy(to_server[0], writer))
+
+
+class LongWay:
+    """A way from FAR to NEAR and back through which each packet takes ``round_s``, half in each direction; needs root.
+
+    It lasts as long as the process.
+    """
+
+    def __init__(self, round_s: float) -> None:
+        self.round_s = round_s
+        self._device = os.open('/dev/net/tun', os.O_RDWR)
+        fcntl.ioctl(self._device, _TUNSETIFF, struct.pack('16sH', FAR_DEVICE.encode(), _IFF_TUN | _IFF_NO_PI))
+        _ran('ip', 'addr', 'add', f'{NEAR}/24', 'dev', FAR_DEVICE)
+        _ran('ip', 'link', 'set', FAR_DEVICE, 'up', 'mtu', str(MTU), 'txqueuelen', '2000')
+        self._packets: deque[tuple[float, bytearray]] = deque()
+        self._some = threading.Event()
+        for work in (self._take, self._give):
+            threading.Thread(target=work, name='long way', daemon=True).start()
+
+    def _take(self) -> None:
+        while True:
+            packet = bytearray(os.read(self._device, 2 * MTU))
+            if packet[0] >> 4 == 4:
+                packet[_SOURCE], packet[_DESTINATION] = packet[_DESTINATION], packet[_SOURCE]
+                self._packets.append((time.monotonic() + self.round_s / 2, packet))
+                self._some.set()
+
+    def _give(self) -> None:
+        while True:
+            self._some.wait()
+            self._some.clear()
+            while self._packets:
+                at_s, packet = self._packets.popleft()
+                time.sleep(max(0.0, at_s - time.monotonic()))
+                os.write(self._device, packet)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

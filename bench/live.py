@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """What the live page costs and how late it is: CPU of node and page without viewers and with some, and links that are slow.
 
-    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --beside 0.5 | --browser | --pairs 7
-        | --minutes 60 | --floor] [--kills 2]
+    scripts/with-env python bench/live.py [--seconds 20] [--viewers 3] [--link 8 [--video] | --round-trip 100 | --beside 0.5
+        | --browser | --pairs 7 | --minutes 60 | --floor] [--kills 2]
 
 Viewers are WebSocket clients without a browser that acknowledge what they read. ``--link`` puts them and the page into a network
 namespace where what the page sends leaves at so many Mbit/s (tc htb; needs root); with ``--video`` the viewer takes the camera as
-WebRTC and decodes it. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
+WebRTC and decodes it. With ``--round-trip`` each packet takes half of so many ms, as through a VPN, beside one that takes
+none; it needs root as well. ``--beside`` gives a second viewer that reads so many Mbit/s, and says what that does to the first.
 ``--browser`` opens the page in a Chromium on a machine of its own (a network namespace): how late items come and are drawn, the
 first frame, outages of 10 s. ``--pairs`` measures the node's CPU with and without viewers in turns, ``--minutes`` what the page
 holds while viewers come and go. ``--floor`` measures the page with one viewer beside processes that only read the same topics
@@ -37,6 +38,7 @@ from typing import Any
 
 import aiohttp
 import aiortc
+from _link import FAR, NEAR, LongWay
 from _report import Bar, show, spread
 
 sys.path.insert(0, str(Path(__file__).parents[1] / 'test'))
@@ -51,6 +53,8 @@ WATCHING = 8
 """While the page is killed."""
 TAKINGS = round(4 / 1.1, 1)
 """Times the CPU of taking the messages that the page may use with one viewer: 4 % of a core was the aim where that cost 1.1 %."""
+MOST_LATE_MS, FULL_SHARE = 60.0, 0.9
+"""What an IMU message may take besides the way, and the part of the bytes of a near viewer that a far one must get."""
 BESIDE = 1.2
 """Times its p95 alone that a viewer beside one on a slow link may have."""
 
@@ -63,12 +67,14 @@ class Watcher:
         self.late_ms: dict[str, list[float]] = {}
         self.bytes = self.acknowledgements = 0
         self.takes_video = False
+        self.token = ''
 
     async def run(self, *, reads: bool = True, bytes_s: float = 0.0) -> None:
         """``bytes_s``: it reads no faster."""
+        jar = aiohttp.CookieJar(unsafe=True)  # of addresses too
         async with (
-            aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}) as session,
-            session.ws_connect(f'{self.url}ws') as ws,
+            aiohttp.ClientSession(headers={'Origin': self.url.rstrip('/')}, cookie_jar=jar) as session,
+            await self.connected(session) as ws,
         ):
             await ws.send_json({'watch': self.topics})
             if self.takes_video:
@@ -102,6 +108,12 @@ class Watcher:
                 if time.monotonic() - said_s > 1:
                     said_s = time.monotonic()
                     await ws.send_json({'ping': said_s})
+
+    async def connected(self, session: aiohttp.ClientSession) -> aiohttp.ClientWebSocketResponse:
+        if self.token:
+            async with session.post(f'{self.url}api/session', json={'token': self.token}) as answer:
+                answer.raise_for_status()
+        return await session.ws_connect(f'{self.url}ws')
 
     def told(self, seconds: float) -> dict[str, Any]:
         found: dict[str, Any] = {
@@ -153,11 +165,12 @@ def private_mb(pid: int) -> float:
     return round(sum(int(line.split()[1]) for line in lines if line.startswith('Private_')) / 1024, 1)
 
 
-def watched(url: str, count: int, seconds: float, pids: dict[str, int], *, deaf: int = 0, video: bool = False) -> dict[str, Any]:
+def watched(url: str, count: int, seconds: float, pids: dict[str, int], *,
+            deaf: int = 0, video: bool = False, token: str = '') -> dict[str, Any]:  # fmt: skip
     """So many viewers for so long, ``deaf`` of which read nothing: what each gets, and the CPU of the processes, % of a core."""
     watchers = [Watcher(url, TOPICS) for _ in range(count)]
     for watcher in watchers:
-        watcher.takes_video = video
+        watcher.takes_video, watcher.token = video, token
 
     async def run() -> tuple[float, dict[str, float]]:
         tasks = [asyncio.create_task(watcher.run(reads=place >= deaf)) for place, watcher in enumerate(watchers)]
@@ -353,6 +366,15 @@ def link_bars(row: dict[str, Any], mbps: float, *, video: bool) -> list[Bar]:
     ]
 
 
+def far_bars(near: dict[str, Any], far: dict[str, Any], round_ms: float) -> list[Bar]:
+    where = f'at {round_ms:g} ms of round trip'
+    return [
+        at_least(f'bytes of a viewer {where}, of those of one beside the robot', FULL_SHARE,
+                 far['each'][0]['mbps'] / near['each'][0]['mbps'], 'of them'),
+        *late(far, {'imu': round_ms / 2 + MOST_LATE_MS}, where),
+    ]  # fmt: skip
+
+
 def browser_bars(row: dict[str, Any]) -> list[Bar]:
     return [
         *(at_most(f"{kind} to the browser's handler, p95", 60, ms, 'ms') for kind, ms in row['came'].items() if kind in KINDS),
@@ -408,7 +430,9 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
     stack.callback(processes.end)
     node = processes.node()
     sim = processes.sim(f'rate_scale:={given.scale}')
-    live, url = processes.page(node, *(['--bind', ROBOT] if machines else []))
+    way = LongWay(0.0) if given.round_trip else None
+    bound = ['--bind', ROBOT] if machines else ['--bind', NEAR, '--name', FAR] if way else []
+    live, url = processes.page(node, *bound)
     pids = {'node': node.popen.pid, 'live': live.popen.pid}
     until(lambda: node.topic('/imu').get('received', 0) > 50, 'the robot is heard')
 
@@ -433,6 +457,12 @@ def measured(given: argparse.Namespace, stack: ExitStack, folder: Path) -> list[
     elif given.link:
         shape(url, given.link)
         bars = link_bars(tell(watched(url, 1, given.seconds, pids, video=given.video)), given.link, video=given.video)
+    elif way:
+        token = (node.home / 'live' / 'viewer.token').read_text().strip()
+        far_url = url.replace(NEAR, FAR)
+        near = tell(watched(far_url, 1, given.seconds, pids, token=token))
+        way.round_s = given.round_trip / 1e3
+        bars = far_bars(near, tell(watched(far_url, 1, given.seconds, pids, token=token)), given.round_trip)
     elif given.kills:
         bars = []
     else:
@@ -447,6 +477,7 @@ def main() -> int:
     parser.add_argument('--viewers', type=int, default=3, help='of the rows with more than one (default 3)')
     parser.add_argument('--link', type=float, default=0.0, metavar='MBPS', help='what the page sends leaves no faster')
     parser.add_argument('--video', action='store_true', help='with --link: take the camera as WebRTC')
+    parser.add_argument('--round-trip', type=float, default=0.0, metavar='MS', help='a packet and its answer take so long')
     parser.add_argument('--kills', type=int, default=0, help='so often the page is killed while eight watch')
     parser.add_argument('--beside', type=float, default=0.0, metavar='MBPS', help='a second viewer that reads no faster')
     parser.add_argument('--browser', action='store_true', help='in a Chromium on a machine of its own')
@@ -455,11 +486,12 @@ def main() -> int:
     parser.add_argument('--floor', action='store_true', help='beside processes that only read the same topics')
     parser.add_argument('--scale', type=float, default=1.0, help="of the robot's rates (default 1)")
     given = parser.parse_args()
-    if (given.link or given.browser) and 'LIVE_BENCH' not in os.environ:
+    if (given.link or given.browser or given.round_trip) and 'LIVE_BENCH' not in os.environ:
         command = ['unshare', '-n', sys.executable, *sys.argv]
         return subprocess.run(command, env={**os.environ, 'LIVE_BENCH': '1'}, check=False).returncode
-    if given.link:
+    if given.link or given.round_trip:
         subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True)
+    if given.link:
         subprocess.run(['ip', 'addr', 'add', '192.0.2.1/32', 'dev', 'lo'], check=True)  # aiortc's viewer takes no 127.0.0.1
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bars = measured(given, stack, Path(folder))

@@ -11,6 +11,7 @@ import os
 import secrets
 import socket
 import ssl
+import struct
 import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
@@ -80,7 +81,8 @@ LEDGER_EVERY: Final = 2
 """The ledger is read with each second status."""
 ASK_AGAIN_S: Final = 5.0
 """How often it is asked whether those who watch still may."""
-SEND_BUFFER: Final = 32 << 10
+_MIN_RTT: Final = struct.Struct('=148xI')
+"""tcp_info.tcpi_min_rtt of linux/tcp.h, in microseconds."""
 LEASE_EVERY_S: Final = 2.0
 DOCTOR_S: Final = 60.0
 """What the doctor found is told again for so long, however many ask."""
@@ -480,6 +482,7 @@ class LiveServer:
                 except Exception:  # the one supervised catch-all: the page shows the age of what it has
                     log.exception('the figures cannot be read')
                 for one in self._viewers:
+                    one.viewer.round_s = _round_s(one.transport)
                     one.viewer.choose_sizes()
                     self._suggest_video(one, began_s)
                 self._rewatch()
@@ -755,6 +758,7 @@ class LiveServer:
             await ws.prepare(request)
             _quicken(request)
             one.transport = request.transport
+            one.viewer.round_s = _round_s(one.transport)
             self._offer_catalogue(one)
             self._rewatch()
             one.tasks = [asyncio.create_task(self._receive(one))]
@@ -964,12 +968,10 @@ def _static(folder: Path) -> list[tuple[str, tuple[bytes, bytes, str, str]]]:
 
 
 def _listener(bind: str, port: int) -> socket.socket:
-    """Before it listens its connections' buffers are made small: what waits there is stale when it arrives."""
     family = socket.AF_INET6 if ':' in bind else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         listener.bind((bind, port))
         listener.listen(64)
         listener.setblocking(False)
@@ -979,8 +981,21 @@ def _listener(bind: str, port: int) -> socket.socket:
     return listener
 
 
+def _round_s(transport: asyncio.BaseTransport | None) -> float:
+    """The least time that a packet and its answer took lately, as the kernel of Linux says; 0 where it is unknown."""
+    connection = transport.get_extra_info('socket') if transport is not None else None
+    if connection is not None:
+        with suppress(OSError, struct.error):
+            told = int(_MIN_RTT.unpack_from(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))[0])
+            return 0.0 if told == 0xFFFF_FFFF else told / 1e6
+    return 0.0
+
+
 def _quicken(request: web.Request) -> None:
-    """Frames of a viewer leave at once, marked as interactive video where the system lets us."""
+    """Frames of a viewer leave at once, marked as interactive video where the system lets us, and few wait to be sent.
+
+    What waits here is stale when it arrives; what is on its way is as much as the way holds.
+    """
     transport = request.transport
     connection = transport.get_extra_info('socket') if transport is not None else None
     if connection is None:

@@ -15,13 +15,15 @@ from typing import Final
 
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
-LEAST_WINDOW, MOST_WINDOW = 12 << 10, 128 << 10
-CHUNKS: Final = 3
-"""Frames of a window: on a slow link small items wait for a smaller one."""
+LEAST_QUEUE, MOST_QUEUE = 12 << 10, 64 << 10
+"""Bytes that may wait on the link, besides those that are on their way."""
+QUEUE_S: Final = 0.04
+"""They last so long, within these bounds."""
+LEAST_CHUNK, MOST_CHUNK = 4 << 10, 16 << 10
+"""Bytes of a frame with a part of a large item: on a slow link small items wait for a smaller one."""
+CHUNK_S: Final = QUEUE_S / 3
 SMALL_FRAME: Final = 4 << 10
 """Bytes of a frame with small items, from which on the next has the rest."""
-WINDOW_S: Final = 0.04
-"""What may be under way lasts so long on the link, within these bounds."""
 SMALL_ROOM: Final = 8 << 10
 """Small items may exceed the window by so much: they do not wait for a large one to be acknowledged."""
 MOST_ROWS_WAITING: Final = 12
@@ -42,6 +44,9 @@ UP: Final = 1.6
 """By how much the link must be better than a larger size needs, before it is sent."""
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
+MOST_RATE: Final = 5e6
+"""Bytes a second that may be on their way: twice what a robot has to show."""
+MOST_ROUND_S: Final = 0.3
 
 BESIDE_VIDEO: Final = 0.15
 """Of the link, for clouds while video has its own way."""
@@ -70,6 +75,8 @@ class Viewer:
         """Bulk items that were replaced by newer ones before they were sent."""
         self.has_video = False
         """Whether it gets its camera as video beside this: then bulk items are paced, and do not measure the link."""
+        self.round_s = 0.0
+        """How long the way there and back takes when nothing waits on it; 0 where nobody knows."""
         self._now = now
         self._rows: dict[str, deque[LiveItem]] = {}
         self._slots: dict[str, LiveItem] = {}
@@ -80,7 +87,7 @@ class Viewer:
         self._sizes: dict[str, int] = {}
         self._bytes: dict[str, int] = {}
         self._sent = self._acked = 0
-        self._measured: deque[tuple[int, int, float]] = deque()
+        self._measured: deque[tuple[int, int, int, float]] = deque()  # an item's end, and at its begin: sent, acknowledged, when
         self._bulk_s = 0.0  # when bulk may be sent again, beside video
 
     def watch(self, topics: Iterable[str]) -> None:
@@ -106,8 +113,9 @@ class Viewer:
 
     @property
     def window(self) -> int:
-        """Bytes that may be under way."""
-        return int(min(max(self.rate * WINDOW_S, LEAST_WINDOW), MOST_WINDOW))
+        """Bytes that may be under way: what fills the link, and a little that waits on it."""
+        queue = min(max(self.rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
+        return int(queue + min(self.rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
 
     def next_frame(self) -> bytes | None:
         """What is sent now; None while nothing waits or may be sent."""
@@ -125,9 +133,12 @@ class Viewer:
         if self._acked < received <= self._sent:
             self._acked = received
             while self._measured and self._measured[0][0] <= received:
-                _, before, since_s = self._measured.popleft()
-                # The mean of times, not of rates: one item that a buffer took at once says little about the link.
-                pace = max(self._now() - since_s, 1e-4) / (received - before)
+                _, begin, before, since_s = self._measured.popleft()
+                # The link carries at least what was acknowledged in that time, and at least what was sent in that time less the
+                # way there and back: the latter is more where it had been idle. The mean is of times, not of rates: one item that
+                # a buffer took at once says little about the link.
+                took_s = max(self._now() - since_s, 1e-4)
+                pace = min(took_s / (received - before), max(took_s - self.round_s, 1e-4) / (received - begin))
                 self.rate = 1 / (0.7 / self.rate + 0.3 * max(pace, 1e-8))
 
     def choose_sizes(self) -> None:
@@ -164,8 +175,8 @@ class Viewer:
             lane = self._lanes[topic] = _Lane(self._free_lane(), body)
             flags = BEGIN
             if len(body) >= LEAST_MEASURED and not self.has_video:
-                self._measured.append((self._sent + len(body), self._acked, self._now()))
-        part = lane.body[lane.at : lane.at + self.window // CHUNKS]
+                self._measured.append((self._sent + len(body), self._sent, self._acked, self._now()))
+        part = lane.body[lane.at : lane.at + int(min(max(self.rate * CHUNK_S, LEAST_CHUNK), MOST_CHUNK))]
         lane.at += len(part)
         self._bulk_s = max(self._bulk_s, self._now()) + len(part) / (self.rate * BESIDE_VIDEO) if self.has_video else 0.0
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)

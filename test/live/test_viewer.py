@@ -9,16 +9,16 @@ from e2e.live_frames import Frames
 
 from shadowhound_data_logger.live.kinds import FULL, SMALLEST, LiveItem
 from shadowhound_data_logger.live.viewer import (
-    CHUNKS,
-    LEAST_WINDOW,
+    LEAST_QUEUE,
+    MOST_CHUNK,
+    MOST_QUEUE,
+    MOST_RATE,
+    MOST_ROUND_S,
     MOST_ROWS_WAITING,
-    MOST_WINDOW,
     SMALL_FRAME,
     SMALLER,
     Viewer,
 )
-
-CHUNK = MOST_WINDOW // CHUNKS
 
 
 class Browser:
@@ -38,7 +38,7 @@ class Browser:
         before = len(self.items)
         while most and (frame := self.viewer.next_frame()) is not None:
             most -= 1
-            assert len(frame) <= CHUNK + 4
+            assert len(frame) <= MOST_CHUNK + 4
             self.items += [{**head, 'body': body} for head, body in self._frames.take(frame)]
         return self.items[before:]
 
@@ -89,7 +89,7 @@ def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topi
         browser.viewer.offer(frame(number))
         browser.viewer.offer(row(number))
         browser.read()
-    assert LEAST_WINDOW <= browser.received <= MOST_WINDOW + CHUNK
+    assert LEAST_QUEUE <= browser.received <= MOST_QUEUE + MOST_CHUNK
     browser.acknowledge()
     items = all_of(browser)
     frames = [item['number'] for item in items if item['topic'] == '/camera']
@@ -171,7 +171,7 @@ def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browse
     before = browser.received
     browser.viewer.acknowledge(said)
     browser.read()
-    assert browser.received - before <= CHUNK + 4
+    assert browser.received - before <= MOST_CHUNK + 4
 
 
 def test_what_is_not_watched_any_more_is_not_sent(browser: Browser) -> None:
@@ -181,3 +181,79 @@ def test_what_is_not_watched_any_more_is_not_sent(browser: Browser) -> None:
     browser.viewer.offer(frame(1))
     browser.viewer.watch([])
     assert all_of(browser) == []
+
+
+class Link:
+    """Carries what a viewer is sent at a rate, after which an acknowledgement takes the rest of a round. Times are in s."""
+
+    def __init__(self, viewer: Viewer, now: list[float], rate: float, round_s: float) -> None:
+        self.viewer, self.now, self.rate, self.round_s = viewer, now, rate, round_s
+        self.carried = 0
+        self._received = Frames()
+        self._free_s = 0.0
+        self._answers: list[tuple[float, int]] = []
+        self.late_s: list[float] = []
+
+    def run(self, seconds: float, camera_bytes: int = 60_000, camera_hz: float = 30.0) -> None:
+        """A camera, and rows at 100 Hz, each of which says when it was offered."""
+        camera_s = row_s = self.now[0]
+        sizes_s, end_s = self.now[0] + 1, self.now[0] + seconds
+        while self.now[0] < end_s:
+            if self.now[0] >= camera_s:
+                camera_s += 1 / camera_hz
+                size = self.viewer.size('/camera')
+                self.viewer.offer(LiveItem('/camera', 'camera', size, {}, bytes(int(camera_bytes * SMALLER[size]))))
+            if self.now[0] >= row_s:
+                row_s += 0.01
+                self.viewer.offer(LiveItem('/imu', 'imu', FULL, {'at': self.now[0]}, bytes(60)))
+            if self.now[0] >= sizes_s:
+                sizes_s += 1
+                self.viewer.choose_sizes()
+            while self._answers and self._answers[0][0] <= self.now[0]:
+                self.viewer.acknowledge(self._answers.pop(0)[1] & 0xFFFF_FFFF)
+            while (sent := self.viewer.next_frame()) is not None:
+                self._free_s = max(self._free_s, self.now[0]) + len(sent) / self.rate
+                self.carried += len(sent)
+                for head, _ in self._received.take(sent):
+                    if head['topic'] == '/imu':
+                        self.late_s.append(self._free_s + self.round_s / 2 - head['at'])
+                self._answers.append((self._free_s + self.round_s, self._received.bytes))
+            self.now[0] += 0.001
+
+
+@pytest.mark.parametrize('round_s', [0.0, 0.02, 0.1, 0.25])
+def test_a_long_way_is_filled(now: list[float], round_s: float) -> None:
+    """However far the robot is, a link that carries everything does: in full size, and small items are as late as the way is."""
+    viewer = Viewer(lambda: now[0])
+    viewer.round_s = round_s
+    link = Link(viewer, now, 4e6, round_s)
+    link.run(5.0)
+    link.late_s.clear()
+    link.carried = 0
+    link.run(10.0)
+    assert viewer.size('/camera') == FULL
+    assert link.carried > 10 * 30 * 60_000 * 0.9
+    late = sorted(link.late_s)
+    assert late[int(len(late) * 0.95)] < round_s / 2 + 0.03
+
+
+@pytest.mark.parametrize('round_s', [0.0, 0.1])
+@pytest.mark.parametrize('rate', [60_000.0, 250_000.0, 1e6])
+def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate: float, round_s: float) -> None:
+    """Nor is a far one taken for a faster one: a row is late by the way and by what may wait on it."""
+    viewer = Viewer(lambda: now[0])
+    viewer.round_s = round_s
+    link = Link(viewer, now, rate, round_s)
+    link.run(10.0)
+    link.late_s.clear()
+    link.run(20.0)
+    late = sorted(link.late_s)
+    assert 0.5 * rate < viewer.rate < 1.5 * rate
+    assert late[int(len(late) * 0.95)] < round_s / 2 + (LEAST_QUEUE + 2 * 4_096) / rate + 0.08
+
+
+def test_a_way_is_not_believed_to_hold_what_none_holds(now: list[float]) -> None:
+    """A kernel, or who stands in between, may say anything."""
+    viewer = Viewer(lambda: now[0])
+    viewer.rate, viewer.round_s = 1e12, 1e6
+    assert viewer.window <= MOST_QUEUE + MOST_RATE * MOST_ROUND_S
