@@ -25,6 +25,8 @@ MOST_WAITING: Final = 64
 LARGE: Final = 32 << 10
 """Bytes of a message of which the newest alone waits."""
 _MESSAGE_DATA: Final = 1
+_WARNING, _ERROR = 1, 2
+"""Levels of a status."""
 _UINT32: Final = 1 << 32
 
 
@@ -117,11 +119,16 @@ class FoxgloveClient:
 
     def _complain(self, message: str) -> None:
         if len(self._texts) < MOST_WAITING:
-            self._say(op='status', level=1, message=message)
+            self._say(op='status', level=_WARNING, message=message)
 
     def _say(self, **what: Any) -> None:
         self._texts.append(json.dumps(what))
         self.ready.set()
+
+
+def refusal(message: str) -> str:
+    """What a client is told that may not stay: its alerts show it."""
+    return json.dumps({'op': 'status', 'level': _ERROR, 'message': message})
 
 
 def _list(said: Mapping[str, Any], name: str) -> list[Any]:

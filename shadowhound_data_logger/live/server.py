@@ -25,7 +25,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from shadowhound_data_logger.clock import SECOND, SystemClock
@@ -45,7 +45,7 @@ from shadowhound_data_logger.live.access import (
     rtsp_password,
 )
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures
-from shadowhound_data_logger.live.foxglove import PROTOCOLS, FoxgloveClient
+from shadowhound_data_logger.live.foxglove import PROTOCOLS, FoxgloveClient, refusal
 from shadowhound_data_logger.live.h264 import H264Element, find_h264
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import FULL, KINDS, RAW, LiveItem
@@ -798,9 +798,13 @@ class LiveServer:
         ticket = request.query.get('ticket', '')
         nonce = self._access.of_ticket(ticket, address)
         if nonce is None:
-            return _problem(401, 'this address has ended, or is not for this machine: ask the page for another')
+            problem = "get a new address from the robot's page: this one has ended, or is for another computer"
+            return await _refuse_foxglove(request, _problem(401, problem), problem, WSCloseCode.POLICY_VIOLATION)
         if len(self._foxgloves) >= MOST_FOXGLOVES:
-            return _problem(429, f'{MOST_FOXGLOVES} clients are here, which is the most there may be', {'Retry-After': '10'})
+            problem = f'{MOST_FOXGLOVES} clients are here, which is the most there may be'
+            return await _refuse_foxglove(
+                request, _problem(429, problem, {'Retry-After': '10'}), problem, WSCloseCode.TRY_AGAIN_LATER
+            )
         ws = web.WebSocketResponse(
             protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0, heartbeat=SILENT_S
         )
@@ -944,6 +948,18 @@ def _ms(request: web.Request, name: str) -> int | None:
 
 def _json(content: Mapping[str, Any]) -> web.Response:
     return web.json_response(content, headers={'Cache-Control': 'no-store'})
+
+
+async def _refuse_foxglove(request: web.Request, answer: web.Response, problem: str, code: WSCloseCode) -> web.StreamResponse:
+    """In their protocol where it is spoken: a browser does not tell its page with which answer a WebSocket was refused."""
+    ws = web.WebSocketResponse(protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
+    if not ws.can_prepare(request):
+        return answer
+    with suppress(ConnectionError):
+        await ws.prepare(request)
+        await ws.send_str(refusal(problem))
+        await ws.close(code=code)
+    return ws
 
 
 def _problem(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:

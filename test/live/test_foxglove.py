@@ -171,6 +171,31 @@ def test_who_may_connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     asyncio.run(run())
 
 
+def test_a_client_is_told_why_it_may_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In its own protocol, which its alerts show: of an HTTP answer to a WebSocket a browser tells nothing."""
+
+    async def told(session: aiohttp.ClientSession, url: str) -> tuple[dict[str, Any], int | None]:
+        async with session.ws_connect(url, protocols=PROTOCOLS, headers={'Origin': 'http://lichtblick.example'}) as ws:
+            status = await ws.receive_json(timeout=60)
+            assert (await ws.receive(60)).type is aiohttp.WSMsgType.CLOSE
+            return status, ws.close_code
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession() as session:
+            page.server._on_graph(GRAPH)
+            path = await _path(page, 'viewer')
+            for wrong in ('/foxglove', path[:-1], f'/foxglove?ticket={page.token("viewer")}'):
+                status, code = await told(session, f'{page.origin}{wrong}')
+                assert (status['op'], status['level'], code) == ('status', 2, 1008)
+                assert status['message'].startswith('get a new address')
+            assert (page.server._foxgloves, page.server._wanted) == (set(), None)
+            monkeypatch.setattr(module, 'MOST_FOXGLOVES', 0)
+            status, code = await told(session, f'{page.origin}{path}')
+            assert (status['level'], status['message'][:2], code) == (2, '0 ', 1013)
+
+    asyncio.run(run())
+
+
 @pytest.mark.ros
 @pytest.mark.long('a publisher over DDS')
 def test_a_message_arrives_as_it_was_published(  # noqa: PLR0915 - one conversation
