@@ -34,6 +34,8 @@ FIND_S: Final = 30.0
 """For all encoders together: each is given some seconds, and GStreamer looks for its plug-ins first."""
 NOTHING_S: Final = 6.0
 """An encoder that gives nothing for so long while it is fed has failed."""
+H264_AGAIN_S: Final = 300.0
+"""After an encoder failed, whoever comes takes its topic as VP8 or JPEG for so long."""
 KEY_EVERY_S: Final = 0.7
 """Key frames that receivers ask for come no more often."""
 KEY_EVERY: Final = 150
@@ -168,6 +170,11 @@ def fitted(width: int, height: int, most_blocks: int) -> tuple[int, int]:
     return max(16, int(width * share) // 16 * 16), max(16, int(height * share) // 16 * 16)
 
 
+def of_size(size: tuple[int, int] | None) -> str:
+    """To be said with why an encoder failed: hardware takes no pictures that are smaller than it likes."""
+    return '' if size is None else f', with pictures of {size[0]} x {size[1]}'
+
+
 class H264Encoder:
     """Makes H.264 of the newest JPEG of a topic in a process of its own. Used by one event loop. New; open once; close once.
 
@@ -181,6 +188,7 @@ class H264Encoder:
         self._process = GstProcess(SCRIPT)
         self._task: asyncio.Task[None] | None = None
         self._is_over = False
+        self._size: tuple[int, int] | None = None
         self._wants_key = False
         self._key_s = -KEY_EVERY_S
         self._fed_s: float | None = None
@@ -210,7 +218,7 @@ class H264Encoder:
     def offer(self, at_ms: float, jpeg: bytes) -> None:
         try:
             height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
-            size = fitted(width, height, BLOCKS_3_1)
+            size = self._size = fitted(width, height, BLOCKS_3_1)
         except ValueError:
             return  # the age of the last one that was good is on the page
         if at_ms <= self._offered_ms:
@@ -261,7 +269,7 @@ class H264Encoder:
     def _fail(self, why: str) -> None:
         if not self._is_over:
             self._is_over = True
-            self._failed(f'{self._element.name}: {why}')
+            self._failed(f'{self._element.name}: {why}{of_size(self._size)}')
 
 
 async def _record(output: asyncio.StreamReader) -> tuple[dict[str, Any], bytes]:

@@ -122,7 +122,7 @@ class H264Pipeline:
     def _on_message(self, _: Any, message: Any) -> Any:
         if message.type == self._gi.Gst.MessageType.ERROR:
             error, _ = message.parse_error()
-            self._failed(error.message)
+            self._failed(error.message.rstrip('.'))
         return self._gi.Gst.BusSyncReply.DROP
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +20,7 @@ import simplejpeg
 
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
-from shadowhound_data_logger.live.h264 import BLOCKS_4_0, H264Element, fitted
+from shadowhound_data_logger.live.h264 import BLOCKS_4_0, H264_AGAIN_S, H264Element, fitted, of_size
 from shadowhound_data_logger.live.kinds import LiveItem
 
 log = logging.getLogger(__name__)
@@ -59,6 +60,11 @@ class RtspServer:
         self._task: asyncio.Task[None] | None = None
         self._cameras: list[str] = []
         self._refused: dict[str, str] = {}
+        self._h264_from_s: dict[str, float] = {}
+        """By topic: when H.264 is tried again after its encoder failed."""
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._jpegs: frozenset[str] = frozenset()
+        """Those that are played as JPEG."""
         self.topics: frozenset[str] = frozenset()
         """Those that somebody plays."""
         self.players: tuple[str, ...] = ()
@@ -81,28 +87,48 @@ class RtspServer:
         """Let these topics be played."""
         if (wanted := sorted(cameras)) != self._cameras:
             self._cameras = wanted
-            self._process.tell({'topics': wanted})
+            self._tell_topics()
 
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
         if item.topic not in self.topics:
             return
         try:
-            head = self._head(item.body)
+            head = self._head(item.topic, item.body)
         except ValueError as error:
             if self._refused.get(item.topic) != str(error):
                 log.warning('%s is not sent over RTSP: %s', item.topic, error)
                 self._refused[item.topic] = str(error)
         else:
-            self._process.tell({'topic': item.topic, **head}, item.body)
+            self._process.tell(head, item.body)
 
-    def _head(self, jpeg: bytes) -> dict[str, Any]:
+    def _head(self, topic: str, jpeg: bytes) -> dict[str, Any]:
         """What the process is told of a frame. Raises ValueError with why it cannot be sent."""
-        if self._given['h264'] is None and (why := unsuited(jpeg)):
+        is_jpeg = self._given['h264'] is None or topic in self._jpegs
+        if is_jpeg and (why := unsuited(jpeg)):
             raise ValueError(why)
         height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
-        head = {'width': width, 'height': height}
-        return head if self._given['h264'] is None else head | {'size': fitted(width, height, BLOCKS_4_0)}
+        head: dict[str, Any] = {'topic': topic, 'width': width, 'height': height}
+        if not is_jpeg:
+            head['size'] = self._sizes[topic] = fitted(width, height, BLOCKS_4_0)
+        return head
+
+    def _tell_topics(self) -> None:
+        now_s = time.monotonic()
+        jpegs = [topic for topic, from_s in self._h264_from_s.items() if from_s > now_s]
+        self._process.tell({'topics': self._cameras, 'jpegs': jpegs})
+
+    def _fail(self, topics: Iterable[str], why: str) -> None:
+        """The encoder of these: players that come are sent JPEG for a while, so that none is refused again and again."""
+        now_s = time.monotonic()
+        for topic in topics:
+            if self._h264_from_s.get(topic, 0.0) > now_s:
+                continue
+            log.warning('%s is not encoded as H.264 over RTSP: %s%s; for %.0f s players that come are sent JPEG',
+                        topic, why[:300], of_size(self._sizes.get(topic)), H264_AGAIN_S)  # fmt: skip
+            self._h264_from_s[topic] = now_s + H264_AGAIN_S
+        self._tell_topics()
+        asyncio.get_running_loop().call_later(H264_AGAIN_S + 1.0, self._tell_topics)
 
     async def _start(self) -> None:
         try:
@@ -117,7 +143,7 @@ class RtspServer:
             await self._process.end()
             raise RtspUnavailable(f'RTSP is not served: {said.get("error", "the process ended")}', remedy=said.get('remedy', ''))
         self.port = self._given['port'] = said['port']
-        self._process.tell({'topics': self._cameras})
+        self._tell_topics()
 
     async def _said(self) -> dict[str, Any]:
         """The next line of the process; empty when it has ended."""
@@ -129,7 +155,12 @@ class RtspServer:
         while True:
             while said := await self._said():
                 self.players = tuple(said.get('players', self.players))
+                self._jpegs = frozenset(said.get('jpegs', self._jpegs))
                 self._watch(said.get('watched', self.topics))
+                if 'failed' in said:
+                    self._fail([said['failed']], said['why'])
+            if self._given['h264'] is not None:  # whose encoder it was is not known
+                self._fail(self.topics - self._jpegs, 'the process has ended')
             self.players = ()
             self._watch(())
             log.warning('the process that serves RTSP has ended; it is started again')

@@ -2,9 +2,11 @@
 
 It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
 of a body, and these. The first head has ``address``, ``port``, ``user``, ``password``, and an encoder under ``h264`` as
-``h264_process.py`` has it, or null: JPEGs are sent as they are. Later ones name ``topics`` that are served, or a ``topic`` with
-``width`` and ``height`` of the JPEG in the body, and the ``size`` in which it is encoded. What it says are lines of JSON:
-``port``, ``watched`` (topics that clients play), ``players`` (the addresses of these), or ``error``. It ends with its input.
+``h264_process.py`` has it, or null: JPEGs are sent as they are. Later ones name ``topics`` that are served, and which of these
+are sent as JPEG (``jpegs``); or a ``topic`` with ``width`` and ``height`` of the JPEG in the body, and the ``size`` in
+which it is encoded. What it says are lines of JSON: ``port``, ``watched`` (topics that clients play) and which of these they get
+as JPEG (``jpegs``), ``players`` (the addresses of these clients), a topic of which the encoder has ``failed`` and ``why``, or
+``error``. It ends with its input.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ AF41 = 34
 MOST_SESSIONS = 16
 CLEAN_S = 5
 ROLE = 'viewer'
+writing = threading.Lock()
 
 
 def say(**what: Any) -> None:
     """A line for the process that feeds this one."""
-    sys.stdout.write(json.dumps(what) + '\n')
-    sys.stdout.flush()
+    with writing:
+        sys.stdout.write(json.dumps(what) + '\n')
+        sys.stdout.flush()
 
 
 def read(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
@@ -50,7 +54,7 @@ class Cameras:
         self._sources: dict[str, Any] = {}
         self._caps: dict[str, tuple[Any, ...]] = {}
         self._h264: dict[str, Any] | None = given['h264']
-        self._mounted: set[str] = set()
+        self._factories: dict[str, Any] = {}
         self._players: dict[Any, str] = {}
         self.server = rtsp.RTSPServer()
         self.server.set_address(given['address'])
@@ -63,22 +67,24 @@ class Cameras:
         self.server.set_auth(auth)
         self.server.connect('client-connected', self._meet)
 
-    def mount(self, topics: list[str]) -> None:
-        """Serve these; others that were served before stay."""
+    def mount(self, topics: list[str], jpegs: list[str]) -> None:
+        """Serve these; others that were served before stay. Whoever plays one already goes on as he does."""
         for topic in topics:
-            if topic in self._mounted:
-                continue
-            self._mounted.add(topic)
-            factory = self._rtsp.RTSPMediaFactory()
-            factory.set_launch(AS_JPEG if self._h264 is None else AS_H264.format(launch=self._h264['launch']))
-            factory.set_shared(True)
-            factory.set_dscp_qos(AF41)
-            permissions = self._rtsp.RTSPPermissions()
-            for right in ('media.factory.access', 'media.factory.construct'):
-                permissions.add_permission_for_role(ROLE, right, True)
-            factory.set_permissions(permissions)
-            factory.connect('media-configure', self._begin, topic)
-            self.server.get_mount_points().add_factory(topic, factory)
+            factory = self._factories.get(topic) or self._mount(topic)
+            encoder = None if topic in jpegs else self._h264
+            factory.set_launch(AS_JPEG if encoder is None else AS_H264.format(launch=encoder['launch']))
+
+    def _mount(self, topic: str) -> Any:
+        factory = self._factories[topic] = self._rtsp.RTSPMediaFactory()
+        factory.set_shared(True)
+        factory.set_dscp_qos(AF41)
+        permissions = self._rtsp.RTSPPermissions()
+        for right in ('media.factory.access', 'media.factory.construct'):
+            permissions.add_permission_for_role(ROLE, right, True)
+        factory.set_permissions(permissions)
+        factory.connect('media-configure', self._begin, topic)
+        self.server.get_mount_points().add_factory(topic, factory)
+        return factory
 
     def push(self, head: dict[str, Any], jpeg: bytes) -> None:
         topic, width, height = head['topic'], head['width'], head['height']
@@ -120,21 +126,34 @@ class Cameras:
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:
         pipeline = media.get_element()
-        if self._h264 is not None:
+        frames, scaled = pipeline.get_by_name('frames'), pipeline.get_by_name('size')
+        if self._h264 is not None and scaled is not None:
             encoder = pipeline.get_by_name('h264')
             for name, text in self._h264['set'].items():
                 if encoder.find_property(name) is not None:  # as other versions have it
                     self._gst.util_set_object_arg(encoder, name, text)
+            pipeline.get_parent().get_bus().set_sync_handler(self._on_message, topic)
         with self._lock:
-            self._sources[topic] = pipeline.get_by_name('frames'), pipeline.get_by_name('size')
+            self._sources[topic] = frames, scaled
             self._caps.pop(topic, None)
-            media.connect('unprepared', self._end, topic)
-            say(watched=sorted(self._sources))
+            media.connect('unprepared', self._end, topic, frames)
+            self._tell()
 
-    def _end(self, _: Any, topic: str) -> None:
+    def _on_message(self, _: Any, message: Any, topic: str) -> Any:
+        if message.type == self._gst.MessageType.ERROR:
+            error, _ = message.parse_error()
+            say(failed=topic, why=error.message.rstrip('.'))
+        return self._gst.BusSyncReply.PASS
+
+    def _end(self, _: Any, topic: str, frames: Any) -> None:
         with self._lock:
-            self._sources.pop(topic, None)
-            say(watched=sorted(self._sources))
+            if self._sources.get(topic, (None,))[0] is frames:  # and not those of one that has taken its place
+                del self._sources[topic]
+            self._tell()
+
+    def _tell(self) -> None:
+        jpegs = [topic for topic, (_, scaled) in self._sources.items() if scaled is None]
+        say(watched=sorted(self._sources), jpegs=sorted(jpegs))
 
 
 def main() -> None:
@@ -167,7 +186,7 @@ def main() -> None:
         while (record := read(sys.stdin.buffer)) is not None:
             head, jpeg = record
             if 'topics' in head:
-                GLib.idle_add(cameras.mount, head['topics'])
+                GLib.idle_add(cameras.mount, head['topics'], head['jpegs'])
             else:
                 cameras.push(head, jpeg)
         GLib.idle_add(loop.quit)

@@ -31,7 +31,7 @@ from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCRtp
 from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationError
 from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
 
-from shadowhound_data_logger.live.h264 import KEY_EVERY_S, H264Element, H264Encoder
+from shadowhound_data_logger.live.h264 import H264_AGAIN_S, KEY_EVERY_S, H264Element, H264Encoder
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.untrusted import check_pixels
 from shadowhound_data_logger.worker import Worker
@@ -51,8 +51,6 @@ RATE_SHARE: Final = 0.85
 """Of what a receiver says that its link carries."""
 RAISE_EVERY_S: Final = 4.0
 """A new rate begins with a key frame, so a better one waits."""
-H264_AGAIN_S: Final = 300.0
-"""After an encoder of H.264 failed, viewers who come take its topic as VP8 for so long."""
 MOST_WAITING: Final = 10
 """Packets of a peer whose turn does not come; then it goes on with the next key frame."""
 CONNECT_S: Final = 10.0

@@ -207,6 +207,7 @@ def test_a_process_that_fails_is_told_of_once(script: str, why: str, tmp_path: P
     (text,) = failed
     assert text.startswith('nvv4l2h264enc: ')
     assert why in text
+    assert text.endswith(', with pictures of 320 x 240')
 
 
 # -- a software encoder in the place of hardware -------------------------------------------------------------------------------

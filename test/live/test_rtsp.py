@@ -10,7 +10,9 @@ import shutil
 import socket
 import stat
 import subprocess
+import sys
 import time
+from dataclasses import replace
 from hashlib import new
 from pathlib import Path
 
@@ -22,8 +24,10 @@ from live.test_webrtc import CAMERA, LEVELS, Robot, robot, until
 from PIL import Image
 
 from shadowhound_data_logger.live import gstreamer as module
+from shadowhound_data_logger.live import h264, rtsp
 from shadowhound_data_logger.live.access import make_tokens, rtsp_password
 from shadowhound_data_logger.live.gstreamer import PYTHON
+from shadowhound_data_logger.live.h264 import SOFTWARE
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.rtsp import RtspServer, RtspUnavailable, unsuited
 from shadowhound_data_logger.options import COMPRESSED_IMAGE
@@ -92,6 +96,64 @@ def test_a_machine_without_gstreamer_says_what_to_install(monkeypatch: pytest.Mo
         said = asyncio.run(run())
         assert 'gir1.2-gst-rtsp-server-1.0' in said
         assert 'secret' not in said
+
+
+BREAKS = """import json, os, struct, sys
+def read():
+    head, body = struct.unpack('<II', sys.stdin.buffer.read(8))
+    return json.loads(sys.stdin.buffer.read(head)), sys.stdin.buffer.read(body)
+def say(**what):
+    print(json.dumps(what), flush=True)
+def play():
+    say(watched=['/big', '/small'], jpegs=[topic for topic in ('/big', '/small') if topic in served['jpegs']])
+read()
+say(port=1)
+served, _ = read()
+if served['jpegs']:
+    play()
+else:
+    play()
+    while read()[0].get('topic') != '/small':
+        pass
+    {breaks}
+    play()
+sys.stdin.buffer.read()
+"""
+
+
+@pytest.mark.parametrize(('breaks', 'jpegs', 'why'), [
+    ('say(failed="/small", why="it cannot"); served, _ = read()', {'/small'}, 'it cannot, with pictures of 64 x 48'),
+    ('os.abort()', {'/big', '/small'}, 'the process has ended, with pictures of 64 x 48'),
+], ids=['it says so', 'it crashes'])  # fmt: skip
+def test_a_camera_whose_encoder_fails_is_sent_as_jpeg(
+    breaks: str, jpegs: set[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """For a while; each is told of once. Where the whole process went with it, so are all that were encoded by it."""
+    (tmp_path / 'script.py').write_text(BREAKS.replace('{breaks}', breaks))
+    monkeypatch.setattr(rtsp, 'SCRIPT', tmp_path / 'script.py')
+    monkeypatch.setattr(rtsp, 'AGAIN_S', 0.0)
+    monkeypatch.setattr(module, 'PYTHON', Path(sys.executable))
+
+    async def run() -> None:
+        server = RtspServer('127.0.0.1', 0, 'secret', lambda: None, SOFTWARE)
+        await server.open()
+        try:
+            server.serve(['/big', '/small'])
+
+            async def is_sent() -> bool:
+                for topic, picture in (('/big', jpeg(480, 640)), ('/small', jpeg(48, 64))):
+                    server.offer(LiveItem(topic, 'camera', head={'at': 1.0}, body=picture))
+                return server._jpegs == jpegs
+
+            await until(is_sent, 'JPEG')
+            assert {topic for topic in ('/big', '/small') if 'size' not in server._head(topic, jpeg(48, 64))} == jpegs
+        finally:
+            await server.close()
+
+    asyncio.run(run())
+    told = [record.getMessage() for record in caplog.records if 'is not encoded as H.264' in record.getMessage()]
+    assert sorted(text.split()[0] for text in told) == sorted(jpegs)
+    assert why in told[-1]
 
 
 def hashed(text: str) -> str:
@@ -252,6 +314,49 @@ def test_ffmpeg_plays_the_camera_as_h264(tmp_path: Path, monkeypatch: pytest.Mon
             await asyncio.gather(odd, return_exceptions=True)
 
     asyncio.run(run())
+
+
+@pytest.mark.long("GStreamer's RTSP server")
+def test_a_camera_that_the_encoder_takes_no_pictures_of_is_sent_as_jpeg(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Encoders in hardware have a least size. The first player is refused, those after it are not; other cameras stay H.264."""
+    encoder = software_encoder()
+    least = 'capsfilter caps="video/x-raw,width=(int)[128,4096],height=(int)[96,4096]" ! '
+    monkeypatch.setattr(h264, 'SOFTWARE', replace(SOFTWARE, launch=least + SOFTWARE.launch))
+
+    def describe(url: str, password: str) -> tuple[int, str]:
+        with contextlib.closing(Player(url, password)) as player:
+            return player.ask('DESCRIBE')
+
+    async def publish(found: Robot) -> None:
+        while True:
+            found.server._on_items([LiveItem('/small', 'camera', head={'at': time.monotonic() * 1e3}, body=jpeg(64, 64))])
+            await asyncio.sleep(0.1)
+
+    async def run() -> None:
+        async with robot(tmp_path, monkeypatch, rtsp=0, h264=encoder) as found:
+            found.server._on_graph({CAMERA: COMPRESSED_IMAGE, '/small': COMPRESSED_IMAGE})
+            small = asyncio.create_task(publish(found))
+            password = (tmp_path / 'live' / 'rtsp.password').read_text().strip()
+            urls = {topic: f'{found.server.rtsp_url}{topic}' for topic in (CAMERA, '/small')}
+            for url in urls.values():
+                await until_served(url)
+            assert (await asyncio.to_thread(describe, urls['/small'], password))[0] == 503
+
+            async def is_played() -> str:
+                status, described = await asyncio.to_thread(describe, urls['/small'], password)
+                return described if status == 200 else ''
+
+            assert 'm=video 0 RTP/AVP 26' in await until(is_played, 'JPEG')
+            status, described = await asyncio.to_thread(describe, urls[CAMERA], password)
+            assert (status, 'H264/90000' in described) == (200, True)
+            small.cancel()
+            await asyncio.gather(small, return_exceptions=True)
+
+    asyncio.run(run())
+    told = [record.getMessage() for record in caplog.records if 'is not encoded as H.264 over RTSP' in record.getMessage()]
+    assert [(text.split()[0], 'with pictures of 64 x 64' in text) for text in told] == [('/small', True)]
 
 
 @pytest.mark.long("GStreamer's RTSP server and client")
