@@ -31,7 +31,8 @@ SCRIPT: Final = Path(__file__).with_name('h264_process.py')
 NEVER: Final = 'none'
 """In place of an encoder's name: nothing is encoded as H.264."""
 FIND_S: Final = 30.0
-"""For all encoders together: each is given some seconds, and GStreamer looks for its plug-ins first."""
+"""For all encoders together, and for each where that failed: each is given some seconds, and GStreamer looks for its plug-ins
+first."""
 NOTHING_S: Final = 6.0
 """An encoder that gives nothing for so long while it is fed has failed."""
 H264_AGAIN_S: Final = 300.0
@@ -136,7 +137,23 @@ async def find_h264(named: str = '') -> H264Element | None:
 
 
 async def _found(tried: tuple[H264Element, ...]) -> dict[str, Any]:
-    """What the process says of these: ``found``, or ``error``."""
+    """What is said of these: ``found``, or ``error``. A driver may crash the process that tries it, or never return."""
+    said = await _said_of(tried)
+    if 'broken' not in said:
+        return said
+    if len(tried) == 1:
+        return {'error': said['broken']}
+    log.warning('no encoder of H.264 is known yet: %s; each is tried by itself', said['broken'])
+    for element in tried:
+        said = await _found((element,))
+        log.info('%s: %s', element.name, said.get('error', 'it encodes'))
+        if 'found' in said:
+            break
+    return said
+
+
+async def _said_of(tried: tuple[H264Element, ...]) -> dict[str, Any]:
+    """What one process says of these; or ``broken``: why it says nothing."""
     picture = bytes(simplejpeg.encode_jpeg(np.full((240, 320, 3), 128, np.uint8), colorsubsampling='420'))
     process = GstProcess(SCRIPT)
     try:
@@ -144,9 +161,9 @@ async def _found(tried: tuple[H264Element, ...]) -> dict[str, Any]:
         process.tell({'at': 0.0, 'width': 320, 'height': 240, 'size': (320, 240)}, picture)
         head, _ = await asyncio.wait_for(_record(process.output), FIND_S)
     except asyncio.TimeoutError:
-        return {'error': f'it says nothing for {FIND_S:.0f} s'}
+        return {'broken': f'its process says nothing for {FIND_S:.0f} s'}
     except EOFError:
-        return {'error': 'its process has ended'}
+        return {'broken': 'its process has ended'}
     except (OSError, ValueError, TypeError) as error:
         return {'error': f'{PYTHON}: {error}'}
     else:

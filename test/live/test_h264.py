@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import logging
 import subprocess
 import sys
 from collections.abc import AsyncIterator
@@ -129,6 +130,38 @@ def test_a_machine_without_gstreamer_has_no_encoder(tmp_path: Path, monkeypatch:
     assert asyncio.run(find_h264('none')) is None
     with pytest.raises(H264Unavailable, match='x264enc does not encode here'):
         asyncio.run(find_h264('x264enc'))
+
+
+TRIES = """import json, os, struct, sys
+def read():
+    head, body = struct.unpack('<II', sys.stdin.buffer.read(8))
+    return json.loads(sys.stdin.buffer.read(head)), sys.stdin.buffer.read(body)
+tried, _ = read()
+read()
+for name in [each['name'] for each in tried['find']]:
+    if name == 'nvh264enc':
+        {breaks}
+text = json.dumps({'found': 'v4l2h264enc'} if name == 'v4l2h264enc' else {'error': 'no device'}).encode()
+sys.stdout.buffer.write(struct.pack('<II', len(text), 0) + text)
+"""
+
+
+@pytest.mark.parametrize(('breaks', 'why'), [('os.abort()', 'its process has ended'), ('sys.stdin.read()', 'says nothing')])
+def test_an_encoder_that_crashes_or_hangs_keeps_no_other_from_being_tried(
+    breaks: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The log says which one it was."""
+    caplog.set_level(logging.INFO)
+    (tmp_path / 'script.py').write_text(TRIES.replace('{breaks}', breaks))
+    monkeypatch.setattr(h264, 'SCRIPT', tmp_path / 'script.py')
+    monkeypatch.setattr(h264, 'FIND_S', 30.0 if 'ended' in why else 1.0)
+    monkeypatch.setattr(gstreamer, 'PYTHON', Path(sys.executable))
+    found = asyncio.run(find_h264())
+    assert found is not None
+    assert found.name == 'v4l2h264enc'
+    assert [text.split(':')[0] for text in caplog.messages if why in text][1:] == ['nvh264enc']
+    with pytest.raises(H264Unavailable, match=why):
+        asyncio.run(find_h264('nvh264enc'))
 
 
 @pytest.mark.parametrize(('width', 'height', 'encoded'), [
