@@ -9,6 +9,7 @@ import asyncio
 import json
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -64,9 +65,18 @@ class GstProcess:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            await asyncio.wait_for(process.wait(), END_S)
+            await asyncio.wait_for(_over(process), END_S)
         except asyncio.TimeoutError:
-            process.kill()
-            await process.wait()
+            with suppress(ProcessLookupError):
+                process.kill()
+            await _over(process)
         if self._process is process:
             self._process = None
+
+
+async def _over(process: asyncio.subprocess.Process) -> None:
+    """Wait until it has ended. What it still says is thrown away: the end of one whose pipe is full is not seen."""
+    assert process.stdout is not None
+    while await process.stdout.read(1 << 16):
+        pass
+    await process.wait()

@@ -173,6 +173,8 @@ def encode(gi: Any, element: dict[str, Any]) -> None:
 
 def main() -> None:
     """Encode, or find an encoder."""
+    sys.stdout = os.fdopen(os.dup(1), 'w')  # ours alone: what drivers print, as NVIDIA's do, goes where errors go
+    os.dup2(2, 1)
     first = read(sys.stdin.buffer)
     if first is None:
         return

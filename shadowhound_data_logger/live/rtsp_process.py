@@ -12,6 +12,7 @@ as JPEG (``jpegs``), ``players`` (the addresses of these clients), a topic of wh
 from __future__ import annotations
 
 import json
+import os
 import struct
 import sys
 import threading
@@ -158,6 +159,8 @@ class Cameras:
 
 def main() -> None:
     """Until the input ends."""
+    sys.stdout = os.fdopen(os.dup(1), 'w')  # ours alone: what drivers print, as NVIDIA's do, goes where errors go
+    os.dup2(2, 1)
     first = read(sys.stdin.buffer)
     if first is None:
         return

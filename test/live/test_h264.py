@@ -9,6 +9,7 @@ import logging
 import subprocess
 import sys
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -207,6 +208,7 @@ def wait():
     ('say({"at": -1e300, "key": True}, b"\\0\\0\\0\\1e"); wait()', 'no H.264'),
     ('say({}, text=b"[" * 2000); wait()', 'too deep'),
     ('wait()', 'nothing for 0.3 s'),
+    ('while True: sys.stdout.buffer.write(b"noise" * 99_999)', 'bytes at once'),
 ])  # fmt: skip
 def test_a_process_that_fails_is_told_of_once(script: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether it ends, says that it cannot, says nothing, or says what is no H.264 of the camera; nothing of it is passed on."""
@@ -369,6 +371,19 @@ def test_the_rate_is_kept() -> None:
             second = sum(len(unit) for *_, unit in found.units[90:]) * 8
             assert first < 1_000_000
             assert 1.5 * first < second < 2_500_000
+
+    asyncio.run(run())
+
+
+@pytest.mark.long("GStreamer's encoder of H.264")
+def test_what_a_driver_prints_is_not_taken_for_what_the_process_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NVIDIA's print to standard output."""
+    monkeypatch.setattr(h264, 'SOFTWARE', replace(SOFTWARE, launch=f'identity dump=true ! {SOFTWARE.launch}'))
+
+    async def run() -> None:
+        async with decoded() as found:
+            for number in range(3):
+                await found.encode(jpeg(50 + number))
 
     asyncio.run(run())
 
