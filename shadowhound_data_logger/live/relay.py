@@ -23,8 +23,8 @@ from urllib.parse import urlsplit
 import aiohttp
 import numpy as np
 
-from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.live.access import token_of
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.live.access import TokenRefused, token_of
 from shadowhound_data_logger.live.kinds import FULL, KINDS, MOST_NAMES, LiveItem, check_jpeg
 from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE
 
@@ -35,6 +35,10 @@ SILENT_S: Final = 3.0
 """The robot says something each second."""
 AGAIN_S: Final = 0.7
 """After a connection ended, and up to half as long again."""
+REFUSED_S: Final = 30.0
+"""The same where the robot did not let us in, unless we have another token: each wrong one counts against this address there."""
+LOOK_S: Final = 1.0
+"""How often it is looked meanwhile which token we have."""
 TRY_S: Final = 1.0, 1.0, 1.0, 4.0
 """How long one attempt after the other to connect gets: a packet that is lost at its begin is sent again later and later."""
 PINGS: Final = 12
@@ -45,8 +49,18 @@ MOST_SMALL: Final = 1 << 20
 MOST_HEAD: Final = 1 << 20
 MOST_LANES: Final = 64
 _SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
-_BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, Rejected, TypeError, AttributeError, RecursionError)
+_BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, DataLoggerError, TypeError, AttributeError,
+                  RecursionError)  # fmt: skip
+_NOT_SIGNED_IN: Final = {
+    401: 'it refuses the token: copy its viewer.token once more', 429: 'too many wrong tokens came from this address',
+}  # fmt: skip
+_NOT_WATCHING: Final = {401: 'it asks for a token: see --robot-token', 429: 'it takes no more viewers'}
+"""Why it does not let us in, by status."""
 _BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk}
+
+
+class _NotLetIn(ValueError):
+    """The robot is well, and does not want us."""
 
 
 class Relay:
@@ -63,6 +77,7 @@ class Relay:
         self._patience = itertools.cycle(TRY_S)
         self._wake = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self._tried = ''
         self.problem = ''
         """Why nothing comes; empty while connected, or while nobody watches."""
 
@@ -87,24 +102,47 @@ class Relay:
             try:
                 await self._watch()
             except (aiohttp.ClientError, *_BROKEN) as error:
-                why = str(error)[:200] or type(error).__name__
-                if not self.problem:
-                    log.warning('the page of the robot cannot be read: %s', why)
-                self.problem = f'the page of the robot cannot be read: {why}'
-                self._came(_catalogue([], self.problem))
+                problem = f'the page of the robot cannot be read: {str(error)[:200] or type(error).__name__}'
+                if not self.problem or (isinstance(error, _NotLetIn) and problem != self.problem):
+                    log.warning('%s', problem)
+                self.problem = problem
+                self._came(_catalogue([], problem))
+                if isinstance(error, _NotLetIn):
+                    await self._look_for_token()
                 await asyncio.sleep(AGAIN_S * random.uniform(1.0, 1.5))
 
+    async def _look_for_token(self) -> None:
+        """Until there is another one than was tried, or some time has passed."""
+        until_s = time.monotonic() + REFUSED_S
+        while time.monotonic() < until_s and self._given() == self._tried:
+            await asyncio.sleep(LOOK_S)
+
+    def _given(self) -> str:
+        """The token of now; empty where there is none that can be used."""
+        with suppress(TokenRefused):
+            return '' if self._token is None else token_of(self._token)
+        return ''
+
     async def _watch(self) -> None:
-        """Until nobody watches any more. Raises for a connection that failed, or an answer that is none."""
+        """Until nobody watches any more. Raises for a connection that failed or was ended, or an answer that is none."""
         timeout = aiohttp.ClientTimeout(total=None, connect=10.0, sock_connect=next(self._patience), sock_read=10.0)
         jar = aiohttp.CookieJar(unsafe=True)  # an address is as good as a name
         async with aiohttp.ClientSession(headers={'Origin': self._origin}, timeout=timeout, cookie_jar=jar) as session:
             if self._token is not None:
-                given = {'token': token_of(self._token)}
+                self._tried = token_of(self._token)
+                given = {'token': self._tried}
                 async with session.post(f'{self._url}/api/session', json=given, allow_redirects=False) as answer:
+                    if answer.status in _NOT_SIGNED_IN:
+                        raise _NotLetIn(_NOT_SIGNED_IN[answer.status])
                     if answer.status != 200:
                         raise ValueError(f'it does not let us in ({answer.status})')
-            async with session.ws_connect(f'{self._url}/ws', max_msg_size=MOST_MESSAGE) as ws:
+            try:
+                ws = await session.ws_connect(f'{self._url}/ws', max_msg_size=MOST_MESSAGE)
+            except aiohttp.WSServerHandshakeError as error:
+                if error.status in _NOT_WATCHING:
+                    raise _NotLetIn(_NOT_WATCHING[error.status]) from error
+                raise
+            async with ws:
                 self.problem = ''
                 log.info('watching at %s', self._origin)
                 connection = _Connection(ws, self._came)
@@ -117,6 +155,8 @@ class Relay:
                         await asyncio.wait([teller], timeout=0.1)
                     if not teller.cancelled():
                         teller.exception()  # the connection has ended, whatever it says of that
+        if self._wanted() is not None:
+            raise ConnectionError('it has ended the connection')
 
     async def _tell(self, connection: _Connection) -> None:
         """What is watched, when it changes, and a ping each second."""

@@ -18,6 +18,8 @@ from e2e.live_frames import Frames
 from live.test_access import Page, serving
 from live.test_kinds import of_too_many_pixels
 
+from shadowhound_data_logger.live import access, relay, server
+from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.options import COMPRESSED_IMAGE
@@ -25,6 +27,7 @@ from shadowhound_data_logger.options import COMPRESSED_IMAGE
 CAMERA, IMU = '/camera', '/imu'
 GRAPH = {CAMERA: COMPRESSED_IMAGE, IMU: 'sensor_msgs/msg/Imu'}
 VIEWERS = 10
+GIVEN = relay.Relay._given
 
 
 @asynccontextmanager
@@ -110,6 +113,129 @@ def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pyte
             await run(robot, await stack.enter_async_context(tower(tmp_path, robot.origin, token)))
 
     asyncio.run(both())
+
+
+def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The robot would lock this address out. Whoever watches is told; the new token is taken as soon as the file has it."""
+    monkeypatch.setattr(server, 'ASK_AGAIN_S', 0.05)
+    monkeypatch.setattr(relay, 'AGAIN_S', 0.01)
+    monkeypatch.setattr(relay, 'REFUSED_S', 3600.0)
+    monkeypatch.setattr(relay, 'LOOK_S', 0.01)
+    looks: list[str] = []
+
+    def token_of(path: Path) -> str:
+        looks.append(path.read_text())
+        return access.token_of(path)
+
+    monkeypatch.setattr(relay, 'token_of', token_of)
+
+    async def run() -> None:
+        async with serving(tmp_path / 'robot', monkeypatch) as robot:
+            robot.server.ros_problem = ''
+            robot.server._on_graph(GRAPH)
+            token = tmp_path / 'thor.token'
+            token.write_text(robot.token('viewer'))
+            token.chmod(0o600)
+            async with tower(tmp_path, robot.origin, token) as page:
+                browser = Browser()
+                task = asyncio.create_task(browser.run(page))
+
+                def problem() -> str | None:
+                    told: str | None = browser.newest.get('topics', ({'problem': None},))[0]['problem']
+                    return told
+
+                await until(lambda: problem() == '' and robot.server._viewers)
+                make_tokens(robot.folder, anew=True)
+                await until(lambda: 'refuses the token' in (problem() or ''))
+                looks.clear()
+                await until(lambda: len(looks) > 50)
+                assert len(robot.server._access._failures['127.0.0.1']) == 1
+                token.write_text('')  # it is being replaced
+                await until(lambda: 'holds no token' in (problem() or ''))
+                token.write_text(robot.token('viewer'))
+                await until(lambda: problem() == '' and robot.server._viewers)
+                assert len(robot.server._access._failures.get('127.0.0.1', ())) == 0
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        assert sum('refuses the token' in text for text in caplog.messages) == 1
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(('path', 'status', 'why'), [
+    ('/api/session', 429, 'too many wrong tokens'), ('/ws', 401, 'asks for a token'), ('/ws', 429, 'no more viewers'),
+])  # fmt: skip
+def test_a_robot_that_lets_nobody_in_is_left_alone_for_a_while(
+    path: str, status: int, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether too many came from here, it wants a token and we have none, or it has as many viewers as it takes."""
+    monkeypatch.setattr(relay, 'AGAIN_S', 0.01)
+    monkeypatch.setattr(relay, 'REFUSED_S', 3600.0)
+    monkeypatch.setattr(relay, 'LOOK_S', 0.01)
+    asked: list[str] = []
+    looks: list[int] = []
+    monkeypatch.setattr(relay.Relay, '_given', lambda self: looks.append(1) or GIVEN(self))
+
+    async def refuse(request: web.Request) -> web.StreamResponse:
+        asked.append(request.path)
+        return web.json_response({}, status=status)
+
+    async def run() -> None:
+        app = web.Application()
+        app.add_routes([web.route('*', path, refuse)])
+        runner = web.AppRunner(app)
+        await runner.setup()
+        await web.TCPSite(runner, '127.0.0.1', 0).start()
+        (token := tmp_path / 'token').write_text('x' * 30)
+        token.chmod(0o600)
+        given = token if path == '/api/session' else None
+        try:
+            async with tower(tmp_path, f'http://127.0.0.1:{runner.addresses[0][1]}', given) as page:
+                browser = Browser()
+                task = asyncio.create_task(browser.run(page))
+                await until(lambda: why in browser.newest.get('topics', ({'problem': ''},))[0]['problem'])
+                await until(lambda: len(looks) > 50)
+                assert asked == [path]
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        finally:
+            await runner.cleanup()
+
+    asyncio.run(run())
+
+
+def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And whoever watches is told why nothing comes."""
+    monkeypatch.setattr(relay, 'AGAIN_S', 3600.0)
+    asked: list[str] = []
+
+    async def end(request: web.Request) -> web.StreamResponse:
+        asked.append(request.path)
+        ws = web.WebSocketResponse()
+        await ws.prepare(request)
+        return ws
+
+    async def run() -> None:
+        app = web.Application()
+        app.add_routes([web.get('/ws', end)])
+        runner = web.AppRunner(app)
+        await runner.setup()
+        await web.TCPSite(runner, '127.0.0.1', 0).start()
+        try:
+            async with tower(tmp_path, f'http://127.0.0.1:{runner.addresses[0][1]}', None) as page:
+                browser = Browser()
+                task = asyncio.create_task(browser.run(page))
+                await until(lambda: len(asked) > 20 or 'topics' in browser.newest)
+                assert 'has ended the connection' in browser.newest['topics'][0]['problem']
+                assert asked == ['/ws']
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        finally:
+            await runner.cleanup()
+
+    asyncio.run(run())
 
 
 WHOLE, SEVERAL = b'\x01\x03\x00\x00', b'\x00\x03\x00\x00'
