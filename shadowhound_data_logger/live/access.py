@@ -234,8 +234,11 @@ class Access:
         # One each: a viewer who signs out again and again ends no operator's sign-in.
         self._ended = {role: _Ended(path.with_name(f'{role}.{ENDED_FILE}'), now) for role, path in tokens.items()}
 
-    def sign_in(self, token: str, address: str) -> tuple[SignIn, str] | None:
-        """Of whoever knows a token, with the cookie; None for a wrong one. Raises TokenRefused where nobody can sign in."""
+    def sign_in(self, token: str, address: str, over: SignIn | None = None) -> tuple[SignIn, str] | None:
+        """Of whoever knows a token, with the cookie; None for a wrong one. Raises TokenRefused where nobody can sign in.
+
+        It takes the place of ``over``, whose cookie came with the token: that is signed out; ``keep`` makes it last.
+        """
         given = _bytes(token)
         for role in ROLES:
             try:
@@ -243,6 +246,8 @@ class Access:
             except TokenRefused:  # the other role's may be good
                 continue
             if hmac.compare_digest(given, token.encode()):
+                if over is not None:  # first: that may end all that expire as soon as another one of the role
+                    self.sign_out(over)
                 nonce, expires = secrets.token_urlsafe(12), self._ended[role].expiry()
                 text = f'{role}.{expires}.{nonce}'
                 self._failures.pop(address, None)

@@ -591,8 +591,9 @@ class LiveServer:
         if wait_s := self._access.wait_s(address):
             return _problem(429, 'too many wrong tokens', {'Retry-After': str(round(wait_s))})
         token = (await _body(request)).get('token')
+        before = self._access.who(request.cookies.get(COOKIE))
         try:
-            found = self._access.sign_in(token, address) if isinstance(token, str) else None
+            found = self._access.sign_in(token, address, before) if isinstance(token, str) else None
         except TokenRefused as error:
             log.warning('nobody can sign in: %s', error)
             return _problem(503, str(error))
@@ -600,6 +601,8 @@ class LiveServer:
             log.warning('a wrong token from %s', address)
             return _problem(401, 'this is not the token of a viewer or operator')
         who, cookie = found
+        if before is not None and before.nonce:
+            await self._keep_sign_outs(before.role)
         log.info('%s signed in from %s', who.role, address)
         response = _json({'role': who.role, 'csrf': who.csrf, 'signed_in': True, **self._about})
         response.set_cookie(COOKIE, cookie, max_age=LASTS_S, httponly=True, samesite='Strict', secure=self._scheme == 'https')
@@ -612,14 +615,20 @@ class LiveServer:
         self._access.sign_out(who)
         _end(one for one in self._viewers if one.who.nonce == who.nonce)
         _end(one for one in self._foxgloves if one.nonce == who.nonce)
-        try:
-            await asyncio.to_thread(self._access.keep, who.role)
+        if await self._keep_sign_outs(who.role):
             response = _json({})
-        except OSError as error:
-            log.error('a sign-out is forgotten when this page restarts: %s', error)  # noqa: TRY400 - an operator's matter
+        else:
             response = _problem(503, 'signed out until this page restarts: the disk refused it; --new-tokens ends it for good')
         response.del_cookie(COOKIE)
         return response
+
+    async def _keep_sign_outs(self, role: str) -> bool:
+        try:
+            await asyncio.to_thread(self._access.keep, role)
+        except OSError as error:
+            log.error('a sign-out is forgotten when this page restarts: %s', error)  # noqa: TRY400 - an operator's matter
+            return False
+        return True
 
     def _refused(self, request: web.Request) -> web.StreamResponse | None:
         """The answer to a request that acts and does not come from an operator at this page."""

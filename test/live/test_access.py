@@ -271,6 +271,67 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
     asyncio.run(run())
 
 
+@pytest.mark.parametrize('bind', ['0.0.0.0', '127.0.0.1'])
+def test_a_sign_in_ends_the_one_whose_cookie_comes_with_it(bind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever that cookie was copied to, also after the page restarts; a wrong token ends nothing, nor does a forged cookie."""
+    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
+    right, wrong = (json.dumps({'token': token}).encode() for token in ('{}', 'x' * 30))
+
+    async def role(page: Page, who: str) -> str:
+        status, _, body = await page.ask(who, 'GET', '/api/session')
+        told = json.loads(body)
+        return told['role'] if status == 200 and told['signed_in'] else ''
+
+    async def run() -> None:
+        async with (
+            serving(tmp_path, monkeypatch, bind) as page,
+            aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
+        ):
+            others = dict(page.cookies)
+            await page.sign_in('viewer')
+            copied = await session.ws_connect(
+                f'{page.origin}/ws', headers={'Cookie': f'shadowhound_live={page.cookies["viewer"]}'}
+            )
+            token = right.replace(b'{}', page.token('operator').encode())
+            forged = others['operator'][:-1] + ('0' if others['operator'][-1] != '0' else '1')
+            for cookie, body, status in (
+                (page.cookies['viewer'], wrong, 401),
+                (forged, token, 200),
+                ('', token, 200),
+                (page.cookies['viewer'], token, 200),
+            ):
+                assert [await role(page, who) for who in ('viewer', 'operator')] == ['viewer', 'operator']
+                headers = {'Cookie': f'shadowhound_live={cookie}'}
+                found, answer, _ = await page.ask('stranger', 'POST', '/api/session', body=body, headers=headers)
+                assert found == status
+            await ended(copied)
+            page.cookies['new'] = answer['Set-Cookie'].partition('=')[2].partition(';')[0]
+            assert [await role(page, who) for who in ('viewer', 'operator', 'new')] == ['', 'operator', 'operator']
+            others |= {'gone': page.cookies['viewer'], 'new': page.cookies['new']}
+        async with serving(tmp_path, monkeypatch, bind) as page:
+            page.cookies = others
+            told = [await role(page, who) for who in ('viewer', 'operator', 'new', 'gone')]
+            assert told == ['viewer', 'operator', 'operator', '']
+
+    asyncio.run(run())
+
+
+def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The log says it."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            (page.folder / f'viewer.{ENDED_FILE}.part').mkdir()
+            body = json.dumps({'token': page.token('operator')}).encode()
+            assert (await page.ask('viewer', 'POST', '/api/session', body=body))[0] == 200
+            assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
+            assert 'a sign-out is forgotten' in caplog.text
+
+    asyncio.run(run())
+
+
 def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once all tabs of that browser and its Foxglove; those of another sign-in with the same token go on."""
     monkeypatch.setattr(module, 'ASK_AGAIN_S', 3600.0)  # nobody else looks who may watch
@@ -646,6 +707,28 @@ def test_a_viewer_who_signs_out_again_and_again_ends_no_operator_s_sign_in(
         it.sign_out(access, it.cookie(access))
     for each in (access, it.access()):
         assert each.who(operator[1]) == operator[0]
+
+
+def test_a_viewer_who_signs_in_again_and_again_over_himself_ends_nobody_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of his own sign-ins the last one is left, also when all came within a second."""
+    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    it = Signing(tmp_path)
+    access = it.access()
+    tokens = {role: path.read_text().strip() for role, path in it.tokens.items()}
+    operator = access.sign_in(tokens['operator'], '10.0.0.1')
+    assert operator is not None
+    cookies: list[str] = []
+    for _ in range(9):
+        signed = access.sign_in(tokens['viewer'], '10.0.0.1', over=access.who(cookies[-1] if cookies else None))
+        assert signed is not None
+        access.keep('viewer')
+        cookies.append(signed[1])
+    for each in (access, it.access()):
+        assert each.who(operator[1]) == operator[0]
+        assert [each.who(cookie) is not None for cookie in cookies] == [False] * 8 + [True]
+    assert it.entries == 3
 
 
 def test_a_clock_that_was_ahead_makes_no_cookie_for_years(tmp_path: Path) -> None:
