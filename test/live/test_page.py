@@ -647,6 +647,32 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
         served.close()
 
 
+def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sign-in of before ends, and its connection with it; the page goes on by the new one, without a reload."""
+    monkeypatch.setattr(server_module, 'ASK_AGAIN_S', 0.2)
+    settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
+    served = Served(settings, monkeypatch)
+    try:
+        page = opened(browser, f'http://127.0.0.1:{served.server.port}/')
+        page.locator('input[name=token]').fill((tmp_path / 'live' / 'viewer.token').read_text().strip())
+        press(page.locator('button.primary'))
+        holds(page, 'shadowhound.count.figures > 0')
+        page.evaluate('window.same = true')
+        (viewer,) = served.server._viewers
+        press(page.get_by_role('button', name='Sign in as operator'))
+        page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
+        press(page.locator('dialog button.primary'))
+        page.locator('[data-act=flush]').wait_for()
+        until(lambda: [one.who.role for one in served.server._viewers] == ['operator'], 'the connection of the operator')
+        assert viewer not in served.server._viewers
+        count = counted(page, 'figures')
+        holds(page, f'shadowhound.count.figures > {count}')
+        assert page.evaluate('window.same')
+        page.close()
+    finally:
+        served.close()
+
+
 def test_where_everybody_may_watch_an_operator_becomes_a_viewer(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
