@@ -121,7 +121,7 @@ class RtspServer:
     def _fail(self, topics: Iterable[str], why: str) -> None:
         """The encoder of these: players that come are sent JPEG for a while, so that none is refused again and again."""
         now_s = time.monotonic()
-        for topic in topics:
+        for topic in sorted(topics):
             if self._h264_from_s.get(topic, 0.0) > now_s:
                 continue
             log.warning('%s is not encoded as H.264 over RTSP: %s%s; for %.0f s players that come are sent JPEG',

@@ -24,6 +24,8 @@ AS_H264 = f'( {FRAMES} ! {{launch}} ! rtph264pay name=pay0 pt=96 )'
 AF41 = 34
 """DSCP of interactive video (RFC 4594)."""
 MOST_SESSIONS = 16
+TRIES = 30
+"""Frames of which an encoder makes something before it has failed."""
 CLEAN_S = 5
 ROLE = 'viewer'
 writing = threading.Lock()
@@ -54,6 +56,8 @@ class Cameras:
         self._lock = threading.Lock()
         self._sources: dict[str, Any] = {}
         self._caps: dict[str, tuple[Any, ...]] = {}
+        self._fed: dict[str, int] = {}
+        """By topic of which nothing came yet that could be described to a player: frames that were encoded."""
         self._h264: dict[str, Any] | None = given['h264']
         self._factories: dict[str, Any] = {}
         self._players: dict[Any, str] = {}
@@ -104,6 +108,8 @@ class Cameras:
                     scaled.set_property('caps', self._gst.Caps.from_string(
                         f'video/x-raw,width={size[0]},height={size[1]},pixel-aspect-ratio=1/1'))  # fmt: skip
                 source.set_property('caps', self._gst.Caps.from_string(caps))
+            if topic in self._fed:
+                self._fed[topic] += 1
             source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
 
     def _meet(self, _: Any, client: Any) -> None:
@@ -137,8 +143,14 @@ class Cameras:
         with self._lock:
             self._sources[topic] = frames, scaled
             self._caps.pop(topic, None)
+            self._fed[topic] = 0
+            media.connect('prepared', self._on_prepared, topic)
             media.connect('unprepared', self._end, topic, frames)
             self._tell()
+
+    def _on_prepared(self, _: Any, topic: str) -> None:
+        with self._lock:
+            self._fed.pop(topic, None)
 
     def _on_message(self, _: Any, message: Any, topic: str) -> Any:
         if message.type == self._gst.MessageType.ERROR:
@@ -148,8 +160,11 @@ class Cameras:
 
     def _end(self, _: Any, topic: str, frames: Any) -> None:
         with self._lock:
-            if self._sources.get(topic, (None,))[0] is frames:  # and not those of one that has taken its place
+            own, scaled = self._sources.get(topic, (None, None))
+            if own is frames:  # and not those of one that has taken its place
                 del self._sources[topic]
+                if self._fed.pop(topic, 0) >= TRIES and scaled is not None:
+                    say(failed=topic, why=f'nothing came of {TRIES} frames')
             self._tell()
 
     def _tell(self) -> None:

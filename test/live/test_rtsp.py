@@ -359,6 +359,48 @@ def test_a_camera_that_the_encoder_takes_no_pictures_of_is_sent_as_jpeg(
     assert [(text.split()[0], 'with pictures of 64 x 64' in text) for text in told] == [('/small', True)]
 
 
+@pytest.mark.long("GStreamer's RTSP server, which waits 20 s")
+@pytest.mark.parametrize('is_fed', [True, False])
+def test_a_camera_of_which_the_encoder_makes_nothing_is_sent_as_jpeg(is_fed: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """One that is silent itself is not the encoder's fault."""
+    software_encoder()
+    element = replace(SOFTWARE, launch=f'valve drop=true ! {SOFTWARE.launch}')
+
+    def describe(url: str) -> tuple[int, str]:
+        with contextlib.closing(Player(url, 'secret')) as player:
+            player._socket.settimeout(60.0)
+            return player.ask('DESCRIBE')
+
+    async def publish(server: RtspServer) -> None:
+        while True:
+            server.offer(LiveItem(CAMERA, 'camera', head={'at': time.monotonic() * 1e3}, body=jpeg(480, 640)))
+            await asyncio.sleep(0.05)
+
+    async def run() -> None:
+        server = RtspServer('127.0.0.1', 0, 'secret', lambda: None, element)
+        await server.open()
+        camera = asyncio.create_task(publish(server) if is_fed else asyncio.sleep(0))
+        try:
+            server.serve([CAMERA])
+            url = f'rtsp://127.0.0.1:{server.port}{CAMERA}'
+            await until_served(url)
+            assert (await asyncio.to_thread(describe, url))[0] == 503
+            if is_fed:
+
+                async def is_played() -> str:
+                    status, described = await asyncio.to_thread(describe, url)
+                    return described if status == 200 else ''
+
+                assert 'm=video 0 RTP/AVP 26' in await until(is_played, 'JPEG')
+        finally:
+            camera.cancel()
+            await asyncio.gather(camera, return_exceptions=True)
+            await server.close()
+
+    asyncio.run(run())
+    assert ['nothing came of' in text for text in caplog.messages if 'is not encoded' in text] == [True] * is_fed
+
+
 @pytest.mark.long("GStreamer's RTSP server and client")
 def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the password, the very JPEGs; without it, nothing. A topic is read while somebody plays it, from where is known."""
