@@ -136,6 +136,9 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('GET', '/', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/api/session', {}, (401, 200, 200)),
     ('GET', '/api/session', {'headers': REBOUND}, (403, 403, 403)),
+    ('GET', '/viewer.token', {}, (404, 404, 404)),
+    ('GET', '/api/foxglove', {}, (401, 200, 200)),
+    ('GET', '/api/past/robots', {}, (401, 200, 200)),
     ('GET', '/api/gaps', {}, (401, 503, 503)),  # there is no spool
     ('GET', '/api/gaps?from=-1', {}, (401, 400, 400)),
     ('GET', '/api/past/days', {}, (401, 503, 503)),  # there is no spool
@@ -200,20 +203,21 @@ def policy(headers: dict[str, str]) -> dict[str, str]:
 
 
 def test_a_table_of_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each as a stranger, as a viewer and as an operator; every answer has the headers that keep others out."""
+    """Each as a stranger, as a viewer and as an operator; every answer has the headers that keep others out, and no token."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
             found, expected = [], []
             for method, path, special, statuses in TABLE:
                 for who, status in zip(WHO, statuses, strict=True):
-                    given, headers, _ = await page.ask(who, method, path, **special)
+                    given, headers, body = await page.ask(who, method, path, **special)
                     case = f'{who}: {method} {path} {special}'
                     found.append((case, given))
                     expected.append((case, status))
                     if given != 101:
                         assert policy(headers) == POLICY, case
                         assert KEEPING_OUT.items() <= headers.items(), case
+                    assert not any(page.token(role) in f'{headers} {body!r}' for role in WHO[1:]), case
             assert found == expected
 
     asyncio.run(run())
