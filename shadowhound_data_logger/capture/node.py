@@ -133,13 +133,6 @@ def give_back() -> None:
         trim(0)
 
 
-def free_shared_memory() -> None:
-    """What processes that were killed left in /dev/shm, such as the node before this one."""
-    if found := orphans(is_freed=True):
-        freed = sum(each.bytes for each in found)
-        log.info('freed %.0f MB of shared memory (%d segments) that killed processes had left', freed / 1e6, len(found))
-
-
 def refuse(rest: list[str]) -> int:
     """Answer arguments that are not for ROS; the exit code."""
     if rest[0] in {'-h', '--help'}:
@@ -163,11 +156,14 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2
     stop = StopSignals()
+    freed = orphans(is_freed=True)  # before anything of ours needs the room that the node before may have left full
     with middleware.profiled(os.environ), dead_ports_avoided(get_default_context().get_domain_id()) as avoided:
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     guard = PortGuard()
     logging.basicConfig(level=logging.INFO, format='%(message)s', handlers=[RosHandler(node.get_logger())])
-    free_shared_memory()
+    if freed:
+        size = sum(each.bytes for each in freed)
+        log.info('freed %.0f MB of shared memory (%d segments) that killed processes had left', size / 1e6, len(freed))
     if avoided:
         log.info(
             'not listening at %d ports in shared memory of processes that were killed: others may still write there', len(avoided)
