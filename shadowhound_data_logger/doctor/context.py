@@ -14,7 +14,7 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
 from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.ros_arguments import read_parameters
+from shadowhound_data_logger.ros_arguments import NODE, read_parameters
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001
@@ -32,7 +32,8 @@ def make(
     root: Path = Path('/'),
 ) -> Context:
     """Raises ParametersUnreadable. What Settings refuses is left out, one after the other, and told in ``refused``."""
-    given = dict(parameters if parameters is not None else read_parameters(parameter_file) if parameter_file else {})
+    node = f'/{namespace.strip("/")}/{NODE}' if namespace.strip('/') else None
+    given = dict(parameters if parameters is not None else read_parameters(parameter_file, node) if parameter_file else {})
     known, left, refused = dict(environ), dict(given), []
     while True:
         try:

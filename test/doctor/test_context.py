@@ -90,6 +90,19 @@ def test_a_parameter_file(tmp_path: Path) -> None:
         read_parameters(path)
 
 
+def test_a_parameter_file_of_two_robots(tmp_path: Path) -> None:
+    """Of each namespace its own."""
+    path = tmp_path / 'fleet.yaml'
+    path.write_text(
+        '/tachi/sensor_logger_node:\n  ros__parameters: {robot: tachi, imu.rate_hz: 10.0}\n'
+        '/other/sensor_logger_node:\n  ros__parameters: {robot: other, imu.rate_hz: -1.0}\n'
+    )
+    for namespace in ('/tachi', '/tachi/'):
+        made = make({}, parameter_file=path, namespace=namespace)
+        assert (made.settings.robot, made.refused) == ('tachi', ())
+    assert [error.data['name'] for error in make({}, parameter_file=path, namespace='/other').refused] == ['imu.rate_hz']
+
+
 def test_who_can_reach_what_listens(scene: Scene) -> None:
     """IPv4 and IPv6, as the kernel writes them; what is connected does not listen."""
     scene.listen('0100007F:1389', '00000000:2328', '0A01A8C0:0050')
