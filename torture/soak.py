@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
-from e2e.processes import HERE, Node, Process, Processes, published, until
+from e2e.processes import HERE, Node, Process, Processes, is_accounted, published, until
 from e2e.wire import HANG, PASS, REFUSE, Wire
 from matplotlib.figure import Figure
 
@@ -46,6 +46,8 @@ DELIVER_S: Final = 1800.0
 STEPS_S: Final = (-300, 300)
 """How far the clock is wrong: not so far that the store refuses the signatures."""
 FLAT_MB: Final = 16.0
+LOG_MB, INDEX_BYTES = 6.0, 2_000
+"""Of the index: its write-ahead log, and what it remembers of an object for three days."""
 FLAT_COUNT: Final = 4
 """Descriptors and threads that come and go."""
 BAD_ANSWER: Final = (503, 'SlowDown')
@@ -95,13 +97,13 @@ class Soak:
 
     def bars(self) -> Iterator[Bar]:
         rows = self.ledger['topics']
-        said = {topic: (count, rows.get(topic, {})) for topic, count in self.published.items() if topic in rows}
+        told = {topic: rows[topic]['received'] + rows[topic]['missed'] if topic in rows else 0 for topic in self.published}
         open_ends = [
-            f'{topic}: {count} published, {row["received"]} received, {row["missed"]} missed'
-            for topic, (count, row) in said.items()
-            if count != row['received'] + row['missed']
+            f'{topic}: {count} published, {told[topic]} received or missed'
+            for topic, count in self.published.items()
+            if not is_accounted(told[topic], count)
         ]
-        yield Bar('every message is received or listed as missed', bool(said) and not open_ends, '; '.join(open_ends))
+        yield Bar('every message is received or listed as missed', bool(told) and not open_ends, '; '.join(open_ends))
         dropped = {topic: row['dropped'] for topic, row in rows.items() if row['dropped']}
         yield Bar('none that was received is dropped', not dropped, str(dropped or ''))
         yield Bar('the ledger balances, at any time', not self.unbalanced, '; '.join(self.unbalanced[:3]))
@@ -111,6 +113,11 @@ class Soak:
             early, late = self.early_and_late(what)
             yield Bar(f'{what} do not grow' if what.endswith('s') else f'{what} does not grow', late - early <= most,
                       f'{early:.1f} in the second quarter, {late:.1f} in the last')  # fmt: skip
+
+        early, late = self.looks[len(self.looks) // 4], self.looks[-1]
+        grown, objects = late.index_mb - early.index_mb, late.delivered - early.delivered
+        yield Bar('the index grows with what it remembers alone', grown <= LOG_MB + objects * INDEX_BYTES / 1e6,
+                  f'{grown:.1f} MB for {objects} objects')  # fmt: skip
 
     def early_and_late(self, what: str) -> tuple[float, float]:
         """Medians of the second and of the last quarter of the time in which the robot published."""

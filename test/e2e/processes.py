@@ -27,6 +27,9 @@ WAIT_S = 120.0
 """Longer than anything takes that works, on a machine that does other things as well; a node starts in two when it is idle."""
 GENTLE = 'rate_scale:=0.3'
 """Of a simulated Go2, for tests that are not about its rates: it and the node cost a third."""
+UNHEARD = 3
+"""So many messages a publisher may have sent before a node on a busy machine knows of it, RELIABLE or not: an account begins with
+the first that was taken (docs/reliability.md)."""
 T = TypeVar('T')
 
 
@@ -313,6 +316,11 @@ class Processes:
 
     def _name(self, kind: str) -> str:
         return f'{kind}-{len(self.started)}'
+
+
+def is_accounted(told: int | None, counted: int) -> bool:
+    """Whether a ledger knows of all that a robot published, but for what it sent before the node knew of it."""
+    return told is None or 0 <= counted - told <= UNHEARD
 
 
 def published(sim: Process, seconds: float = WAIT_S) -> dict[str, int]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from e2e.bag_reading import Bag, Recorded, bags, by_topic
-from e2e.processes import LONG, WAIT_S, Node, Processes, published
+from e2e.processes import LONG, WAIT_S, Node, Processes, is_accounted, published
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import Heard, recorded
 
@@ -21,8 +21,6 @@ DURATION_S = 60.0 if LONG else 7.0
 SLICE_S = 2.0
 CATALOGUE_S = 2.0
 BEST_EFFORT = {'/point_cloud2', '/camera/camera_info'}
-UNHEARD = 3
-"""So many messages a BEST_EFFORT publisher may have sent before a node on a busy machine knows of it: they are in no account."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,7 @@ class Session:
         ended_ns = time.time_ns()
         for topic in BEST_EFFORT:
             counted = ledger['topics'][topic]['published']
-            if counted is not None and said[topic] - UNHEARD <= counted < said[topic]:
+            if counted is not None and is_accounted(counted, said[topic]):
                 said[topic] = counted
         witness.signal(signal.SIGTERM)
         assert witness.wait() == 0
