@@ -246,9 +246,10 @@ class Access:
             except TokenRefused:  # the other role's may be good
                 continue
             if hmac.compare_digest(given, token.encode()):
-                if over is not None:  # first: that may end all that expire as soon as another one of the role
+                nonce, expires = secrets.token_urlsafe(12), self._ended[role].expiry()  # which may refuse
+                if over is not None:
                     self.sign_out(over)
-                nonce, expires = secrets.token_urlsafe(12), self._ended[role].expiry()
+                    expires = self._ended[role].expiry()  # where the list is full, it is later than what that has ended
                 text = f'{role}.{expires}.{nonce}'
                 self._failures.pop(address, None)
                 return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'

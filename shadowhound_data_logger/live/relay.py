@@ -38,7 +38,7 @@ AGAIN_S: Final = 0.7
 REFUSED_S: Final = 30.0
 """The same where the robot did not let us in, unless we have another token: each wrong one counts against this address there."""
 LOOK_S: Final = 1.0
-"""How often it is looked meanwhile which token we have."""
+"""How often the file of the token is read meanwhile."""
 TRY_S: Final = 1.0, 1.0, 1.0, 4.0
 """How long one attempt after the other to connect gets: a packet that is lost at its begin is sent again later and later."""
 PINGS: Final = 12
@@ -60,7 +60,7 @@ _BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk}
 
 
 class _NotLetIn(ValueError):
-    """The robot is well, and does not want us."""
+    """The robot answers, and refuses us."""
 
 
 class Relay:
@@ -155,7 +155,7 @@ class Relay:
                         await asyncio.wait([teller], timeout=0.1)
                     if not teller.cancelled():
                         teller.exception()  # the connection has ended, whatever it says of that
-        if self._wanted() is not None:
+        if self._wanted() is not None and not connection.is_left:
             raise ConnectionError('it has ended the connection')
 
     async def _tell(self, connection: _Connection) -> None:
@@ -164,6 +164,7 @@ class Relay:
         while True:
             wanted = self._wanted()
             if wanted is None:
+                connection.is_left = True
                 await connection.ws.close()
                 return
             if (topics := sorted(wanted)) != told:
@@ -180,6 +181,8 @@ class _Connection:
 
     def __init__(self, ws: Any, came: Callable[[LiveItem], None]) -> None:
         self.ws, self._came = ws, came
+        self.is_left = False
+        """Whether we end it, since nobody watches."""
         self._parts: dict[int, bytearray] = {}
         self._received = self._told = 0
         self._telling: asyncio.Task[None] | None = None

@@ -121,9 +121,10 @@ class RtspServer:
     def _fail(self, topics: Iterable[str], why: str) -> None:
         """The encoder of these: players that come are sent JPEG for a while, so that none is refused again and again."""
         now_s = time.monotonic()
-        for topic in sorted(topics):
-            if self._h264_from_s.get(topic, 0.0) > now_s:
-                continue
+        new = [topic for topic in sorted(topics) if self._h264_from_s.get(topic, 0.0) <= now_s]
+        if not new:
+            return
+        for topic in new:
             log.warning('%s is not encoded as H.264 over RTSP: %s%s; for %.0f s players that come are sent JPEG',
                         topic, why[:300], of_size(self._sizes.get(topic)), H264_AGAIN_S)  # fmt: skip
             self._h264_from_s[topic] = now_s + H264_AGAIN_S

@@ -57,7 +57,7 @@ class Cameras:
         self._sources: dict[str, Any] = {}
         self._caps: dict[str, tuple[Any, ...]] = {}
         self._fed: dict[str, int] = {}
-        """By topic of which nothing came yet that could be described to a player: frames that were encoded."""
+        """By topic of which nothing came yet that could be described to a player: how many frames the encoder was given."""
         self._h264: dict[str, Any] | None = given['h264']
         self._factories: dict[str, Any] = {}
         self._players: dict[Any, str] = {}
@@ -96,7 +96,7 @@ class Cameras:
         size: Any = head.get('size')
         with self._lock:
             source, scaled = self._sources.get(topic, (None, None))
-            if source is None:
+            if source is None or (scaled is not None and size is None):  # the latter was sent to a player who has left
                 return
             if self._caps.get(topic) != (width, height, size):
                 self._caps[topic] = width, height, size

@@ -81,6 +81,7 @@ LEDGER_EVERY: Final = 2
 """The ledger is read with each second status."""
 ASK_AGAIN_S: Final = 5.0
 """How often it is asked whether those who watch still may."""
+FOXGLOVE_BUFFER: Final = 32 << 10
 _MIN_RTT: Final = struct.Struct('=148xI')
 """tcp_info.tcpi_min_rtt of linux/tcp.h, in microseconds."""
 LEASE_EVERY_S: Final = 2.0
@@ -170,10 +171,12 @@ class _Connected:
         """Write all that may be sent now, at once: each write costs as much as a frame does.
 
         ``ws.send_bytes`` would write each frame by itself, and a large one in two parts. It would also wait for a full buffer;
-        here the window of the viewer limits what is in it.
+        here the window of the viewer limits what is in it, and where he acknowledges what he has not read, what is in it already.
         """
         self.flushing = None
         if self.transport is None or self.transport.is_closing() or self.ws.closed:
+            return
+        if self.transport.get_write_buffer_size() > 2 * self.viewer.window:
             return
         parts: list[bytes] = []
         while (frame := self.viewer.next_frame()) is not None:
@@ -476,13 +479,14 @@ class LiveServer:
                 self._video.tick()
                 for one in self._viewers:
                     one.viewer.has_video = self._video.has(one)
+            for one in self._viewers:
+                one.viewer.round_s = _round_s(one.transport)
             if self._viewers and not self._settings.is_of_store:
                 try:
                     await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)
                 except Exception:  # the one supervised catch-all: the page shows the age of what it has
                     log.exception('the figures cannot be read')
                 for one in self._viewers:
-                    one.viewer.round_s = _round_s(one.transport)
                     one.viewer.choose_sizes()
                     self._suggest_video(one, began_s)
                 self._rewatch()
@@ -822,6 +826,7 @@ class LiveServer:
         try:
             await ws.prepare(request)
             _quicken(request)
+            _buffer_little(request)
             self._rewatch()
             await self._loop.run_in_executor(self._pool, _describe_all, frozenset(self._graph.values()))
             one.client.publish(self._graph)
@@ -962,7 +967,8 @@ def _json(content: Mapping[str, Any]) -> web.Response:
 async def _refuse_foxglove(request: web.Request, answer: web.Response, problem: str, code: WSCloseCode) -> web.StreamResponse:
     """In their protocol where it is spoken: a browser does not tell its page with which answer a WebSocket was refused."""
     ws = web.WebSocketResponse(protocols=PROTOCOLS, max_msg_size=MOST_MESSAGE, compress=False, timeout=2.0)
-    if not ws.can_prepare(request):
+    offered = {name.strip() for name in request.headers.get('Sec-WebSocket-Protocol', '').split(',')}
+    if not offered.intersection(PROTOCOLS) or not ws.can_prepare(request):
         return answer
     with suppress(ConnectionError):
         await ws.prepare(request)
@@ -1010,7 +1016,7 @@ def _round_s(transport: asyncio.BaseTransport | None) -> float:
     """The least time that a packet and its answer took lately, as the kernel of Linux says; 0 where it is unknown."""
     connection = transport.get_extra_info('socket') if transport is not None else None
     if connection is not None:
-        with suppress(OSError, struct.error):
+        with suppress(OSError, struct.error, AttributeError):
             told = int(_MIN_RTT.unpack_from(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256))[0])
             return 0.0 if told == 0xFFFF_FFFF else told / 1e6
     return 0.0
@@ -1031,6 +1037,14 @@ def _quicken(request: web.Request) -> None:
         if connection.family == socket.AF_INET6:
             connection.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, AF41)
         connection.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, AF41)  # of a socket of IPv6 too, which may speak IPv4
+
+
+def _buffer_little(request: web.Request) -> None:
+    """For who acknowledges nothing: all that is on its way to him waits in this buffer of the system as well."""
+    connection = request.transport.get_extra_info('socket') if request.transport is not None else None
+    if connection is not None:
+        with suppress(OSError):
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, FOXGLOVE_BUFFER)
 
 
 async def _examine(spool: Path, robot: str) -> dict[str, Any]:

@@ -44,8 +44,8 @@ UP: Final = 1.6
 """By how much the link must be better than a larger size needs, before it is sent."""
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
-MOST_RATE: Final = 5e6
-"""Bytes a second that may be on their way: twice what a robot has to show."""
+MOST_RATE: Final = 3e6
+"""Bytes a second that may be on their way: more than a robot has to show. A link that becomes narrow has these before it."""
 MOST_ROUND_S: Final = 0.3
 
 BESIDE_VIDEO: Final = 0.15
@@ -114,8 +114,9 @@ class Viewer:
     @property
     def window(self) -> int:
         """Bytes that may be under way: what fills the link, and a little that waits on it."""
-        queue = min(max(self.rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
-        return int(queue + min(self.rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
+        rate = self.rate * (BESIDE_VIDEO if self.has_video else 1.0)
+        queue = min(max(rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
+        return int(queue + min(rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
 
     def next_frame(self) -> bytes | None:
         """What is sent now; None while nothing waits or may be sent."""

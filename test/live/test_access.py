@@ -713,7 +713,7 @@ def test_a_viewer_who_signs_out_again_and_again_ends_no_operator_s_sign_in(
         assert each.who(operator[1]) == operator[0]
 
 
-def test_a_viewer_who_signs_in_again_and_again_over_himself_ends_nobody_else(
+def test_a_viewer_who_signs_in_again_and_again_over_himself_ends_no_operators_sign_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of his own sign-ins the last one is left, also when all came within a second."""

@@ -11,10 +11,12 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from hashlib import new
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from live.test_webrtc import CAMERA, LEVELS, Robot, robot, until
 from PIL import Image
 
 from shadowhound_data_logger.live import gstreamer as module
-from shadowhound_data_logger.live import h264, rtsp
+from shadowhound_data_logger.live import h264, rtsp, rtsp_process
 from shadowhound_data_logger.live.access import make_tokens, rtsp_password
 from shadowhound_data_logger.live.gstreamer import PYTHON
 from shadowhound_data_logger.live.h264 import SOFTWARE
@@ -456,3 +458,14 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             await until(has_left, 'nothing is read, and nobody plays')
 
     asyncio.run(run())
+
+
+def test_a_frame_for_a_player_who_has_left_is_passed_over() -> None:
+    """It was sent to one who got JPEG; who plays now gets H.264, which is encoded in a size that such a frame does not say."""
+    cameras = object.__new__(rtsp_process.Cameras)
+    source = Mock()
+    vars(cameras).update(_lock=threading.Lock(), _sources={CAMERA: (source, Mock())}, _caps={}, _fed={}, _gst=Mock())
+    cameras.push({'topic': CAMERA, 'width': 64, 'height': 48}, b'jpeg')
+    source.emit.assert_not_called()
+    cameras.push({'topic': CAMERA, 'width': 64, 'height': 48, 'size': (64, 48)}, b'jpeg')
+    source.emit.assert_called_once()

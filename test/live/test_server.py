@@ -11,11 +11,12 @@ from typing import Any
 import aiohttp
 import pytest
 from e2e.live_frames import Frames
-from live.test_access import serving
+from live.test_access import UPGRADE, serving
 from spool.making import FakeClock
 from spool.test_status import written
 
 from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live.access import COOKIE
 from shadowhound_data_logger.live.figures import SpoolFigures
 from shadowhound_data_logger.live.kinds import FULL, HALF, LiveItem
 from shadowhound_data_logger.live.server import NARROW_S, LiveServer, LiveSettings
@@ -193,3 +194,61 @@ def test_a_task_that_fails_is_told_of_at_once(
             assert 'it cannot be asked' in caplog.text
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize('is_of_store', [False, True])
+def test_the_round_trip_to_each_viewer_is_known(is_of_store: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To this machine it is short; it is asked for again, for that of the first packets may have been a long one."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch, is_of_store=is_of_store) as page:
+            cookie = f'{COOKIE}={page.cookies["viewer"]}'
+            async with (
+                aiohttp.ClientSession(headers={'Origin': page.origin, 'Cookie': cookie}) as session,
+                session.ws_connect(f'{page.origin}/ws'),
+            ):
+                while not page.server._viewers:
+                    await asyncio.sleep(0.01)
+                (one,) = page.server._viewers
+                while not one.viewer.round_s:
+                    await asyncio.sleep(0.01)
+                assert one.viewer.round_s < 0.05
+                one.viewer.round_s = 7.0
+                while one.viewer.round_s == 7.0:
+                    await asyncio.sleep(0.01)
+                assert 0 < one.viewer.round_s < 0.05
+
+    asyncio.run(asyncio.wait_for(run(), 30.0))
+
+
+def test_who_acknowledges_what_he_does_not_read_gets_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waits for him in this process is bounded."""
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            reader, writer = await asyncio.open_connection('127.0.0.1', page.server.port, limit=1024)
+            given = {
+                'Host': f'127.0.0.1:{page.server.port}',
+                'Origin': page.origin,
+                'Cookie': f'{COOKIE}={page.cookies["viewer"]}',
+            }
+            lines = [f'{name}: {value}' for name, value in {**given, **UPGRADE}.items()]
+            writer.write('\r\n'.join(['GET /ws HTTP/1.1', *lines, '', '']).encode())
+            assert b'101' in await reader.readline()
+            while not page.server._viewers or next(iter(page.server._viewers)).transport is None:
+                await asyncio.sleep(0.01)
+            (one,) = page.server._viewers
+            writer.transport.pause_reading()  # type: ignore[attr-defined]
+            one.viewer.watch(['/camera'])
+            most = 0
+            for _ in range(300):
+                one.tell(LiveItem('/camera', 'camera', FULL, {'at': 1.0}, bytes(60_000)))
+                await asyncio.sleep(0)
+                one.viewer.acknowledge(one.viewer._sent & 0xFFFF_FFFF)
+                one.flush()
+                assert one.transport is not None
+                most = max(most, one.transport.get_write_buffer_size())
+            assert 100_000 < most < 500_000
+            writer.close()
+
+    asyncio.run(asyncio.wait_for(run(), 30.0))

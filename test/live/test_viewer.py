@@ -9,6 +9,10 @@ from e2e.live_frames import Frames
 
 from shadowhound_data_logger.live.kinds import FULL, SMALLEST, LiveItem
 from shadowhound_data_logger.live.viewer import (
+    BESIDE_VIDEO,
+    CHUNK_S,
+    FIRST_RATE,
+    LEAST_CHUNK,
     LEAST_QUEUE,
     MOST_CHUNK,
     MOST_QUEUE,
@@ -16,6 +20,7 @@ from shadowhound_data_logger.live.viewer import (
     MOST_ROUND_S,
     MOST_ROWS_WAITING,
     SMALL_FRAME,
+    SMALL_ROOM,
     SMALLER,
     Viewer,
 )
@@ -250,6 +255,52 @@ def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate
     late = sorted(link.late_s)
     assert 0.5 * rate < viewer.rate < 1.5 * rate
     assert late[int(len(late) * 0.95)] < round_s / 2 + (LEAST_QUEUE + 2 * 4_096) / rate + 0.08
+
+
+def test_beside_video_large_items_get_a_part_of_the_link(now: list[float]) -> None:
+    """Of the link as it was before: what goes beside video tells nothing of it. Rows wait for no more than that part of a way."""
+    viewer = Viewer(lambda: now[0])
+    viewer.round_s = 0.1
+    link = Link(viewer, now, 2e6, 0.1)
+    link.run(5.0)
+    before = viewer.window
+    viewer.has_video, rate = True, viewer.rate
+    link.rate = 125_000.0  # video has the rest
+    link.run(2.0)
+    link.carried = 0
+    link.late_s.clear()
+    link.run(10.0)
+    assert viewer.rate == rate
+    assert viewer.window < before / 3
+    assert link.carried < 10 * rate * BESIDE_VIDEO * 1.3
+    viewer.has_video = False
+    link.rate = 2e6
+    link.carried = 0
+    link.run(10.0)
+    assert link.carried > 10 * rate * BESIDE_VIDEO * 2
+
+
+@pytest.mark.parametrize(('rate', 'chunk'), [(5e6, MOST_CHUNK), (60_000.0, LEAST_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
+def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser, rate: float, chunk: int) -> None:
+    """What comes after it waits 13 ms, where the link is not slower than is worth while."""
+    browser.viewer.rate = rate
+    browser.viewer.offer(frame(1))
+    sent = browser.viewer.next_frame()
+    assert sent is not None
+    assert len(sent) == chunk + 4
+
+
+def test_small_items_go_while_a_window_is_full(browser: Browser) -> None:
+    """They do not wait until a large one is acknowledged; for who acknowledges nothing, that ends."""
+    browser.viewer.offer(frame(1, 400_000))
+    browser.read()
+    before = browser.received
+    browser.viewer.offer(row(1))
+    assert [item['topic'] for item in browser.read()] == ['/imu']
+    for number in range(1000):
+        browser.viewer.offer(row(number))
+        browser.read()
+    assert browser.received - before <= SMALL_ROOM + SMALL_FRAME
 
 
 def test_a_way_is_not_believed_to_hold_what_none_holds(now: list[float]) -> None:
