@@ -59,7 +59,7 @@ BEFORE_S, AFTER_S = 3.0, 0.3
 ROUNDS: Final = 3
 WIDE: Final = 'rclone copy, 16 transfers'
 EQUAL: Final = 0.85
-"""With as many transfers both wait for the server, and take the same CPU: one round is 0.87 to 1.09 of the other."""
+"""With as many transfers each shares two cores with the server, and CPU decides: one round was 0.87 to 1.09 of the other."""
 OBJECT_BYTES: Final = 50_000
 PREFIX: Final = 'thor/camera/20261121/'
 PUTS: Final = 16

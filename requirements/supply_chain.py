@@ -20,6 +20,7 @@ import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from xml.etree import ElementTree
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 LOCKS: Final = ('robot', 'runtime')
@@ -49,12 +50,21 @@ def sbom(folder: Path) -> int:
         command = [str(TOOLS / 'bin' / 'cyclonedx-py'), 'requirements', str(ROOT / 'requirements' / f'{lock}.txt'),
                    '--output-reproducible', '--output-format', 'JSON', '--output-file', str(target)]  # fmt: skip
         subprocess.run(command, check=True)
-        print(target)
-    target = folder / 'vendored.cdx.json'
+        write(target, json.loads(target.read_text(encoding='utf-8')))
     content = {'bomFormat': 'CycloneDX', 'specVersion': '1.6', 'version': 1, 'components': list(vendored())}
+    write(folder / 'vendored.cdx.json', content)
+    return 0
+
+
+def write(target: Path, content: dict[str, Any]) -> None:
+    """Write a bill of materials, which says of what it is one: this package, as package.xml has it."""
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own
+    name, version = manifest.findtext('name'), manifest.findtext('version')
+    license_ = [{'license': {'id': each.text}} for each in manifest.findall('license')]
+    subject = {'type': 'application', 'bom-ref': f'{name}@{version}', 'name': name, 'version': version, 'licenses': license_}
+    content['metadata'] = {**content.get('metadata', {}), 'component': subject}
     target.write_text(json.dumps(content, indent=2) + '\n', encoding='utf-8')
     print(target)
-    return 0
 
 
 def vendored() -> Iterator[dict[str, Any]]:

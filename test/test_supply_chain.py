@@ -30,6 +30,18 @@ def test_all_that_is_bundled_has_a_version_a_licence_and_a_hash(supply_chain: An
         assert [(one['alg'], len(one['content'])) for one in each['hashes']] == [('SHA-512', 128)]
 
 
+def test_a_bill_says_of_what_it_is_one(supply_chain: Any, tmp_path: Path) -> None:
+    """Of this package and its version, beside what its tool says of itself."""
+    target = tmp_path / 'a.cdx.json'
+    supply_chain.write(target, {'bomFormat': 'CycloneDX', 'metadata': {'tools': {'components': []}}, 'components': []})
+    told = json.loads(target.read_text())['metadata']
+    version = re.search(r'<version>(.+)</version>', (ROOT / 'package.xml').read_text())
+    assert version is not None
+    assert (told['component']['name'], told['component']['version']) == ('shadowhound_data_logger', version[1])
+    assert told['component']['licenses'] == [{'license': {'id': 'Apache-2.0'}}]
+    assert 'tools' in told
+
+
 def test_a_machine_without_the_database_skips_the_audit(
     supply_chain: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
