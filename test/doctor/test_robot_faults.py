@@ -23,6 +23,7 @@ from shadowhound_data_logger.doctor import disk, environment
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
+from shadowhound_data_logger.doctor.run import fix
 from shadowhound_data_logger.model import State
 
 SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'
@@ -173,6 +174,15 @@ def unfinished_port(scene: Scene) -> None:
     os.utime(port, (0, 0))
 
 
+def left_segment(scene: Scene) -> None:
+    """With its lock, which nobody holds."""
+    segment = scene.root / 'dev/shm/fastrtps_0123456789abcdef'
+    segment.write_bytes(bytes(2_000_000))
+    lock = segment.with_name(f'{segment.name}_el')
+    lock.touch()
+    os.utime(lock, (0, 0))
+
+
 def patched(target: str, value: object) -> Inject:
     """Something of the doctor's own modules is another for the time of the test."""
 
@@ -247,6 +257,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                           ('start the driver again', 'export FASTDDS_DEFAULT')),
     'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',
                                                         'sockets.driver', ('export FASTRTPS_DEFAULT',)),
+    'shared memory that a killed process has left': (left_segment, 'sockets', 'sockets.orphans', ('--fix', 'when it starts')),
     'a port that a killed process has left': (unfinished_port, 'sockets', 'sockets.ports', ('--fix', 'goes on')),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
     'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
@@ -277,6 +288,15 @@ def test_a_fault_is_found_and_named(robot: Scene, inject: Inject, asked: str, na
     if name == 'tower.listen':
         found = found[:1]  # both addresses are of one port here
     expect(found, name, *words)
+
+
+def test_shared_memory_of_killed_processes_is_freed(robot: Scene) -> None:
+    """By ``--fix``, which says how much."""
+    left_segment(robot)
+    done = [what for _, what in fix(robot.findings('sockets'), robot.context())]
+    assert done == [f'freed 2 MB in {robot.root / "dev/shm"}']
+    assert list((robot.root / 'dev/shm').glob('fastrtps_0*')) == []
+    assert robot.findings('sockets') == []
 
 
 def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> None:
