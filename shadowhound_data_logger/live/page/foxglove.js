@@ -10,6 +10,6 @@ export function Foxglove() {
     setTold(answer?.ok ? `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}${content.path}` : content?.error ?? 'no answer');
   };
   return html`<details onToggle=${ask}><summary>Open in Foxglove or Lichtblick</summary>
-    <p class="note">Open a connection of the kind “Foxglove WebSocket” to this address. Whoever has it may watch from this computer's address until it ends: in 12 hours, or when you sign out or in again here.</p>
+    <p class="note">Open a connection of the kind “Foxglove WebSocket” to this address. Whoever has it may watch from this computer's address until it ends: with your sign-in, in 12 hours at most, or when you sign in again here.</p>
     <p class="note"><code data-foxglove>${told}</code></p></details>`;
 }
