@@ -16,9 +16,9 @@ from typing import Final
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
 LEAST_QUEUE, MOST_QUEUE = 12 << 10, 64 << 10
-"""Bytes that may wait on the link, besides those that are on their way."""
+"""Bytes that may be queued on the link, besides those in flight."""
 QUEUE_S: Final = 0.04
-"""They last so long, within these bounds."""
+"""What is queued lasts so long, within these bounds."""
 LEAST_CHUNK, MOST_CHUNK = 4 << 10, 16 << 10
 """Bytes of a frame with a part of a large item: on a slow link small items wait for a smaller one."""
 CHUNK_S: Final = QUEUE_S / 3
@@ -45,7 +45,7 @@ UP: Final = 1.6
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
 MOST_RATE: Final = 3e6
-"""Bytes a second that may be on their way: more than a robot has to show. A link that becomes narrow has these before it."""
+"""Bytes a second with which the round trip is filled: more than a robot shows. A link that becomes narrow delivers these first."""
 MOST_ROUND_S: Final = 0.3
 
 BESIDE_VIDEO: Final = 0.15
@@ -76,7 +76,7 @@ class Viewer:
         self.has_video = False
         """Whether it gets its camera as video beside this: then bulk items are paced, and do not measure the link."""
         self.round_s = 0.0
-        """How long the way there and back takes when nothing waits on it; 0 where nobody knows."""
+        """The round trip while nothing is queued; 0 where it is unknown."""
         self._now = now
         self._rows: dict[str, deque[LiveItem]] = {}
         self._slots: dict[str, LiveItem] = {}
@@ -113,7 +113,7 @@ class Viewer:
 
     @property
     def window(self) -> int:
-        """Bytes that may be under way: what fills the link, and a little that waits on it."""
+        """Bytes that may be sent and not acknowledged: what fills the round trip, and a short queue."""
         rate = self.rate * (BESIDE_VIDEO if self.has_video else 1.0)
         queue = min(max(rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
         return int(queue + min(rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
@@ -136,7 +136,7 @@ class Viewer:
             while self._measured and self._measured[0][0] <= received:
                 _, begin, before, since_s = self._measured.popleft()
                 # The link carries at least what was acknowledged in that time, and at least what was sent in that time less the
-                # way there and back: the latter is more where it had been idle. The mean is of times, not of rates: one item that
+                # round trip: the latter is more where it had been idle. The mean is of times, not of rates: one item that
                 # a buffer took at once says little about the link.
                 took_s = max(self._now() - since_s, 1e-4)
                 pace = min(took_s / (received - before), max(took_s - self.round_s, 1e-4) / (received - begin))

@@ -44,6 +44,20 @@ async def tower(folder: Path, url: str, token: Path | None) -> AsyncIterator[Liv
         await server.close()
 
 
+@asynccontextmanager
+async def answering(*routes: web.RouteDef) -> AsyncIterator[str]:
+    """Something at the robot's address that answers these alone; yields the address."""
+    app = web.Application()
+    app.add_routes(routes)
+    runner = web.AppRunner(app)
+    await runner.setup()
+    await web.TCPSite(runner, '127.0.0.1', 0).start()
+    try:
+        yield f'http://127.0.0.1:{runner.addresses[0][1]}'
+    finally:
+        await runner.cleanup()
+
+
 class Browser:
     """A viewer that puts items together, and the newest of each topic."""
 
@@ -218,21 +232,13 @@ def test_a_robot_that_ends_each_connection_is_asked_again_after_a_pause(tmp_path
         return ws
 
     async def run() -> None:
-        app = web.Application()
-        app.add_routes([web.get('/ws', end)])
-        runner = web.AppRunner(app)
-        await runner.setup()
-        await web.TCPSite(runner, '127.0.0.1', 0).start()
-        try:
-            async with tower(tmp_path, f'http://127.0.0.1:{runner.addresses[0][1]}', None) as page:
-                browser = Browser()
-                task = asyncio.create_task(browser.run(page))
-                await until(lambda: len(asked) > 20 or 'ended the connection' in str(browser.newest.get('topics')))
-                assert asked == ['/ws']
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-        finally:
-            await runner.cleanup()
+        async with answering(web.get('/ws', end)) as address, tower(tmp_path, address, None) as page:
+            browser = Browser()
+            task = asyncio.create_task(browser.run(page))
+            await until(lambda: len(asked) > 20 or 'ended the connection' in str(browser.newest.get('topics')))
+            assert asked == ['/ws']
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     asyncio.run(run())
 
@@ -253,28 +259,22 @@ def test_who_comes_while_the_relay_leaves_is_shown_the_robot_at_once() -> None:
         return ws
 
     async def run() -> None:
-        app = web.Application()
-        app.add_routes([web.get('/ws', watch)])
-        runner = web.AppRunner(app)
-        await runner.setup()
-        await web.TCPSite(runner, '127.0.0.1', 0).start()
-        wanted: list[list[str] | None] = [[]]
-        address = f'http://127.0.0.1:{runner.addresses[0][1]}'
-        one = relay.Relay(address, None, lambda: wanted[0], lambda item: told.append((item.head or {}).get('problem')))
-        one.open()
-        try:
-            await until(lambda: came)
-            await asyncio.sleep(0)
-            wanted[0] = None
-            one.wake()
-            await asyncio.sleep(0.05)
-            wanted[0] = []
-            one.wake()
-            await until(lambda: len(came) > 1)
-            assert [problem for problem in told if problem] == []
-        finally:
-            await one.close()
-            await runner.cleanup()
+        async with answering(web.get('/ws', watch)) as address:
+            wanted: list[list[str] | None] = [[]]
+            one = relay.Relay(address, None, lambda: wanted[0], lambda item: told.append((item.head or {}).get('problem')))
+            one.open()
+            try:
+                await until(lambda: came)
+                await asyncio.sleep(0)
+                wanted[0] = None
+                one.wake()
+                await asyncio.sleep(0.05)
+                wanted[0] = []
+                one.wake()
+                await until(lambda: len(came) > 1)
+                assert [problem for problem in told if problem] == []
+            finally:
+                await one.close()
 
     asyncio.run(run())
 
@@ -320,24 +320,16 @@ def test_a_robot_that_says_nonsense_is_said_to_be_unreadable(
         return ws
 
     async def run() -> None:
-        app = web.Application()
-        app.add_routes([web.get('/ws', nonsense)])
-        runner = web.AppRunner(app)
-        await runner.setup()
-        await web.TCPSite(runner, '127.0.0.1', 0).start()
-        try:
-            async with tower(tmp_path, f'http://127.0.0.1:{runner.addresses[0][1]}', None) as page:
-                browser = Browser()
-                task = asyncio.create_task(browser.run(page))
+        async with answering(web.get('/ws', nonsense)) as address, tower(tmp_path, address, None) as page:
+            browser = Browser()
+            task = asyncio.create_task(browser.run(page))
 
-                def says_why() -> bool:
-                    problem = browser.newest.get('topics', ({'problem': ''},))[0]['problem']
-                    return 'cannot be read' in problem and 'Timeout' not in problem
+            def says_why() -> bool:
+                problem = browser.newest.get('topics', ({'problem': ''},))[0]['problem']
+                return 'cannot be read' in problem and 'Timeout' not in problem
 
-                await until(says_why)
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-        finally:
-            await runner.cleanup()
+            await until(says_why)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     asyncio.run(run())
