@@ -45,7 +45,7 @@ UP: Final = 1.6
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
 MOST_RATE: Final = 3e6
-"""Bytes a second with which the round trip is filled: more than a robot shows. A link that becomes narrow delivers these first."""
+"""Bytes a second with which a round trip is filled: more than a robot shows. A link that becomes narrow delivers these first."""
 MOST_ROUND_S: Final = 0.3
 
 BESIDE_VIDEO: Final = 0.15
