@@ -12,10 +12,11 @@ import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+import orjson
 import simplejpeg
 
 from shadowhound_data_logger.encode.image import JPEG_MAGIC
@@ -64,8 +65,6 @@ _LENGTH: Final = struct.Struct('<I')
 _FLOAT32: Final = 7
 """sensor_msgs/msg/PointField.FLOAT32."""
 
-_json = json.JSONEncoder(separators=(',', ':')).encode
-
 
 @dataclass(frozen=True)
 class LiveItem:
@@ -77,12 +76,22 @@ class LiveItem:
     head: Mapping[str, Any] | None = None
     body: bytes = b''
 
-    @cached_property
+    @property
     def packed(self) -> bytes:
         """A uint32 with the length of the head, the head as JSON, spaces up to a multiple of 8 bytes, the body."""
-        head = _json({'topic': self.topic, 'kind': self.kind, **(self.head or {})}).encode()
-        head += b' ' * (-(4 + len(head)) % 8)
-        return len(head).to_bytes(4, 'little') + head + self.body
+        packed: bytes | None = self.__dict__.get('_packed')  # ``cached_property`` takes a lock before Python 3.12
+        if packed is None:
+            head = _json({'topic': self.topic, 'kind': self.kind, **(self.head or {})})
+            head += b' ' * (-(4 + len(head)) % 8)
+            packed = self.__dict__['_packed'] = len(head).to_bytes(4, 'little') + head + self.body
+        return packed
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    try:
+        return orjson.dumps(value)
+    except TypeError:  # half a surrogate in a name, or an integer of more than 64 bits
+        return json.dumps(value, separators=(',', ':')).encode()
 
 
 class Kind(NamedTuple):

@@ -15,11 +15,11 @@ from typing import Final
 
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
-LEAST_QUEUE, MOST_QUEUE = 12 << 10, 64 << 10
+LEAST_QUEUE, MOST_QUEUE = 12 << 10, 160 << 10
 """Bytes that may be queued on the link, besides those in flight."""
 QUEUE_S: Final = 0.04
 """What is queued lasts so long, within these bounds."""
-LEAST_CHUNK, MOST_CHUNK = 4 << 10, 16 << 10
+LEAST_CHUNK, MOST_CHUNK = 4 << 10, 64 << 10
 """Bytes of a frame with a part of a large item: on a slow link small items wait for a smaller one."""
 CHUNK_S: Final = QUEUE_S / 3
 SMALL_FRAME: Final = 4 << 10

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,19 @@ from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.live.kinds import FULL, HALF, KINDS, MOST_NAME, MOST_NAMES, SIZES, SMALLEST, clouds, frames, series
+from shadowhound_data_logger.live.kinds import (
+    FULL,
+    HALF,
+    KINDS,
+    MOST_NAME,
+    MOST_NAMES,
+    SIZES,
+    SMALLEST,
+    LiveItem,
+    clouds,
+    frames,
+    series,
+)
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 STORE = get_typestore(Stores.LATEST)
@@ -253,3 +266,17 @@ def odometry(frame_id: str, value: float) -> bytes:
 def joints(names: list[str], position: Any, velocity: Any = ()) -> bytes:
     return cdr(new(JOINTS, header=header(), name=names, position=np.array(position, 'f8'), velocity=np.zeros(len(velocity)),
                    effort=np.zeros(0)), JOINTS)  # fmt: skip
+
+
+def test_a_head_is_json_whatever_is_in_it() -> None:
+    """Half a surrogate, of a name that somebody relays, and an integer that no other reader takes are written all the same."""
+    packed = LiveItem('/a', 'topics', head={'problem': 'ö', 'rate': float('nan')}).packed
+    assert opened(packed) == {'topic': '/a', 'kind': 'topics', 'problem': 'ö', 'rate': None}
+    head = {'problem': 'a \ud800', 'number': 10**30}
+    assert opened(LiveItem('/a', 'topics', head=head).packed) == {'topic': '/a', 'kind': 'topics', **head}
+
+
+def opened(packed: bytes) -> Any:
+    end = 4 + int.from_bytes(packed[:4], 'little')
+    assert end % 8 == 0
+    return json.loads(packed[4:end])
