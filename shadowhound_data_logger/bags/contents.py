@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
 
-from shadowhound_data_logger.bags.description import BagPart, Description
+from shadowhound_data_logger.bags.description import BagPart, Description, clock_of_slices
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
@@ -72,7 +72,9 @@ class Plain:
         return {channel.topic for place in places for channel in self._index(place).channels.values()}
 
     def clock(self) -> Mapping[str, str]:
-        return self._told.clock if self._told is not None else {}
+        if self._told is not None:
+            return self._told.clock
+        return clock_of_slices((source, self._index(place)) for place, source in enumerate(self._sources))
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.state import RECORD
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex
+from shadowhound_data_logger.mcap.index import McapIndex, last_metadata
+from shadowhound_data_logger.mcap.ranges import Ranged
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.untrusted import check_size, from_yaml
+from shadowhound_data_logger.untrusted import check_size, from_json, from_yaml
 
 MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
@@ -91,6 +94,19 @@ def of_slices(slices: Sequence[SliceInfo]) -> Description:
         messages=sum(one.messages for one in slices),
         t_start_ns=min((one.t_start_ns for one in filled), default=0), t_end_ns=max((one.t_end_ns for one in filled), default=0),
     )  # fmt: skip
+
+
+def clock_of_slices(slices: Iterable[tuple[Ranged, McapIndex]]) -> dict[str, str]:
+    """As ``Description.clock``, from what the last slice that says it says; empty where none does, or in another form."""
+    for source, index in reversed([*slices]):
+        said = last_metadata(source, index, RECORD).get('said')
+        if said is None:
+            continue
+        with suppress(ValueError, TypeError, AttributeError, LookupError):
+            clock = from_json(said.encode()).get('clock')
+            return _clock({words.CLOCK: clock['known'], words.BOOT_ID: clock['boot_id'],
+                           words.CLOCK_OFFSET_NS: str(clock['offset_ns'])}) if clock else {}  # fmt: skip
+    return {}
 
 
 def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> SliceInfo:

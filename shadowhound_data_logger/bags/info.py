@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.description import Description, of_metadata, of_slices, slice_info
+from shadowhound_data_logger.bags.description import Description, clock_of_slices, of_metadata, of_slices, slice_info
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
@@ -26,7 +26,6 @@ from shadowhound_data_logger.bags.remote import (
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8
@@ -96,15 +95,13 @@ def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[s
         if not slices:
             raise BagError(f'{name} has neither {METADATA} nor a whole MCAP slice', remedy='is it a bag, or only beginning?')
         with ThreadPoolExecutor(THREADS, 'bag-info') as pool:
-            description = of_slices(list(pool.map(_slice, slices)))
+            read = list(zip(slices, pool.map(read_index, slices), strict=True))
+        told = [slice_info(index, Path(source.name), source.size) for source, index in read]
+        description = replace(of_slices(told), clock=clock_of_slices(read))
     state = GROWING if any(each.endswith('.open') for each in where) else state_of(files, manifest, tags)
     missing = missing_of(files, manifest) if manifest else []
     return BagInfo(robot, name, state if robot or manifest else FOREIGN, description,
                    {file.name: where[file.name] for file in files.files}, manifest, missing, meter.bytes)  # fmt: skip
-
-
-def _slice(source: Ranged) -> SliceInfo:
-    return slice_info(read_index(source), Path(source.name), source.size)
 
 
 def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
