@@ -1,0 +1,61 @@
+"""What the node costs above its floor, against a program that does nothing but what cannot be left out (least_node.py).
+
+Both read the same simulated robot at the same time and put to the same S3 server. The floor is the node's middleware and its
+intake, as in ``node_cpu.py``. What the least program takes to encode, write, commit and put is the least that any node would
+take above it, with these encoders and this HTTP client.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from itertools import pairwise
+from typing import Any
+
+import _proc
+from _report import Bar, Report, main, progress, ratio
+from _world import Program, World, until
+from node_cpu import WARM_S, _floor
+
+ROUNDS = 4
+STEPS = ('encode', 'spool', 'put')
+MOST = 2.0
+
+
+def _used(world: World, node: Program, least: Program) -> dict[str, float]:
+    """Seconds of CPU until now, and objects."""
+    steps = least.ask()
+    return {'node': node.cpu_s(), 'floor': _floor(node, world), 'least': least.cpu_s(), 'objects': steps.pop('objects'),
+            'node_objects': world.ledger()['objects']['spooled'], **steps}  # fmt: skip
+
+
+def measure(options: argparse.Namespace) -> Report:
+    progress(f'the node beside the least program, {options.seconds:g} s')
+    with World(options.folder) as world:
+        sim, node = world.sim(), world.node()
+        own = world.folder / 'least'
+        own.mkdir()
+        least = world.program('least_node', 'least_node.py', str(own))
+        until(lambda: len(world.ledger()['topics']) > 1, 'the node to hear the robot', node, sim)
+        topics = least.line()['topics']
+        time.sleep(WARM_S)
+        told = [_used(world, node, least)]
+        for _ in range(ROUNDS):
+            time.sleep(options.seconds / ROUNDS)
+            told.append(_used(world, node, least))
+    rounds = [{name: after[name] - before[name] for name in after} for before, after in pairwise(told)]
+    total = sum(map(Counter, rounds), Counter[str]())
+    above = [used['node'] - used['floor'] for used in rounds]
+    steps = [sum(used[step] for step in STEPS) for used in rounds]
+    value, each = ratio(above, steps)
+    figures: dict[str, Any] = {
+        'seconds': options.seconds, 'topics': topics, 'load': _proc.load(), 'used': total,
+        'node_of_its_floor': total['node'] / total['floor'], 'least_of_that_floor': 1 + sum(steps) / total['floor'],
+    }  # fmt: skip
+    what = 'CPU of the node above its floor, against that of a program that only encodes, writes, commits and puts the same'
+    return Report((Bar(what, f'at most {MOST:g}', value, 'of it', value <= MOST, each),), figures)
+
+
+if __name__ == '__main__':
+    main(__doc__, measure, seconds=60.0)
