@@ -440,6 +440,7 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
                 return server._wanted == {}
 
             url, password = f'{server.rtsp_url}{CAMERA}', (tmp_path / 'live' / 'rtsp.password').read_text().strip()
+            await until_served(url)
             assert 'nauthorized' in await play(url, 'a wrong password', tmp_path / 'none')
             assert list((tmp_path / 'none').iterdir()) == []
             assert await is_idle()
