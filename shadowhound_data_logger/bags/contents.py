@@ -17,7 +17,7 @@ from typing import IO, Final
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
 
-from shadowhound_data_logger.bags.description import BagPart, Description, clock_of_slices
+from shadowhound_data_logger.bags.description import BagPart, Description
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
 from shadowhound_data_logger.mcap.index import McapIndex, read_index
@@ -48,12 +48,14 @@ class Plain:
 
     A slice is opened when something of it is wanted, by its summary first.
 
-    Life: New; used by one thread. ``told`` saves opening slices of which it says that they are of another time.
+    Life: New; used by one thread. ``told`` saves opening slices of which it says that they are of another time; without it
+    ``clock`` may say what it would (``Description.clock``).
     """
 
-    def __init__(self, sources: Sequence[Ranged], told: Description | None) -> None:
+    def __init__(self, sources: Sequence[Ranged], told: Description | None, clock: Mapping[str, str] | None = None) -> None:
         self._sources = sources
         self._told = told
+        self._clock = clock or {}
         self._times = _times(told, sources)
         self._index: Callable[[int], McapIndex] = cache(lambda place: read_index(sources[place]))
 
@@ -72,9 +74,7 @@ class Plain:
         return {channel.topic for place in places for channel in self._index(place).channels.values()}
 
     def clock(self) -> Mapping[str, str]:
-        if self._told is not None:
-            return self._told.clock
-        return clock_of_slices((source, self._index(place)) for place, source in enumerate(self._sources))
+        return self._clock if self._told is None else self._told.clock
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
         places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]

@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.contents import Packed, Plain, is_plain
 from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, METADATA
-from shadowhound_data_logger.bags.remote import RemoteBag, document, natural
+from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, natural
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
@@ -82,7 +82,7 @@ class CutSource(Protocol):
     def topics(self) -> set[str]: ...
 
     def clock(self) -> Mapping[str, str]:
-        """Of its description."""
+        """As ``Description.clock``."""
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
@@ -100,7 +100,8 @@ def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) ->
         if is_plain(told, [each.name for each in bag.slices]):
             sources = [StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices]
             others = _others(told, [each.name for each in bag.slices])
-            return _cut(Plain(sources, told), folder, out, choice, meter, bag.size, others)
+            plain = Plain(sources, told, clock_of(store, bag) if told is None else {})
+            return _cut(plain, folder, out, choice, meter, bag.size, others)
         fetched = fetch(store, bag, folder / SOURCE)
         meter.add(fetched.downloaded)
         return _cut(_packed(fetched.folder, told), folder, out, choice, meter, bag.size)

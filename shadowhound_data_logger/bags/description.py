@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.state import RECORD
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex, last_metadata
-from shadowhound_data_logger.mcap.ranges import Ranged
+from shadowhound_data_logger.mcap.index import McapIndex
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.untrusted import check_size, from_json, from_yaml
+from shadowhound_data_logger.untrusted import check_size, from_yaml
 
 MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
@@ -96,19 +93,6 @@ def of_slices(slices: Sequence[SliceInfo]) -> Description:
     )  # fmt: skip
 
 
-def clock_of_slices(slices: Iterable[tuple[Ranged, McapIndex]]) -> dict[str, str]:
-    """As ``Description.clock``, from what the last slice that says it says; empty where none does, or in another form."""
-    for source, index in reversed([*slices]):
-        said = last_metadata(source, index, RECORD).get('said')
-        if said is None:
-            continue
-        with suppress(ValueError, TypeError, AttributeError, LookupError):
-            clock = from_json(said.encode()).get('clock')
-            return _clock({words.CLOCK: clock['known'], words.BOOT_ID: clock['boot_id'],
-                           words.CLOCK_OFFSET_NS: str(clock['offset_ns'])}) if clock else {}  # fmt: skip
-    return {}
-
-
 def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> SliceInfo:
     """A slice as its own summary tells it."""
     counts: dict[str, int] = {channel.topic: 0 for channel in index.channels.values()}
@@ -140,12 +124,12 @@ def _described(found: Mapping[str, Any]) -> Description:
         distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
         parts=tuple(_part(path, told.get(path)) for path in paths), messages=messages,
         t_start_ns=start if messages else 0, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else 0,
-        clock=_clock(found.get('custom_data')),
+        clock=clock_said(found.get('custom_data')),
     )  # fmt: skip
 
 
-def _clock(custom: object) -> dict[str, str]:
-    """Of the custom data of a bag whose clock was not set; what is not as we write it says nothing."""
+def clock_said(custom: object) -> dict[str, str]:
+    """As ``Description.clock``, from a bag's custom data or a slice's metadata; what is not as we write it says nothing."""
     if not isinstance(custom, Mapping):
         return {}
     known, boot_id, offset_ns = (custom.get(word) for word in (words.CLOCK, words.BOOT_ID, words.CLOCK_OFFSET_NS))

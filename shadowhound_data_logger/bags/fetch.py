@@ -6,7 +6,7 @@ What is there already and right is not asked for again; a file that a kill cut o
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from typing import Final
 from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
-from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, missing_of
+from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, clock_of, missing_of
 from shadowhound_data_logger.durable_files import fingerprint, lock, replacing
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.index import read_index
@@ -93,7 +93,7 @@ def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, told: Tol
     checksums = dict(zip((file.name for file in others), _side_by_side(one, others, threads), strict=True))
     missing = tuple(missing_of(bag, manifest)) if manifest is not None else ()
     if not bag.is_archive and (missing or not bag.file(METADATA)):
-        _describe(folder, bag)
+        _describe(folder, bag, clock_of(store, bag))
     return FetchedBag(
         folder / bag.files[0].name if bag.is_archive else folder, len(bag.files), bag.size, meter.bytes,
         is_complete=manifest is not None and not missing,
@@ -147,10 +147,10 @@ def _alone(path: Path) -> Iterator[int]:
         yield os.fstat(part.fileno()).st_size
 
 
-def _describe(folder: Path, bag: RemoteBag) -> None:
+def _describe(folder: Path, bag: RemoteBag, clock: Mapping[str, str]) -> None:
     """Of a bag that is not all there, so that players open what is; the real one replaces it with the rest."""
     slices = [file for file in bag.slices if file.name.endswith('.mcap')]
     infos = [slice_info(read_index(LocalFile(folder / file.name)), folder / file.name, file.size) for file in slices]
     if infos:
         with replacing(folder / METADATA) as file:
-            file.write(metadata_yaml(infos, ros_distro=''))
+            file.write(metadata_yaml(infos, ros_distro='', custom_data=clock))

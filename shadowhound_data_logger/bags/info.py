@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.description import Description, clock_of_slices, of_metadata, of_slices, slice_info
+from shadowhound_data_logger.bags.description import Description, clock_said, of_metadata, of_slices, slice_info
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
@@ -26,6 +26,7 @@ from shadowhound_data_logger.bags.remote import (
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8
@@ -95,18 +96,21 @@ def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[s
         if not slices:
             raise BagError(f'{name} has neither {METADATA} nor a whole MCAP slice', remedy='is it a bag, or only beginning?')
         with ThreadPoolExecutor(THREADS, 'bag-info') as pool:
-            read = list(zip(slices, pool.map(read_index, slices), strict=True))
-        told = [slice_info(index, Path(source.name), source.size) for source, index in read]
-        description = replace(of_slices(told), clock=clock_of_slices(read))
+            description = replace(of_slices(list(pool.map(_slice, slices))), clock=clock_said(tags))
     state = GROWING if any(each.endswith('.open') for each in where) else state_of(files, manifest, tags)
     missing = missing_of(files, manifest) if manifest else []
     return BagInfo(robot, name, state if robot or manifest else FOREIGN, description,
                    {file.name: where[file.name] for file in files.files}, manifest, missing, meter.bytes)  # fmt: skip
 
 
+def _slice(source: Ranged) -> SliceInfo:
+    return slice_info(read_index(source), Path(source.name), source.size)
+
+
 def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
-    """What was written beside one slice: enough to tell whose it is."""
+    """What was written beside one slice: enough to tell whose it is, and by which clock its times are."""
     for file in waiting.values():
         return file.metadata or {words.BAG: bag.name}
-    held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not bag.file(MANIFEST) else None
+    is_told = bag.file(MANIFEST) and bag.file(METADATA)
+    held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not is_told else None
     return held.metadata if held else {}

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.description import clock_said
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
 from shadowhound_data_logger.errors import BagError
@@ -103,6 +104,12 @@ def read_manifest(store: ObjectStore, bag: RemoteBag) -> Manifest | None:
 def document(store: ObjectStore, file: RemoteFile) -> bytes:
     """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, StoreError."""
     return read_whole(StoredFile(store, BUCKET, file.key, file.size))
+
+
+def clock_of(store: ObjectStore, bag: RemoteBag) -> dict[str, str]:
+    """As ``Description.clock``, from the metadata of the first slice, where there is no metadata.yaml. Raises StoreError."""
+    held = store.head(BUCKET, bag.slices[0].key) if bag.slices else None
+    return clock_said(held.metadata) if held is not None else {}
 
 
 def missing_of(bag: RemoteBag, manifest: Manifest) -> list[str]:

@@ -18,7 +18,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import ChunkIndex, Footer, Metadata, Schema, Statistics
 
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.format import MAGIC, RECORD
@@ -32,8 +32,6 @@ FIRST_READ: Final = 64 << 10
 """From the end: the whole summary of most slices, so that one request does."""
 MOST_SUMMARY_BYTES: Final = 64 << 20
 """That of a hundred thousand chunks: a bag of 100 GB in one file."""
-MOST_METADATA_BYTES: Final = 4 << 20
-"""Of one record that is asked for by its place."""
 INDEX_HEAD: Final = 15
 """Bytes of a message index record before its entries: head, channel, length of the entries."""
 INDEX_ENTRY: Final = 16
@@ -71,8 +69,6 @@ class McapIndex:
     """Where the messages end."""
     is_indexed: bool
     """Whether ``chunks`` and ``counts`` tell of every message; else the file has to be read from one end to the other."""
-    metadata: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    """Name -> where the last metadata record of this name begins, and its length with its head."""
 
 
 _Record = TypeVar('_Record', covariant=True)
@@ -182,21 +178,8 @@ def read_metadata(path: Path, name: str) -> Iterator[Mapping[str, str]]:
         os.close(file)
 
 
-def last_metadata(source: Ranged, index: McapIndex, name: str) -> Mapping[str, str]:
-    """What the last metadata record of this name says; empty where none can be read. Raises as ``source`` does."""
-    start, length = index.metadata.get(name, (0, 0))
-    if not RECORD.size <= length <= MOST_METADATA_BYTES or not len(MAGIC) <= start <= index.data_end - length:
-        return {}
-    content = source.read(start, length)[RECORD.size :]
-    with suppress(*UNREADABLE):
-        found = parsed(Metadata, content)
-        said: Mapping[str, str] = found.metadata
-        return said if found.name == name else {}
-    return {}
-
-
 def _index(summary: memoryview, data_end: int, source: Ranged) -> McapIndex:
-    schemas, chunks, statistics, metadata = Schemas(), [], None, dict[str, tuple[int, int]]()
+    schemas, chunks, statistics = Schemas(), [], None
     try:
         for kind, _, content in records(summary, source.name):
             if kind in {Opcode.SCHEMA, Opcode.CHANNEL}:
@@ -205,19 +188,16 @@ def _index(summary: memoryview, data_end: int, source: Ranged) -> McapIndex:
                 chunks.append(_chunk(parsed(ChunkIndex, content), data_end))
             elif kind == Opcode.STATISTICS:
                 statistics = parsed(Statistics, content)
-            elif kind == Opcode.METADATA_INDEX:
-                found = parsed(MetadataIndex, content)
-                metadata[found.name] = found.offset, found.length
     except UNREADABLE as error:
         raise BagDamaged(f'{source.name} has a summary that cannot be read: {error}', path=source.name) from error
     chunks.sort(key=lambda chunk: chunk.start)
     if statistics is None:
-        return McapIndex(schemas.channels, tuple(chunks), {}, 0, 0, 0, data_end, is_indexed=False, metadata=metadata)
+        return McapIndex(schemas.channels, tuple(chunks), {}, 0, 0, 0, data_end, is_indexed=False)
     counts, messages = statistics.channel_message_counts, statistics.message_count
     is_known = sum(counts.values()) == messages and counts.keys() <= schemas.channels.keys()
     is_indexed = is_known and sum(sum(chunk.counts.values()) for chunk in chunks) == messages
     times = statistics.message_start_time, statistics.message_end_time
-    return McapIndex(schemas.channels, tuple(chunks), counts, messages, *times, data_end, is_indexed, metadata)
+    return McapIndex(schemas.channels, tuple(chunks), counts, messages, *times, data_end, is_indexed)
 
 
 def _chunk(found: ChunkIndex, data_end: int) -> Chunk:

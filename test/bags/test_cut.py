@@ -8,18 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bags.real_bags import IMU, NAME, STEP_NS, T0, by_rosbags, messages_of, stored, write_ours, write_rosbags
+from bags.real_bags import IMU, NAME, STEP_NS, T0, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
 from click.testing import CliRunner
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from ruamel.yaml import YAML
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
-from shadowhound_data_logger.bags.info import info_folder
-from shadowhound_data_logger.bags.manifest import ClockOf
-from shadowhound_data_logger.bags.naming import BUCKET
+from shadowhound_data_logger.bags.fetch import fetch
+from shadowhound_data_logger.bags.info import info_folder, info_of
+from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.bags.remote import find_bag
-from shadowhound_data_logger.bags.state import RECORD, BagState
 from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.mcap.messages import RecordedMessage
@@ -161,39 +160,26 @@ def test_the_clock_of_a_bag_is_that_of_its_piece(tmp_path: Path, clock: dict[str
     assert ('was not set yet' if 'clock_offset_ns' in clock else 'was never set in boot b') in said
 
 
-@pytest.mark.parametrize(('known', 'clock'), [
-    (ClockOf('set_later', 'b', 5, 3, 1760788778000000000),
-     {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '1760788778000000000'}),
-    (None, {'clock': 'unset', 'boot_id': 'b'}),
+@pytest.mark.parametrize('clock', [
+    {'clock': 'set_later', 'boot_id': 'b', 'clock_offset_ns': '1760788778000000000'}, {'clock': 'unset', 'boot_id': 'b'}, {},
 ])  # fmt: skip
-def test_slices_tell_the_clock_of_a_bag_that_is_not_whole(tmp_path: Path, known: ClockOf | None, clock: dict[str, str]) -> None:
-    """What was known last, where the one that recorded has not come to write metadata.yaml; in a folder and in a store."""
-    state = BagState.begin(tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'early', 'thor', None,
-                           clock=ClockOf('unset', 'b', 5, 3, None))  # fmt: skip
-    for number in range(3):
-        writer = SliceWriter(state.folder / f'early_{number}.mcap')
-        if number < 2:  # one that says nothing
-            writer.add_metadata(RECORD, state.record('thor', number))
-        writer.write(IMU, T0 + number, T0, number, b'data')
-        if number == 1 and known is not None:
-            state.set_name('early', known)
-            writer.add_metadata(RECORD, state.news())
-        writer.close()
-    store = DirectoryStore(tmp_path / 'store')
-    cut_remote(store, find_bag(store, 'thor', 'early'), tmp_path / 'remote', Choice())
-    cut_folder(state.folder, tmp_path / 'local', Choice())
-    for folder in (tmp_path / 'remote', tmp_path / 'local', state.folder):
-        assert info_folder(folder).description.clock == clock
-
-
-@pytest.mark.parametrize('said', ['[]', '{', '{"clock": 7}', '{"clock": {"known": "unset"}}', '[' * 100_000])
-def test_a_slice_that_says_nonsense_tells_no_clock(tmp_path: Path, said: str) -> None:
-    """Whoever wrote it."""
-    writer = SliceWriter(tmp_path / 'odd_0.mcap')
-    writer.write(IMU, T0, T0, 0, b'data')
-    writer.add_metadata(RECORD, {'said': said})
-    writer.close()
-    assert info_folder(tmp_path).description.clock == {}
+@pytest.mark.parametrize('without', ['metadata', 'm'], ids=['without metadata.yaml', 'without manifest.json as well'])
+def test_slices_in_a_store_tell_the_clock_of_a_bag_that_is_not_whole(tmp_path: Path, clock: dict[str, str], without: str) -> None:
+    """Its metadata.yaml has not come yet: to who cuts it, asks for it, or fetches it."""
+    store, folder = MemoryStore(), tmp_path / 'early'
+    write_ours(folder, slices=2, each=20)
+    for place, path in enumerate(sorted(folder.iterdir())):
+        if not path.name.startswith(without):
+            item = put_item(path, f'{prefix_of("thor", "early")}{path.name}', 'early', place)
+            store.put(replace(item, metadata={**item.metadata, **clock}))
+    bag = find_bag(store, 'thor', 'early')
+    cut_remote(store, bag, tmp_path / 'piece', Choice('0.05'))
+    fetch(store, bag, tmp_path / 'fetched')
+    for found in (
+        info_of(store, 'thor', 'early', tmp_path / 'home'),
+        *map(info_folder, (tmp_path / 'piece', tmp_path / 'fetched' / 'early')),
+    ):
+        assert found.description.clock == clock
 
 
 @pytest.mark.parametrize('custom', [
