@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import json
 import logging
 import math
 import random
@@ -22,6 +21,7 @@ from urllib.parse import urlsplit
 
 import aiohttp
 import numpy as np
+import orjson
 
 from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.live.access import TokenRefused, token_of
@@ -230,7 +230,7 @@ class _Connection:
         size = int.from_bytes(whole[:4], 'little')
         if size > MOST_HEAD:
             raise ValueError('it sends what no page does')
-        head, body = json.loads(whole[4 : 4 + size]), whole[4 + size :]
+        head, body = orjson.loads(whole[4 : 4 + size]), whole[4 + size :]  # which takes no NaN, as browsers do not
         kind = head.pop('kind')
         topic = head.pop('topic')
         if kind not in _SHOWN or not isinstance(topic, str) or (kind not in _BULK and len(whole) > MOST_SMALL):

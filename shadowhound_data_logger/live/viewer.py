@@ -114,9 +114,14 @@ class Viewer:
     @property
     def window(self) -> int:
         """Bytes that may be sent and not acknowledged: what fills the round trip, and a short queue."""
-        rate = self.rate * (BESIDE_VIDEO if self.has_video else 1.0)
+        rate = self._share
         queue = min(max(rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
         return int(queue + min(rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
+
+    @property
+    def _share(self) -> float:
+        """Bytes a second of the link that this has."""
+        return self.rate * (BESIDE_VIDEO if self.has_video else 1.0)
 
     def next_frame(self) -> bytes | None:
         """What is sent now; None while nothing waits or may be sent."""
@@ -177,9 +182,9 @@ class Viewer:
             flags = BEGIN
             if len(body) >= LEAST_MEASURED and not self.has_video:
                 self._measured.append((self._sent + len(body), self._sent, self._acked, self._now()))
-        part = lane.body[lane.at : lane.at + int(min(max(self.rate * CHUNK_S, LEAST_CHUNK), MOST_CHUNK))]
+        part = lane.body[lane.at : lane.at + int(min(max(self._share * CHUNK_S, LEAST_CHUNK), MOST_CHUNK))]
         lane.at += len(part)
-        self._bulk_s = max(self._bulk_s, self._now()) + len(part) / (self.rate * BESIDE_VIDEO) if self.has_video else 0.0
+        self._bulk_s = max(self._bulk_s, self._now()) + len(part) / self._share if self.has_video else 0.0
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)
         self._used[topic] = self._virtual + len(part) / WEIGHTS[self._kinds[topic]]
         if lane.at >= len(lane.body):

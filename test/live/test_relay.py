@@ -281,6 +281,7 @@ def test_who_comes_while_the_relay_leaves_is_shown_the_robot_at_once() -> None:
 
 WHOLE, SEVERAL = b'\x01\x03\x00\x00', b'\x00\x03\x00\x00'
 CLOUD = {'at': 1.0, 'points': 0, 'low': [0.0] * 3, 'step': [1.0] * 3, 'frame': 'odom'}
+NAN = b'{"topic":"","kind":"figures","at":1.0,"figures":{"topics":[],"rate":NaN}}'
 PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
 
 
@@ -289,7 +290,7 @@ PONG = WHOLE + LiveItem('', 'pong', head={'ping': 1.0, 'now': 1.0}).packed
     WHOLE + b'\xff' * 99, WHOLE + b'\x02\x00\x00\x00[]',
     WHOLE + LiveItem('', 'pong', head={'ping': 'x', 'now': {}}).packed, WHOLE + LiveItem('', 'topics', head={'topics': 7}).packed,
     WHOLE + LiveItem('/a', 'script', head={'at': 1}).packed, WHOLE + b'\xff\xff\xff\x7f{}',
-    WHOLE + b'\xff\xff\x00\x00' + b'[' * 0xFFFF, *(
+    WHOLE + b'\xff\xff\x00\x00' + b'[' * 0xFFFF, WHOLE + len(NAN).to_bytes(4, 'little') + NAN, *(
         WHOLE + LiveItem('', 'figures', head={'at': 1.0, 'figures': figures}).packed
         for figures in (None, 7, {}, {'topics': 7}, {'topics': [7]}, {'topics': [{'topic': {}, 'type': ''}]})
     ),

@@ -290,6 +290,15 @@ def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser,
     assert len(sent) == chunk + 4
 
 
+def test_beside_video_a_piece_of_a_large_item_is_as_long_as_its_part_of_the_link(browser: Browser) -> None:
+    """Not as the whole link: rows and video would wait for it."""
+    browser.viewer.rate, browser.viewer.has_video = 4e6, True
+    browser.viewer.offer(frame(1))
+    sent = browser.viewer.next_frame()
+    assert sent is not None
+    assert len(sent) == int(4e6 * BESIDE_VIDEO * CHUNK_S) + 4
+
+
 def test_small_items_go_while_a_window_is_full(browser: Browser) -> None:
     """They do not wait until a large one is acknowledged; for who acknowledges nothing, that ends."""
     browser.viewer.offer(frame(1, 400_000))
