@@ -1,4 +1,4 @@
-"""The least that stores what the node stores: it reads, keeps and encodes the same with the same code, and does without all else.
+"""Stores what the node stores, and no more: it reads, keeps and encodes the same with the same code, and does without all else.
 
 One thread. What one poll closes becomes files that are synced, one commit of SQLite, and a put each, one after the other; then
 the files go. No ledger, no status, no queue, no lock, nothing that is told, noticed, tried again or survived. It is what

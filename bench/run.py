@@ -41,7 +41,7 @@ class Step:
 
 STEPS: Final = (
     Step('node_cpu', ('--seconds', '30'), ('--seconds', '8')),
-    Step('node_least', ('--seconds', '60'), ('--seconds', '8')),
+    Step('node_least', ('--seconds', '60'), None),
     Step('intake', ('--seconds', '20'), ('--seconds', '5')),
     Step('take', ('--seconds', '20'), ('--seconds', '4')),
     Step('vendors', ('--seconds', '60'), ('--seconds', '10')),
