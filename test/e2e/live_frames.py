@@ -21,10 +21,10 @@ class Frames:
         self.bytes += len(frame)
         lane, flags = frame[:2]
         if lane == SMALL_LANE:
-            return [_opened(item) for item in _several(frame[4:])]
+            return [opened(item) for item in _several(frame[4:])]
         assert bool(flags & BEGIN) is (lane not in self._parts)
         self._parts[lane] = self._parts.get(lane, b'') + frame[4:]
-        return [_opened(self._parts.pop(lane))] if flags & END else []
+        return [opened(self._parts.pop(lane))] if flags & END else []
 
     def acknowledgement(self) -> bytes | None:
         """What is to be said now, if anything is."""
@@ -43,7 +43,7 @@ def _several(content: bytes) -> list[bytes]:
     return found
 
 
-def _opened(item: bytes) -> tuple[dict[str, Any], bytes]:
+def opened(item: bytes) -> tuple[dict[str, Any], bytes]:
     end = 4 + int.from_bytes(item[:4], 'little')
     assert end % 8 == 0
     return json.loads(item[4:end]), item[end:]
