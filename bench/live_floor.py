@@ -9,6 +9,7 @@ and thrown away. It says that it is ready, and runs until it is ended. ``bench/l
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 
@@ -16,16 +17,20 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from shadowhound_data_logger import heap
 from shadowhound_data_logger.live.kinds import KINDS
 from shadowhound_data_logger.live.topics import POLL_S, _Watched
+from shadowhound_data_logger.ros.shared_memory import without_our_profile
 
 DISCOVERY_S = 2.0
 
 
 def main() -> None:
     do, topics = sys.argv[1], set(sys.argv[2:])
+    heap.keep()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = Node('live_floor', start_parameter_services=False, enable_rosout=False)
+    with without_our_profile(os.environ):
+        node = Node('live_floor', start_parameter_services=False, enable_rosout=False)
     time.sleep(DISCOVERY_S)
     known = {topic: types[0] for topic, types in node.get_topic_names_and_types() if topic in topics and do != 'join'}
     watched = [_Watched(node, topic, name, KINDS[name], is_raw=False) for topic, name in known.items()]

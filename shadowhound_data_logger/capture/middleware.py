@@ -21,18 +21,15 @@ from typing import Any, Final
 from shadowhound_data_logger.capture.dds_network import LOCALHOST_ONLY, PEERS, RANGE, Network, profile, robot_network
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import MEBI, RMW_AUTO, RMW_FASTRTPS, RMW_ROBOT, CaptureSettings
+from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES, SHIPPED
 from shadowhound_data_logger.ros_arguments import ParametersUnreadable, parameter
 
 RMW: Final = 'RMW_IMPLEMENTATION'
 FAST_DDS, CYCLONE_DDS = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 SETTING: Final = 'capture.rmw'
-PROFILE_FILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-"""What names a profile for Fast DDS 2, and for Fast DDS 3; neither reads the other's."""
 TRANSPORTS: Final = 'FASTDDS_BUILTIN_TRANSPORTS'
 FROM_PROFILE: Final = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 """Has rmw_fastrtps leave to the profile how readers and writers keep memory."""
-SHIPPED: Final = 'fastdds_shm.xml'
-"""The profile for drivers, in launch_configs; ours has what is in it, and more."""
 MEASURED: Final = {(6, 2): 'Humble', (8, 4): 'Jazzy', (9, 3): 'Kilted'}
 """Versions of rmw_fastrtps_cpp through which all was heard of a robot with Cyclone DDS that its own RMW hears."""
 FAST_DDS_3: Final = (9, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 import os
 import signal
@@ -21,6 +20,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context, remove_ros_args
 
+from shadowhound_data_logger import heap
 from shadowhound_data_logger.capture.front import Front
 from shadowhound_data_logger.capture.middleware import SETTING, Middleware
 from shadowhound_data_logger.capture.parameters import Parameters
@@ -45,9 +45,6 @@ NO_FRONT = (
 )
 SPIN_S = 0.5
 """How long a signal may wait to be seen; two of them are the second that is between two statuses."""
-ARENAS, MMAP_THRESHOLD = (-8, 2), (-3, 1 << 20)
-"""Options of glibc's mallopt(3) and their values: few heaps for all threads, and large blocks go back when they are freed.
-At full rate that saves 35 of 128 MB (docs/performance.md)."""
 GIVE_BACK_S = 20.0
 """How often what a crowd of topics or an outage took is given back: half a millisecond with a heap of 100 MB."""
 SECOND_SIGNAL_S = 1.0
@@ -118,21 +115,6 @@ class StopSignals:
             os._exit(128 + number)
 
 
-def bound_heap() -> None:
-    """Keep the heap small; before the first thread is started. Other C libraries than glibc know no such options."""
-    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
-    if mallopt is not None:
-        for option in (ARENAS, MMAP_THRESHOLD):
-            mallopt(*option)
-
-
-def give_back() -> None:
-    """Return to the system what was freed in the midst of the heap, which glibc does not do by itself: some milliseconds."""
-    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None)
-    if trim is not None:
-        trim(0)
-
-
 def refuse(rest: list[str]) -> int:
     """Answer arguments that are not for ROS; the exit code."""
     if rest[0] in {'-h', '--help'}:
@@ -147,7 +129,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
 
     ``arguments`` are those of ROS, without the program's name; ``robot`` is the environment before we changed it.
     """
-    bound_heap()
+    heap.bound()
     try:
         if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
             return refuse(rest)
@@ -237,7 +219,7 @@ def log_until(stop: StopSignals, ros: Ros) -> None:
             service.alive()
             if time.monotonic() - given_back_s > GIVE_BACK_S:
                 given_back_s = time.monotonic()
-                give_back()
+                heap.give_back()
     finally:
         service.stopping()
         node.get_logger().info('closing: open batches are finished and delivered')

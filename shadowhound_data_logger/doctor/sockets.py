@@ -14,11 +14,9 @@ from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, 
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
 from shadowhound_data_logger.ros.port_guard import settle
-from shadowhound_data_logger.ros.shared_memory import orphans
+from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES, orphans
 
 NAME: Final = 'sockets'
-PROFILES: Final = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-"""Of Fast DDS 3, and of Fast DDS 2."""
 PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
 LEAST_BUFFER: Final = 1 << 20
 """Bytes with which all of 105 raw images at 15 Hz arrived; into the default of kernels, 208 KB, not one of them fits."""
@@ -155,7 +153,7 @@ def _least_buffer(text: str) -> int:
 
 def _profile(context: Context) -> Result:
     """Fast DDS of this shell."""
-    name, file = next(((name, path) for name in PROFILES if (path := context.environ.get(name))), ('', ''))
+    name, file = next(((name, path) for name in PROFILE_FILES if (path := context.environ.get(name))), ('', ''))
     remedy = f'export {_variable(context.environ)}={PROFILE_FILE}  # for the driver, and here'
     if not file:
         return warning(
@@ -231,8 +229,8 @@ def _user(driver: list[Process]) -> Iterator[Result]:
 
 def _driver_profile(context: Context, driver: list[Process]) -> Iterator[Result]:
     """The segment belongs to the publisher."""
-    without = [each for each in driver if each.environ and not any(each.environ.get(name) for name in PROFILES)]
-    if without and any(context.environ.get(name) for name in PROFILES):
+    without = [each for each in driver if each.environ and not any(each.environ.get(name) for name in PROFILE_FILES)]
+    if without and any(context.environ.get(name) for name in PROFILE_FILES):
         yield warning(
             'sockets.driver',
             f'the driver (process {without[0].pid}) was started without the shared-memory profile',
@@ -243,4 +241,4 @@ def _driver_profile(context: Context, driver: list[Process]) -> Iterator[Result]
 
 def _variable(environ: Mapping[str, str]) -> str:
     """What names the profile for the Fast DDS of this environment."""
-    return PROFILES[environ.get('ROS_DISTRO') in {'humble', 'iron', 'jazzy'}]
+    return PROFILE_FILES[environ.get('ROS_DISTRO') not in {'humble', 'iron', 'jazzy'}]

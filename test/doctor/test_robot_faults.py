@@ -17,7 +17,6 @@ import pytest
 from doctor.scene import Scene, expect
 from spool.making import make, put, settle
 
-from shadowhound_data_logger.capture.middleware import PROFILE_FILES
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.doctor import disk, environment
 from shadowhound_data_logger.doctor.checks import CHECKS
@@ -25,6 +24,7 @@ from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.doctor.run import fix
 from shadowhound_data_logger.model import State
+from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES
 
 SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'
 MEBI = 1 << 20

@@ -46,6 +46,7 @@ from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.ros.endpoints import POLL_S
+from shadowhound_data_logger.ros.port_guard import FOLDER
 from shadowhound_data_logger.spool.accounts import PAUSED, WRONG_TYPE
 from shadowhound_data_logger.spool.estimator import RESTART, SILENCE, TRANSPORT
 from shadowhound_data_logger.spool.index import MISSING
@@ -64,6 +65,7 @@ RATES = 'rate_scale:=0.2'
 SHOWN_HZ = {'/imu': 20.0, '/odom': 10.0, '/joint_states': 10.0, '/lowstate': 4.0, '/camera/compressed': 6.0}
 """What the simulator publishes at that scale, of some topics."""
 EVENTS = {'events.topics': ['/imu'], 'events.pre_s': 2.0, 'events.post_s': 0.5}
+SEGMENT_LOCK = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_[0-9a-f]{{16}})_el')
 IMU, JOINTS = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
 pytestmark = [
     pytest.mark.ros,
@@ -317,6 +319,18 @@ def test_a_hidden_tab_watches_nothing(page: Page, watching: Watching, graph: Any
     page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
     holds(page, f'shadowhound.count.imu > {before + 3}')
     until(lambda: all(map(is_read, watched)), 'what is shown is read again')
+
+
+def test_the_page_takes_no_shared_memory_for_images(watching: Watching) -> None:
+    """It publishes none; the node beside it, in the same environment, has that of our profile."""
+
+    def owned(pid: int) -> list[int]:
+        """Sizes of the segments of Fast DDS whose lock the process holds."""
+        held = (SEGMENT_LOCK.fullmatch(str(each.readlink())) for each in Path(f'/proc/{pid}/fd').iterdir())
+        return [Path(lock[1]).stat().st_size for lock in held if lock]
+
+    assert max(owned(watching.node.popen.pid)) > 32 << 20
+    assert 0 < sum(owned(watching.live.popen.pid)) < 1 << 20
 
 
 def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching) -> None:
