@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from shadowhound_data_logger import heap
 from shadowhound_data_logger.live.kinds import KINDS
 from shadowhound_data_logger.live.topics import POLL_S, _Watched
-from shadowhound_data_logger.ros.shared_memory import without_our_profile
+from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
 
 DISCOVERY_S = 2.0
 

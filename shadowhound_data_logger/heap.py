@@ -19,10 +19,10 @@ def bound() -> None:
 
 
 def keep() -> None:
-    """Blocks of up to 16 MB stay in the heap when they are freed, for the next message.
+    """Blocks of up to 16 MB come from the heap, and up to 16 MB that are free at the end of each heap stay, for the next message.
 
-    Where each cloud's blocks came from the system anew, which depended on the order in which the first ones were freed, the live
-    page took 400 to 1,900 page faults a second, and up to half a point of a core (docs/live.md).
+    Where each cloud's blocks came from the system anew, as in some starts, the live page took 260 to 1,900 page faults a second,
+    and a quarter to three quarters of a point of a core.
     """
     _set(_KEPT)
 

@@ -21,13 +21,12 @@ from typing import Any, Final
 from shadowhound_data_logger.capture.dds_network import LOCALHOST_ONLY, PEERS, RANGE, Network, profile, robot_network
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import MEBI, RMW_AUTO, RMW_FASTRTPS, RMW_ROBOT, CaptureSettings
-from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES, SHIPPED
+from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED, TRANSPORTS
 from shadowhound_data_logger.ros_arguments import ParametersUnreadable, parameter
 
 RMW: Final = 'RMW_IMPLEMENTATION'
 FAST_DDS, CYCLONE_DDS = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 SETTING: Final = 'capture.rmw'
-TRANSPORTS: Final = 'FASTDDS_BUILTIN_TRANSPORTS'
 FROM_PROFILE: Final = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 """Has rmw_fastrtps leave to the profile how readers and writers keep memory."""
 MEASURED: Final = {(6, 2): 'Humble', (8, 4): 'Jazzy', (9, 3): 'Kilted'}

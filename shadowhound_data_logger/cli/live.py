@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 import click
 
+from shadowhound_data_logger import heap
 from shadowhound_data_logger.cli.common import (
     BadUsage,
     ExitCode,
@@ -99,6 +100,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
         robot_url=robot_url or '', robot_token=robot_token,
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format='%(message)s')
+    heap.keep()
 
     async def serve() -> None:
         server = LiveServer(settings)

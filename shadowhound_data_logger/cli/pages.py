@@ -235,8 +235,8 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('MLFLOW_S3_ENDPOINT_URL', '`AWS_ENDPOINT_URL`', 'Where artifacts are, if the MLflow server does not proxy them.'),
     ('ROS_DOMAIN_ID', '`0`', "The robot driver's."),
     ('RMW_IMPLEMENTATION', 'that of ROS', "The robot's middleware ([thor.md](thor.md#4-middleware))."),
-    ('FASTRTPS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 2 (Humble, Jazzy).'),
-    ('FASTDDS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 3 (Kilted).'),
+    ('FASTRTPS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 2 (Humble, Jazzy). The live page omits `fastdds_shm.xml`.'),
+    ('FASTDDS_DEFAULT_PROFILES_FILE', '', 'The same of Fast DDS 3 (Kilted).'),
     ('CYCLONEDDS_URI', '', 'Interfaces, peers and buffers of Cyclone DDS.'),
 )
 """Those that libraries and the systemd units read."""

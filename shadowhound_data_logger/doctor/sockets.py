@@ -13,8 +13,9 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
+from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES
 from shadowhound_data_logger.ros.port_guard import settle
-from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES, orphans
+from shadowhound_data_logger.ros.shared_memory import orphans
 
 NAME: Final = 'sockets'
 PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
@@ -153,8 +154,10 @@ def _least_buffer(text: str) -> int:
 
 def _profile(context: Context) -> Result:
     """Fast DDS of this shell."""
-    name, file = next(((name, path) for name in PROFILE_FILES if (path := context.environ.get(name))), ('', ''))
-    remedy = f'export {_variable(context.environ)}={PROFILE_FILE}  # for the driver, and here'
+    read = _variable(context.environ)
+    name = read if context.environ.get(read) else next((name for name in PROFILE_FILES if context.environ.get(name)), '')
+    file = context.environ.get(name, '')
+    remedy = f'export {read}={PROFILE_FILE}  # for the driver, and here'
     if not file:
         return warning(
             'sockets.profile',

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Final
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
+from shadowhound_data_logger import heap
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
@@ -461,6 +462,8 @@ class LiveServer:
             if self._viewers or self._foxgloves or self._rtsp
             else None
         )
+        if self._wanted is None and before is not None:
+            heap.give_back()
         if self._wanted != before:
             for source in (self._topics, self._relay):
                 if source is not None:

@@ -18,15 +18,15 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
-from shadowhound_data_logger import heap
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, clouds, frames, series
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
+from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
-from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided, without_our_profile
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
 from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,6 @@ class Topics:
         """Topic -> messages that could not be shown."""
 
     def open(self) -> None:
-        heap.keep()
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         with without_our_profile(os.environ), dead_ports_avoided(get_default_context().get_domain_id()):
             self._node = Node(NODE, start_parameter_services=False, enable_rosout=False)

@@ -19,7 +19,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, MutableMapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,10 +30,6 @@ from shadowhound_data_logger.ros import port_guard
 from shadowhound_data_logger.ros.port_guard import FOLDER, settle
 
 log = logging.getLogger(__name__)
-PROFILE_FILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
-"""What names a profile for Fast DDS 2, and for Fast DDS 3; neither reads the other's."""
-SHIPPED: Final = 'fastdds_shm.xml'
-"""Our profile, in launch_configs: for who publishes images, and for who must not be missed."""
 STARTING_S: Final = 5.0
 """A process that starts has its file before it has its lock."""
 MOST_DEAD_PORTS: Final = 50
@@ -48,21 +44,6 @@ class Orphan:
 
     name: str
     bytes: int
-
-
-@contextmanager
-def without_our_profile(environ: MutableMapping[str, str]) -> Iterator[None]:
-    """While the first participant is made of a process that publishes nothing and may be heard of late.
-
-    To be announced five times a second costs each participant CPU, and the segment of our profile is for images.
-    """
-    ours = {name: environ[name] for name in PROFILE_FILES if Path(environ.get(name, '')).name == SHIPPED}
-    for name in ours:
-        del environ[name]
-    try:
-        yield
-    finally:
-        environ.update(ours)
 
 
 def orphans(folder: Path = FOLDER, *, is_freed: bool = False) -> list[Orphan]:

@@ -24,10 +24,11 @@ from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.doctor.run import fix
 from shadowhound_data_logger.model import State
-from shadowhound_data_logger.ros.shared_memory import PROFILE_FILES
+from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED
 
 SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'
 MEBI = 1 << 20
+PROFILE = Path(__file__).parents[2] / 'launch_configs' / SHIPPED
 Inject = Callable[[Scene], None]
 ASKED = ('versions', 'environment', 'secrets', 'network.s3', 'ros.environment', 'sockets', 'disk', 'spool', 'missions', 'tower')
 
@@ -253,6 +254,12 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'small socket buffers of the node': (small_buffers_of_the_node, 'sockets', 'sockets.buffer', ('systemctl restart',)),
     'a middleware that the node refuses': (refused_middleware, 'ros.environment', 'ros.listener', ()),
     'small shared memory': (without(*PROFILE_FILES), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
+    **{
+        f'the profile that Fast DDS reads on {distribution} is not there, the other one is': (
+            wrong(read, '/nowhere.xml', **{other: str(PROFILE)}, ROS_DISTRO=distribution), 'sockets', 'sockets.profile',
+            (f'export {read}=',))
+        for distribution, read, other in (('humble', *PROFILE_FILES), ('kilted', *reversed(PROFILE_FILES)))
+    },
     'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',
                                           ('start the driver again', 'export FASTDDS_DEFAULT')),
     'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',

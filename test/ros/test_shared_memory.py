@@ -9,15 +9,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.ros.shared_memory import (
-    MOST_DEAD_PORTS,
-    PROFILE_FILES,
-    SHIPPED,
-    Orphan,
-    dead_ports_avoided,
-    orphans,
-    without_our_profile,
-)
+from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, dead_ports_avoided, orphans
 
 DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.78.fd.2f.45.bd.0f.00.00.00.00_0.0.6.3',
@@ -138,13 +130,3 @@ def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pyte
         assert avoided == dead[: -MOST_DEAD_PORTS - 1 : -1]
     with dead_ports_avoided(0, tmp_path / 'none', tmp_path / 'proc') as avoided:
         assert avoided == []
-
-
-@pytest.mark.parametrize('name', PROFILE_FILES)
-@pytest.mark.parametrize(('file', 'is_ours'), [(f'/opt/share/{SHIPPED}', True), ('/home/go2/mine.xml', False)])
-def test_our_profile_is_left_out_while_a_participant_is_made(name: str, file: str, is_ours: bool) -> None:
-    """An operator's own profile holds for every process."""
-    environ = {name: file, 'HOME': '/home/go2'}
-    with without_our_profile(environ):
-        assert (name in environ, 'HOME' in environ) == (not is_ours, True)
-    assert environ == {name: file, 'HOME': '/home/go2'}
