@@ -31,6 +31,7 @@ from lake.making import add, add_part, folder_store
 from lake.test_pull import Field
 from live.test_history import ODOMETRY, jpeg, odometry, patrol, told
 from live.test_kinds import cdr, header, new
+from ros.ports import locked
 from spool.test_status import written
 
 import shadowhound_data_logger
@@ -47,7 +48,6 @@ from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.ros.fast_dds_profile import SHIPPED
-from shadowhound_data_logger.ros.port_guard import FOLDER
 from shadowhound_data_logger.spool.accounts import PAUSED, WRONG_TYPE
 from shadowhound_data_logger.spool.estimator import RESTART, SILENCE, TRANSPORT
 from shadowhound_data_logger.spool.index import MISSING
@@ -66,7 +66,6 @@ RATES = 'rate_scale:=0.2'
 SHOWN_HZ = {'/imu': 20.0, '/odom': 10.0, '/joint_states': 10.0, '/lowstate': 4.0, '/camera/compressed': 6.0}
 """What the simulator publishes at that scale, of some topics."""
 EVENTS = {'events.topics': ['/imu'], 'events.pre_s': 2.0, 'events.post_s': 0.5}
-SEGMENT_LOCK = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_[0-9a-f]{{16}})_el')
 IMU, JOINTS = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
 pytestmark = [
     pytest.mark.ros,
@@ -324,13 +323,12 @@ def test_a_hidden_tab_watches_nothing(page: Page, watching: Watching, graph: Any
 
 def test_the_page_takes_no_shared_memory_for_images(watching: Watching) -> None:
     """It publishes none, and does not load our profile, which its environment names."""
-    page = Path(f'/proc/{watching.live.popen.pid}')
-    if SHIPPED not in (page / 'environ').read_text():
+    if SHIPPED not in Path(f'/proc/{watching.live.popen.pid}/environ').read_text():
         pytest.skip('the tests run without our profile here')
-    locks = [lock for each in (page / 'fd').iterdir() if (lock := SEGMENT_LOCK.fullmatch(str(each.readlink())))]
-    if not locks:
+    segments = locked(watching.live.popen.pid, '[0-9a-f]{16}')
+    if not segments:
         pytest.skip('this middleware has no segments')
-    assert sum(Path(lock[1]).stat().st_size for lock in locks) < 1 << 20
+    assert sum(path.stat().st_size for path in segments) < 1 << 20
 
 
 def test_after_a_kill_the_page_goes_on_by_itself(page: Page, watching: Watching) -> None:

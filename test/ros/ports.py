@@ -10,6 +10,7 @@ import signal
 import struct
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -60,9 +61,17 @@ class Port:
 
 def ports_of(process: int) -> list[Port]:
     """Those that it listens at: it has their locks."""
-    locks = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_port\d+)_el')
-    links = [str(each.readlink()) for each in Path(f'/proc/{process}/fd').iterdir()]
-    return [Port(Path(found[1])) for link in links if (found := locks.fullmatch(link))]
+    return [Port(path) for path in locked(process, r'port\d+')]
+
+
+def locked(process: int, name: str) -> list[Path]:
+    """What of Fast DDS's shared memory has such a name, and its lock is this process's."""
+    lock = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_{name})_el')
+    found = []
+    for each in Path(f'/proc/{process}/fd').iterdir():
+        with suppress(FileNotFoundError):  # closed meanwhile
+            found.append(lock.fullmatch(str(each.readlink())))
+    return [Path(match[1]) for match in found if match]
 
 
 def seem_to_process(process: int, ports: Iterable[Port]) -> None:
