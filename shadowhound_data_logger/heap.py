@@ -11,18 +11,19 @@ _KEPT: Final = {TRIM_THRESHOLD: 16 << 20, MMAP_THRESHOLD: 16 << 20}
 
 
 def bound() -> None:
-    """Few heaps for all threads, and large blocks go back to the system when they are freed; before the first thread is started.
+    """Share few heaps among all threads, and return large blocks to the system when they are freed.
 
-    At full rate that saves the node 35 of 128 MB (docs/performance.md).
+    Call it before the first thread is started.
+    At full rate it saves the node 35 of 128 MB (docs/performance.md).
     """
     _set(_BOUND)
 
 
 def keep() -> None:
-    """Blocks of up to 16 MB come from the heap, and up to 16 MB that are free at the end of each heap stay, for the next message.
+    """Take blocks of up to 16 MB from the heap, and keep up to 16 MB that are free at its end, for the next message.
 
-    Where each cloud's blocks came from the system anew, as in some starts, the live page took 260 to 1,900 page faults a second,
-    and a quarter to three quarters of a point of a core.
+    When each cloud's blocks were taken from the system anew, as happened in some starts, the live page had 260 to 1,900 page
+    faults a second, which cost a quarter to three quarters of a point of a core.
     """
     _set(_KEPT)
 

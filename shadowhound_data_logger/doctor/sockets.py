@@ -13,12 +13,12 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
 from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
-from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES
+from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED
 from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans
 
 NAME: Final = 'sockets'
-PROFILE_FILE: Final = '$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/fastdds_shm.xml'
+PROFILE_FILE: Final = f'$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/{SHIPPED}'
 LEAST_BUFFER: Final = 1 << 20
 """Bytes with which all of 105 raw images at 15 Hz arrived; into the default of kernels, 208 KB, not one of them fits."""
 ENOUGH_BUFFER: Final = 8 << 20
@@ -155,7 +155,7 @@ def _least_buffer(text: str) -> int:
 def _profile(context: Context) -> Result:
     """Fast DDS of this shell."""
     read = _variable(context.environ)
-    name = read if context.environ.get(read) else next((name for name in PROFILE_FILES if context.environ.get(name)), '')
+    name = next((each for each in (read, *PROFILE_FILES) if context.environ.get(each)), '')
     file = context.environ.get(name, '')
     remedy = f'export {read}={PROFILE_FILE}  # for the driver, and here'
     if not file:

@@ -21,14 +21,13 @@ TRANSPORTS: Final = 'FASTDDS_BUILTIN_TRANSPORTS'
 def without_our_profile(environ: MutableMapping[str, str]) -> Iterator[None]:
     """Hide our profile, or another file of its name, while this process makes its first participant, when Fast DDS reads it.
 
-    For processes that publish nothing and may be discovered late (docs/decisions/0004). Where an operator chose transports it
-    is loaded, as by all others. No other thread may read the environment meanwhile.
+    For processes that publish nothing and may be discovered late (docs/decisions/0004). If an operator chose transports, the
+    profile is loaded, as everywhere else. No other thread may read the environment meanwhile.
     """
-    ours = {name: environ[name] for name in PROFILE_FILES if Path(environ.get(name, '')).name == SHIPPED}
-    if environ.get(TRANSPORTS):
-        ours = {}
+    has_choice = bool(environ.get(TRANSPORTS))
+    ours = {name: environ[name] for name in PROFILE_FILES if not has_choice and Path(environ.get(name, '')).name == SHIPPED}
     for name, file in ours.items():
-        log.info('%s is not loaded here: this process publishes nothing', file)
+        log.info('the Fast DDS profile %s is not loaded: this process publishes nothing', file)
         del environ[name]
     try:
         yield

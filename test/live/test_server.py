@@ -252,3 +252,26 @@ def test_who_acknowledges_what_he_does_not_read_gets_no_more(tmp_path: Path, mon
             writer.close()
 
     asyncio.run(asyncio.wait_for(run(), 30.0))
+
+
+def test_memory_is_given_back_once_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not while somebody does, and not again while nobody comes."""
+    given_back: list[int] = []
+
+    async def run() -> None:
+        async with serving(tmp_path, monkeypatch) as page:
+            monkeypatch.setattr(module.heap, 'give_back', lambda: given_back.append(len(page.server._viewers)))
+            cookie = f'{COOKIE}={page.cookies["viewer"]}'
+            async with aiohttp.ClientSession(headers={'Origin': page.origin, 'Cookie': cookie}) as session:
+                first, second = [await session.ws_connect(f'{page.origin}/ws') for _ in range(2)]
+                await first.close()
+                while len(page.server._viewers) > 1:
+                    await asyncio.sleep(0.01)
+                assert given_back == []
+                await second.close()
+                while not given_back:
+                    await asyncio.sleep(0.01)
+                page.server._rewatch()
+        assert given_back == [0]
+
+    asyncio.run(asyncio.wait_for(run(), 30.0))

@@ -65,7 +65,7 @@ def ports_of(process: int) -> list[Port]:
 
 
 def locked(process: int, name: str) -> list[Path]:
-    """What of Fast DDS's shared memory has such a name, and its lock is this process's."""
+    """Files of Fast DDS in shared memory with such a name, whose lock the process holds."""
     lock = re.compile(rf'({FOLDER}/fast(?:dds|rtps)_{name})_el')
     found = []
     for each in Path(f'/proc/{process}/fd').iterdir():
