@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.errors import NameRefused, SettingError, SettingGone
+from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import KeyTemplate, check_name
 from shadowhound_data_logger.options import (
     ARCHIVES,
     BATCHED,
     DEFAULT_SENSORS,
     FORMATS,
-    GONE,
     GROUPS,
     BagSettings,
     CaptureSettings,
@@ -57,7 +56,6 @@ __all__ = [
     'StoreSettings',
     'UploadSettings',
     'default_parameters',
-    'gone',
     'home',
     'store_settings',
 ]  # fmt: skip
@@ -102,7 +100,6 @@ class Settings:
     def load(cls, parameters: Mapping[str, Any], environ: Mapping[str, str], namespace: str = '/') -> Settings:
         """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
-        _check_gone(given)
         robot = _robot(given.pop('robot', ''), environ, namespace)
         sensors = _sensors(given, robot)
         groups = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
@@ -144,12 +141,6 @@ def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
         region=environ.get('AWS_REGION') or environ.get('AWS_DEFAULT_REGION') or 'us-east-1',
         directory=folder / 'store',
     )
-
-
-def gone(name: str) -> str:
-    """What does the job now of a parameter of an earlier version; empty for any other name."""
-    group, _, last = name.partition('.')
-    return GONE.get(name) or ('' if group in GROUPS else GONE.get(f'SENSOR.{last}', '').replace('SENSOR', group))
 
 
 def default_parameters() -> dict[str, Any]:
@@ -195,13 +186,6 @@ def _sensors(given: dict[str, Any], robot: str) -> tuple[SensorSettings, ...]:
                 raise SettingError(f'{sensor.name}.topics', list(sensor.topics), text)
             owners[topic] = sensor.name
     return sensors
-
-
-def _check_gone(given: Mapping[str, Any]) -> None:
-    """Raises SettingError for a parameter of an earlier version: what does its job now."""
-    for name, value in given.items():
-        if instead := gone(name):
-            raise SettingGone(name, value, instead)
 
 
 def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:

@@ -42,17 +42,6 @@ class SettingError(DataLoggerError):
         return f'{self.what}; {self.remedy}'
 
 
-class SettingGone(SettingError):
-    """A parameter of an earlier version; ``data['allowed']`` is what does its job now."""
-
-    def __init__(self, name: str, value: object, instead: str) -> None:
-        DataLoggerError.__init__(self, f'{name} = {value!r}: this parameter no longer exists', remedy=f'remove it: {instead}',
-                                 name=name, value=value, allowed=instead)  # fmt: skip
-
-    def __str__(self) -> str:
-        return DataLoggerError.__str__(self)
-
-
 class NameRefused(DataLoggerError):
     """A name that would become part of an object key is not safe there."""
 

@@ -308,19 +308,3 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'format': 'cdr', 'priority': 8,
     },
 }  # fmt: skip
-GONE: Final[dict[str, str]] = {
-    'SENSOR.batch_count': 'SENSOR.batch_s limits an object in time: 10 frames at 1 Hz are batch_s: 10.0',
-    'SENSOR.dedup_distance': 'SENSOR.dedup stores equal content once, and a lower SENSOR.rate_hz stores fewer pictures',
-    'SENSOR.counter_step': 'the step of SENSOR.counter is learned from the messages',
-    'intake.poll_s': 'topics are drained five times a second, and the history of each grows with what is heard on it',
-    'intake.history_bytes': 'the history of each topic is sized from what is heard on it',
-    'intake.max_rate_hz': 'the history of each topic is sized from what is heard on it',
-    'queue.max_messages': 'queue.max_bytes limits the queue',
-    'encode.threads': 'there are as many as half the cores, two to four',
-    'spool.commit_s': 'objects are committed after a tenth of a second at most',
-    'upload.connect_timeout_s': 'a connection is given up after 5 s; upload.read_timeout_s is how long an answer may take',
-    'mission.max_speed_mps': 'a step of the odometry that is faster than 5 m/s is a jump',
-    'bag.chunk_bytes': 'chunks have 1 MiB',
-    'bag.queue_bytes': '64 MiB may wait for the disk',
-}
-"""Parameters of earlier versions, and what does their job now. SENSOR stands for the name of any sensor."""

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from shadowhound_data_logger.config import Settings, default_parameters
-from shadowhound_data_logger.errors import SettingError, SettingGone
-from shadowhound_data_logger.options import GIBI, GONE
+from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.options import GIBI
 
 
 def load(environ: dict[str, str] | None = None, namespace: str = '/', **parameters: Any) -> Settings:
@@ -97,25 +96,6 @@ def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
     assert error.data['name'] == name
     assert '4711' in str(error)
     assert near in error.data['allowed']
-
-
-@pytest.mark.parametrize('name', sorted(GONE))
-def test_a_parameter_that_is_gone_stops_the_start(name: str) -> None:
-    """The error names it, its value, and what does its job now, be it one of the Go2's sensors or of one's own."""
-    for sensor in ('camera', 'thermal') if name.startswith('SENSOR') else ('',):
-        given = name.replace('SENSOR', sensor)
-        error = refused(**{'sensors': ['camera', 'thermal'], 'thermal.topics': ['thermal'], given: 4711})
-        assert isinstance(error, SettingGone)
-        assert (error.data['name'], error.data['allowed']) == (given, GONE[name].replace('SENSOR', sensor))
-        assert str(error) == f'{given} = 4711: this parameter no longer exists (remove it: {error.data["allowed"]})'
-
-
-def test_what_is_gone_is_no_parameter() -> None:
-    """Neither of its names nor those that its sentence gives as doing the job are wrong."""
-    known = set(default_parameters())
-    assert not known & {name.replace('SENSOR', 'camera') for name in GONE}
-    named = {word for text in GONE.values() for word in re.findall(r'(?:SENSOR|[a-z]+)\.[a-z_]+', text)}
-    assert {name.replace('SENSOR', 'camera') for name in named} <= known
 
 
 @pytest.mark.parametrize('name', ['robot', 'spool', 'a/b', '', 'use_sim_time'])

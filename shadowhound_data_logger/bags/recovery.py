@@ -27,7 +27,7 @@ from shadowhound_data_logger.bags.manifest import Missing
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_number
 from shadowhound_data_logger.bags.objects import finish, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.state import LINES, RECORD, BagState
+from shadowhound_data_logger.bags.state import RECORD, BagState
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, is_name
 from shadowhound_data_logger.mcap.index import read_index, read_metadata
@@ -149,17 +149,15 @@ class BagRecovery:
     # -- what is known of a bag ------------------------------------------------------------------------------------
 
     def _read(self, folder: Path) -> BagState:
-        """By the index, by what an older version left, or by the newest slice. Raises OSError."""
-        robot, rows, lines = self._place.robot, self._rows.get(folder.name), folder / LINES
+        """From the index, or from the newest slice. Raises OSError."""
+        robot, rows = self._place.robot, self._rows.get(folder.name)
         if folder.is_symlink():
             self._set_aside(folder, folder, 'it is a link')
-        if os.path.lexists(lines) and not stat.S_ISREG(lines.lstat().st_mode):
-            self._set_aside(folder, lines, 'it is no file')
         try:
-            if rows is not None and not lines.exists():
+            if rows is not None:
                 return BagState.of_rows(folder, robot, rows)
             self._unkept.add(folder)
-            return BagState.of_lines(folder, robot) if lines.exists() else self._of_slices(folder)
+            return self._of_slices(folder)
         except BagDamaged as error:
             log.warning('%s', error)
             self._unkept.add(folder)
@@ -169,10 +167,9 @@ class BagRecovery:
         """As its newest slice tells it, with those that wait in the spool. Raises OSError or BagDamaged."""
         robot, spool = self._place.robot, self._place.spool
         waiting = spool.root / 'ready' / BUCKET / prefix_of(robot, folder.name)
-        found = [(slice_number(folder.name, path.name), path) for path in (*waiting.glob('*.mcap'), *folder.glob('*.mcap*'))]
-        paths = [
-            path for number, path in sorted((number, path) for number, path in found if number is not None and path.is_file())
-        ]
+        files = [path for path in (*waiting.glob('*.mcap'), *folder.glob('*.mcap*')) if stat.S_ISREG(path.lstat().st_mode)]
+        found = [(slice_number(folder.name, path.name), path) for path in files]
+        paths = [path for number, path in sorted((number, path) for number, path in found if number is not None)]
         said: dict[str, str] = {}
         for path in paths:
             told = {name: text for record in read_metadata(path, RECORD) for name, text in record.items()}
@@ -185,12 +182,11 @@ class BagRecovery:
         return state
 
     def _keep(self, state: BagState) -> None:
-        """Have the index know of a bag what it does not; what an older version left is not needed any more then."""
+        """Add to the index what it does not have of a bag."""
         if state.folder in self._unkept:
             self._place.writer.put(rows=state.all_rows(), wait=False)
             if not self._place.writer.flush(FLUSH_S):
                 raise self._untaken(state)
-            (state.folder / LINES).unlink(missing_ok=True)
             self._unkept.remove(state.folder)
 
     # -- one bag ---------------------------------------------------------------------------------------------------

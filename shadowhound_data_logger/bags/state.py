@@ -9,15 +9,14 @@ All of it takes a hundredth of a slice, so the oldest rows are left out where th
 
 Slices leave the folder as soon as they are spooled; manifest and metadata are made from what is known here, after a death as
 well. The slices' own records are read where the index is lost, and what makes no sense anywhere is left out, whatever it is: a
-slice that is in the folder still is looked into then. Version 6 of the index had a file of JSON lines instead (``LINES``).
+slice that is in the folder still is looked into then.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -56,11 +55,6 @@ ENDED: Final = '.ended'
 """Ends the name of a slice without messages that a bag which ended keeps until it is whole in the spool, for its record."""
 LEFT_OUT: Final = 'the index was lost: {} slices or losses of before are not listed here'
 """Of a bag that was longer than its slices can tell."""
-LINES: Final = 'recording.jsonl'
-MOST_LINE_BYTES: Final = 4 << 20
-"""What one slice can say of itself: some hundred topics with all their QoS are 100 KB."""
-MOST_BYTES: Final = 256 << 20
-"""Of the file: slices of a month."""
 
 
 @dataclass(slots=True)
@@ -133,20 +127,6 @@ class BagState:
         state = cls.of_rows(folder, robot, rows)
         if left_out > 0:
             state.missing.insert(0, Missing(slice_file(folder.name, 0), LEFT_OUT.format(left_out), None))
-        return state
-
-    @classmethod
-    def of_lines(cls, folder: Path, robot: str) -> BagState:
-        """What an older version wrote, as far as it makes sense: a power cut tears the last line. Raises OSError."""
-        state = cls(folder, folder.name, robot)
-        wrong = ''
-        for line in _lines(folder / LINES):
-            try:
-                state._take_line(JsonObject(json.loads(line), LINES, ''))
-            except (ValueError, RecursionError, BagDamaged, NameRefused) as error:
-                wrong = wrong or f'{type(error).__name__} {error}'
-        if wrong:
-            log.warning('%s has lines that make no sense, the first: %.300s', folder / LINES, wrong)
         return state
 
     @property
@@ -251,38 +231,6 @@ class BagState:
         return SliceInfo(self.folder / slice_file(self.folder.name, row.number), row.bytes, row.sha256, row.t_start_ns,
                          row.t_end_ns, row.messages, by_topic, channels)  # fmt: skip
 
-    # -- what an older version wrote -------------------------------------------------------------------------------
-
-    def _take_line(self, line: JsonObject) -> None:
-        if line.has('slice'):
-            self.add_slice(self._old_slice(line.object('slice')))
-        elif line.has('missing'):
-            self.missing.append(read_missing(line.object('missing')))
-        elif line.has('named'):
-            named = line.object('named')
-            bag, clock = named.text('bag'), read_clock(named.object('clock'))
-            check_key(slice_file(bag, 0))
-            self.set_name(bag, clock)
-        if line.has('mission'):
-            self.mission = read_mission(line.object('mission'))
-        if line.has('event'):
-            self.event = read_event(line.object('event'))
-        if line.has('clock'):
-            self.clock, self.is_named = read_clock(line.object('clock')), False
-        self.ended = self.ended or line.has('ended')
-
-    def _old_slice(self, said: JsonObject) -> SliceInfo:
-        file = said.text('file')
-        if file != slice_file(self.folder.name, slice_number(self.folder.name, file) or 0):
-            raise said.wrong('file', f'one of {self.folder.name}')
-        channels = tuple(
-            Channel(one.text('topic'), one.text('type'), one.text_or_none('encoding') or '', '',
-                    one.text_or_none('type_hash') or '', one.text_or_none('qos') or '')
-            for one in said.objects('channels')
-        )  # fmt: skip
-        return SliceInfo(self.folder / file, said.count('bytes'), said.text_or_none('sha256') or '', said.count('t_start_ns'),
-                         said.count('t_end_ns'), said.count('messages'), said.counts('counts'), channels)  # fmt: skip
-
 
 def _fields(channel: Channel) -> list[str]:
     return [channel.topic, channel.type, channel.encoding, channel.type_hash, channel.qos]
@@ -308,20 +256,3 @@ def _list(found: Any) -> list[Any]:
     if not isinstance(found, list):
         raise TypeError(f'{found!r:.80} is no list')
     return found
-
-
-def _lines(path: Path) -> Iterator[bytes]:
-    """In bounded memory; what is no regular file has none. Raises OSError."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return
-    with os.fdopen(descriptor, 'rb') as file:
-        whole, left = True, MOST_BYTES
-        while left > 0 and (line := file.readline(MOST_LINE_BYTES)):
-            left -= len(line)
-            if whole and line.strip():
-                yield line
-            whole = line.endswith(b'\n')
-        if left <= 0:
-            log.error('%s has more than %d bytes: the rest of it is not read', path, MOST_BYTES)

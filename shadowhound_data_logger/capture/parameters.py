@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from shadowhound_data_logger.conditions import conditions
-from shadowhound_data_logger.config import NOT_SETTINGS, Settings, gone
+from shadowhound_data_logger.config import NOT_SETTINGS, Settings
 from shadowhound_data_logger.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.options import GROUPS
 from shadowhound_data_logger.rules import read_rule
@@ -84,8 +84,6 @@ class Parameters:
         return [{**each, 'value': plain(self._node.get_parameter(each['name']).value)} for each in self._described]
 
     def _check_known(self, name: str) -> None:
-        if instead := gone(name):
-            raise DataLoggerError(f'the parameter {name!r} no longer exists', remedy=instead)
         if not self._node.has_parameter(name):
             known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in NOT_SETTINGS]
             near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]

@@ -42,13 +42,6 @@ SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'Policies': (policy,),
 }
 """The verbs by who needs them, in the order of the help."""
-GONE: Final = {
-    ('fetch', '--threads'): 'it downloads 16 objects at a time',
-    ('bag fetch', '--threads'): 'it downloads several files at a time',
-    ('lake verify', '--threads'): 'it asks for 16 objects at a time',
-    ('bag watch', '--every'): 'it looks every 5 seconds',
-}
-"""Options of earlier versions, by verb, and what does their job now."""
 NO_VERB: Final[tuple[type[click.ClickException], ...]] = (
     (click.exceptions.NoArgsIsHelpError,) if hasattr(click.exceptions, 'NoArgsIsHelpError') else ()
 )
@@ -119,8 +112,6 @@ def described(error: Exception, arguments: Sequence[str]) -> tuple[str, str, str
     verb = ' '.join((PROGRAM, *verb_of(arguments)))
     if isinstance(error, DataLoggerError):
         return verb, error.what, error.remedy or error.DEFAULT_REMEDY
-    if isinstance(error, click.NoSuchOption) and (instead := GONE.get((verb.partition(' ')[2], error.option_name))):
-        return verb, f'{error.option_name} no longer exists', f'leave it out: {instead}'
     if isinstance(error, click.ClickException):
         return verb, error.format_message().rstrip('.'), (isinstance(error, BadUsage) and error.remedy) or f'{verb} --help'
     if isinstance(error, OSError):

@@ -27,7 +27,7 @@ HEAD: Final = """\
 The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`;
 [go2.yaml](../launch_configs/go2.yaml) has all of them with their defaults: copy it and delete what you do not change) or one by
 one (`--ros-args -p camera.rate_hz:=5.0`). An unknown name or a value that is not allowed stops the start with exit code 2, and
-the message says what is allowed. A parameter of an earlier version does so too, and the message says what does its job now.
+the message says what is allowed.
 
 **Live** parameters can be changed while the node runs, the others only at its start; a value that is not allowed changes nothing:
 

@@ -63,8 +63,7 @@ def _index(path: Path) -> tuple[SpoolUsage, dict[str, int]]:
     index = Index(path, read_only=True)
     try:
         index.open()
-        if index.is_current:
-            index.check()  # an older one is brought up to date by the next start, and has other tables
+        index.check()
         return usage_of(index, path.parent, time.time_ns()), index.quarantine_reasons()
     finally:
         index.close()

@@ -34,13 +34,12 @@ _OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND
   AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_TOLD}"""  # noqa: S608 - own constants only
 _LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
 _SUM_OF_TOLD, _SUM_OF_UNTOLD = 1, 0
-"""In ``from_ns`` of a sum: whether the store was told of all rows in it. NULL, of an older version: nobody knows."""
+"""In ``from_ns`` of a sum: whether all rows in it have been reported to the store."""
 _FORGOTTEN_UNTIL: Final = f"""
 SELECT session, topic, max(ifnull(to_ns, (SELECT max(started_ns) FROM sessions)))
 FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNTOLD}) = {_SUM_OF_UNTOLD}
   OR EXISTS (SELECT 1 FROM gaps_told WHERE again)) GROUP BY session, topic"""  # noqa: S608
-"""When the last forgotten gap ended that the store may not know of. Where that is not known it was of an earlier session: older
-versions did not keep it."""
+"""When the last forgotten gap ended that may be missing in the store; if that is unknown, when the newest session began."""
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 

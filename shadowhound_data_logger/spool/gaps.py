@@ -24,7 +24,7 @@ MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped
 EXACT, ESTIMATED = 'exact', 'estimated'
 """Grades."""
 UNTIMED: Final = -1
-"""The beginning of a row whose times nobody knows: of an older home, say."""
+"""The beginning of a row without a known time."""
 FORGOTTEN: Final = -2
 """The beginning of a row that holds the sum of those that were forgotten: when they were, the store knows."""
 HOUR_NS: Final = 3600 * SECOND

@@ -5,7 +5,7 @@ read by any number of others. Its transaction is the one commit point of the spo
 Totals are kept by triggers, so that rows of delivered objects may be forgotten without a total changing.
 
 Every statement that the index is asked or changed with is here, but for those of its gap journal (gap_table.py); its tables,
-triggers and migrations are in schema.py. What to do is decided elsewhere.
+and triggers are in schema.py. What to do is decided elsewhere.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ from shadowhound_data_logger.spool.schema import (
     CATALOGUE,
     EXEMPT,
     IMPLAUSIBLE,
-    SCHEMA_VERSION,
     WAITS_FOR,
     definitions,
     expected,
@@ -165,11 +164,6 @@ class Index:
     def requests(self) -> RequestTable:
         """What was asked for of what is kept."""
         return RequestTable(self._db)
-
-    @property
-    def is_current(self) -> bool:
-        """Whether its tables are of this version: a start of the node brings older ones up to date."""
-        return bool(self._db.execute('PRAGMA user_version').fetchone()[0] == SCHEMA_VERSION)
 
     def check(self) -> None:
         """Raises sqlite3.DatabaseError when the file is damaged: 3 us a row, 6 us after a stop that was none.
@@ -848,18 +842,8 @@ class Index:
 
     def other_types(self) -> list[OtherTypeRow]:
         """Of all sessions, in their order."""
-        if self._read_only and not self._has('other_types'):
-            return []
         rows = self._db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
-
-    def gap_sums(self) -> dict[tuple[str, str, str, str], int] | None:
-        """What the gap journal adds up to (``GapTable.sums``); None for an older index, which has none."""
-        return None if self._read_only and not self._has('gaps') else self.gaps.sums()
-
-    def _has(self, table: str) -> bool:
-        """An older index is read as it is: only the node brings it up to date."""
-        return self._db.execute('SELECT 1 FROM sqlite_master WHERE name = ?', (table,)).fetchone() is not None
 
     def rhythms(self) -> list[RhythmRow]:
         """What is known of topics without numbers, one row each."""

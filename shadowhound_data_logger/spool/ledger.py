@@ -35,12 +35,9 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
 def journal(spool: Path, robot: str) -> list[Gap]:
     """What the gap journal of a spool folder has, in the order of time; works while a node runs.
 
-    Raises SpoolError as ``read``, and for an index of a version that had no journal.
+    Raises SpoolError as ``read``.
     """
     with _reading(spool) as index:
-        if index.gap_sums() is None:
-            raise SpoolError(f'the spool {spool} is of an older version, which kept no times of losses',
-                             remedy='start the node once: it brings the spool up to date')  # fmt: skip
         return index.gaps.known(clock_record.read(spool, robot)['offsets'])
 
 
@@ -70,11 +67,11 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
     with index.snapshot():
         topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
-        journal = index.gap_sums()
+        journal = index.gaps.sums()
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     for topic, row in accounts.items():
-        row['gaps'] = None if journal is None else _journaled(topic, journal)
+        row['gaps'] = _journaled(topic, journal)
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip
@@ -107,8 +104,6 @@ def imbalances(ledger: Mapping[str, Any]) -> list[str]:
 
 def _undated(row: Mapping[str, Any]) -> Iterator[str]:
     """One sentence for each account of losses that the rows of the gap journal do not add up to."""
-    if row.get('gaps') is None:  # of an older index
-        return
     lost = {
         MISSED: _sum(part['missed_by'] for part in row['by_grade'].values()), REJECTED: row['rejected'], DROPPED: row['dropped'],
     }  # fmt: skip

@@ -10,17 +10,11 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import EVENTS_WHEN, PREVIEWS, UPLOAD_WHEN, State
-from shadowhound_data_logger.spool.gaps import FORGOTTEN, UNTIMED
+from shadowhound_data_logger.spool.gaps import FORGOTTEN
 
-SCHEMA_VERSION: Final = 7
+SCHEMA_VERSION: Final = 1
 CATALOGUE: Final = '_catalog'
 """The sensor of the catalogue's own objects, which have no rows in it."""
-REGRADED: Final = 5
-"""The version from which on accounts have grades as they are now."""
-JOURNALED: Final = 6
-"""The version from which on losses have times."""
-COMPACTED: Final = 7
-"""The version from which on what left the spool an hour ago has a short row."""
 VERSION_LIMIT: Final = 1000
 """A version from here on is damage, not a future."""
 NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
@@ -180,14 +174,6 @@ END;
 
 ``untold`` are the rows that the table of what is kept in the store lacks: (id, ``kept``, ``thinned`` and the step, or ``lost``).
 """
-_KEPT_IS_A_STATE: Final = f"""
-PRAGMA writable_schema = ON;
-UPDATE sqlite_master SET sql = replace(sql, '''deduplicated'')', '''deduplicated'', ''kept'')')
-  WHERE type = 'table' AND name = 'objects';
-PRAGMA writable_schema = RESET;
-{_KEEP}
-"""  # noqa: S608 - own constants only
-"""One more value that a CHECK allows changes no row (https://www.sqlite.org/lang_altertable.html#otheralter)."""
 
 
 def _gap_of(row: str, topic: str, samples: str) -> str:
@@ -265,61 +251,6 @@ _GAPS_TOLD: Final = """
 CREATE TABLE gaps_told (robot TEXT NOT NULL PRIMARY KEY, version INTEGER NOT NULL, again INTEGER NOT NULL) WITHOUT ROWID;
 """
 """Up to which version of the journal the parts of a robot tell all; and how often it was asked to tell all of it again."""
-_COMPACTED: Final = f"""
-{_COMPACT_OBJECTS}
-{_GAPS_TOLD}
-INSERT OR REPLACE INTO gaps_told SELECT robot, version, 0 FROM (
-  SELECT id, substr(key, 1, instr(key, '/') - 1) AS robot,
-    CASE WHEN json_valid(metadata) THEN CAST(json_extract(metadata, '$.gap_version') AS INTEGER) END AS version
-  FROM objects WHERE bucket = 'sensor-data' AND sensor = '{CATALOGUE}' AND key GLOB '*/_gaps/*'
-  ) WHERE version > 0 ORDER BY id;
-INSERT OR IGNORE INTO gaps_told SELECT DISTINCT robot, 0, 0 FROM sessions;
-UPDATE objects SET settled_ns = created_ns WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns IS NULL;
-"""  # noqa: S608 - own constants only
-"""Rows are made short step by step afterwards. What a full disk never took in had no time, and was never forgotten."""
-
-
-def _untimed(table: str, column: str, kind: str, grade: str) -> str:
-    """The rows of what an older version counted: it knew of no times."""
-    return (f"INSERT INTO gaps SELECT session, topic, '{kind}', cause.key, '{grade}', '', '', {UNTIMED}, NULL, NULL,"  # noqa: S608
-            f' sum(cause.value), count(*), 1 FROM {table}, json_each({table}.{column}) AS cause WHERE cause.value > 0'
-            ' GROUP BY session, topic, cause.key;')  # fmt: skip
-
-
-_LOST_ROWS: Final = f"""
-INSERT INTO gaps SELECT {_gap_of('objects', 'objects.topic', 'objects.samples')} FROM objects
-  WHERE state IN {_LOST} AND topic IS NOT NULL AND samples > 0 {MERGE};
-INSERT INTO gaps SELECT {_gap_of('objects', 'contents.topic', 'contents.samples')}
-  FROM objects JOIN contents USING (id) WHERE state IN {_LOST} AND objects.topic IS NULL AND contents.samples > 0 {MERGE};
-INSERT INTO gaps SELECT 0, topic, 'evicted', '', 'exact', '', '', {UNTIMED}, NULL, NULL, rest, objects, 1 FROM (
-  SELECT topic, objects, samples - ifnull((SELECT sum(count) FROM gaps WHERE gaps.topic = tally.topic AND kind = 'evicted'), 0)
-    AS rest FROM tally WHERE state = 'evicted' AND topic <> '') WHERE rest > 0;
-"""  # noqa: S608 - own constants only
-"""Of the objects that an older index has lost and still remembers the times are known."""
-_JOURNALED: Final = f"""
-CREATE TEMP TABLE older_accounts AS SELECT * FROM main.accounts;
-CREATE TEMP TABLE older_publishers AS SELECT * FROM main.publishers;
-DROP TABLE main.accounts;
-DROP TABLE main.publishers;
-{_ACCOUNTS}
-INSERT INTO accounts SELECT *, 0, 0, 0 FROM temp.older_accounts;
-INSERT INTO publishers SELECT *, 0 FROM temp.older_publishers;
-DROP TABLE temp.older_accounts;
-DROP TABLE temp.older_publishers;
-{_GAP_TABLE}
-{_untimed('publishers', 'missed', 'missed', 'exact')}
-{_untimed('estimates', 'missed', 'missed', 'estimated')}
-{_untimed('accounts', 'rejected', 'rejected', 'exact')}
-{_untimed('accounts', 'dropped', 'dropped', 'exact')}
-{_LOST_ROWS}
-"""  # noqa: S608 - own constants only
-_REGRADED: Final = """
-INSERT INTO estimates SELECT session, topic, 0, received, '{}' FROM accounts WHERE accounting <> 'exact';
-UPDATE accounts SET accounting = 'received-only' WHERE accounting <> 'exact';
-UPDATE publishers SET published = 0, received = 0, missed = '{}'
-  WHERE (session, topic) IN (SELECT session, topic FROM estimates);
-"""
-"""What a middleware reported to have lost was not an account: those sessions know what was received."""
 SCHEMA: Final = f"""
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -369,59 +300,31 @@ CREATE TABLE sessions (
 {_STATISTICS}
 PRAGMA user_version = {SCHEMA_VERSION};
 """  # noqa: S608 - own constants only
-MIGRATIONS: Final = {
-    1: f'DROP INDEX pending; DROP INDEX waiting; {_BY_BUCKET} {_BY_REASON}',
-    2: f'{_CONTENTS} {_CATALOGUE} INSERT INTO uncatalogued SELECT id FROM objects WHERE {_ARRIVED};',  # noqa: S608 - own constants only
-    3: _OTHER_TYPES,
-    4: f'{_ESTIMATES} {_REGRADED}',
-    5: _JOURNALED,
-    6: f'{_COMPACTED} {_RECORDINGS} {_KEPT_IS_A_STATE} {_STATISTICS}',
-}
-"""Version -> what makes the next one of it. Robots in the field have spools of every version that was ever released."""
-_AS_NOW: Final = """
-CREATE TEMP TABLE accounts AS SELECT *, 0 AS first_ns, 0 AS heard_ns, 0 AS complete_ns FROM main.accounts;
-CREATE TEMP TABLE publishers AS SELECT *, 0 AS heard_ns FROM main.publishers;
-"""
-"""What makes the accounts of an older index readable where it may not be changed: a node of that version may be at it."""
-_AS_REGRADED: Final = f"""
-{_ESTIMATES.replace('CREATE TABLE', 'CREATE TEMP TABLE')}
-{_REGRADED}
-"""
-"""Besides, where they have other grades."""
 
 
 def version_of(connection: sqlite3.Connection, path: Path) -> int:
     """The version of an index; 0 where it has no tables yet.
 
-    Raises sqlite3.DatabaseError for a version that is none, SpoolError for a newer one, which has other tables than ours.
+    Raises sqlite3.DatabaseError for an impossible version, SpoolError for that of another program, which is left untouched.
     """
     version = int(connection.execute('PRAGMA user_version').fetchone()[0])
     if not 0 <= version < VERSION_LIMIT or (version > SCHEMA_VERSION and definitions(connection) == expected()):
-        raise sqlite3.DatabaseError(f'the version {version} is none')
+        raise sqlite3.DatabaseError(f'the version {version} is invalid')
     if version > SCHEMA_VERSION:
-        raise SpoolError(f'the spool index {path} is of version {version}, this program knows {SCHEMA_VERSION}',
+        raise SpoolError(f'the spool index {path} has version {version}, this program reads version {SCHEMA_VERSION}',
                          remedy='update shadowhound_data_logger')  # fmt: skip
     return version
 
 
 def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> None:
-    """Make the tables where there are none, bring older ones up to date, have commits be durable. Raises as ``version_of``."""
+    """Create the tables of a new index and make its commits durable. Raises as ``version_of``."""
     version = version_of(connection, path)
     if read_only:
-        if 0 < version < COMPACTED:
-            connection.executescript(_COMPACT_OBJECTS.replace('CREATE TABLE', 'CREATE TEMP TABLE'))
-        if 0 < version < JOURNALED:
-            connection.executescript(_AS_NOW)
-        if 0 < version < REGRADED:
-            connection.executescript(_AS_REGRADED)
         return
     connection.execute('PRAGMA journal_mode = WAL')
     connection.execute('PRAGMA synchronous = FULL')
     if version == 0:
         connection.executescript(f'BEGIN IMMEDIATE; {SCHEMA} COMMIT;')
-    elif version < SCHEMA_VERSION:
-        steps = ''.join(MIGRATIONS[older] for older in range(version, SCHEMA_VERSION))
-        connection.executescript(f'BEGIN IMMEDIATE; {steps} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;')
 
 
 def definitions(db: sqlite3.Connection) -> set[tuple[str, str]]:

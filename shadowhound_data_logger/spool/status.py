@@ -17,7 +17,6 @@ from typing import Any, Final
 from shadowhound_data_logger.clock import SECOND, Clock, iso
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.usage import usage_of
 
@@ -112,16 +111,11 @@ def _load(path: Path) -> dict[str, Any] | None:
     try:
         given = json.loads(path.read_bytes())
         sections = {name: {**rest, **given.get(name, {})} for name, rest in _SECTIONS.items()}
-        topics = {name: _graded({**_TOPIC, **row}) for name, row in given.get('topics', {}).items()}
+        topics = {name: {**_TOPIC, **row} for name, row in given.get('topics', {}).items()}
         workers = {name: {**_WORKER, **row} for name, row in given.get('workers', {}).items()}
         return {**_HEAD, **given, **sections, 'topics': topics, 'workers': workers}
     except (OSError, ValueError, TypeError, AttributeError):
         return None
-
-
-def _graded(row: dict[str, Any]) -> dict[str, Any]:
-    """A node of an older version called an account what its middleware reported to have lost."""
-    return {**row, 'accounting': RECEIVED_ONLY, 'missed': None} if row['accounting'] == 'reported' else row
 
 
 def _state(written: Mapping[str, Any] | None, silent_ns: int | None) -> str:
@@ -235,11 +229,9 @@ def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[st
 def _missed(topics: Mapping[str, Any], what: str, text: str, mark: str) -> Iterator[str]:
     """A line for each cause, so that what a restart cost is told from what the network lost."""
     rows = {topic: row for topic, row in topics.items() if row[what]}
-    told = {
-        topic: row['missed_by'] or {'': row[what]} for topic, row in rows.items()
-    }  # a node of an older version tells no cause
-    for cause in sorted({cause for causes in told.values() for cause in causes}):
-        lost = {topic: causes[cause] for topic, causes in told.items() if cause in causes}
+    by_cause = {topic: row['missed_by'] or {'': row[what]} for topic, row in rows.items()}
+    for cause in sorted({cause for causes in by_cause.values() for cause in causes}):
+        lost = {topic: causes[cause] for topic, causes in by_cause.items() if cause in causes}
         yield f'{text}{cause and f" by {cause}"}: {_most(lost, mark)}'
 
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import pytest
 from bags.recording import ROBOT, desk, manifest
 from bags.slices import closed, fill, messages
-from bags.test_state import old_lines, write_lines
 
-from shadowhound_data_logger.bags.state import LINES, MOST_BYTES, BagState
 from shadowhound_data_logger.mcap.writer import SliceWriter
 
 BAG = 'patrol_20251018_120000'
@@ -24,7 +19,7 @@ def folder(tmp_path: Path) -> Path:
     """Of a bag that was cut off: a slice that is whole, and one that is open, each with ten messages."""
     made = tmp_path / 'home' / 'bags' / ROBOT / BAG
     made.mkdir(parents=True)
-    write_lines(made, old_lines(made, closed(made / f'{BAG}_0.mcap', 10)[0]))
+    closed(made / f'{BAG}_0.mcap', 10)
     writer = SliceWriter(made / f'{BAG}_1.mcap')
     fill(writer, messages(10))
     writer.sync()
@@ -65,16 +60,6 @@ def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
     assert all(path.is_symlink() for path in aside.iterdir())
 
 
-def test_lines_that_are_a_link_are_not_followed(folder: Path, tmp_path: Path) -> None:
-    """Nothing is written where they lead to, and the slices tell of themselves."""
-    precious = tmp_path / 'precious'
-    precious.write_text('precious')
-    (folder / LINES).unlink()
-    (folder / LINES).symlink_to(precious)
-    assert counts(recovered(tmp_path / 'home'), tmp_path / 'home') == WHOLE
-    assert precious.read_text() == 'precious'
-
-
 def test_what_is_no_slice_is_set_aside(folder: Path, tmp_path: Path) -> None:
     """A folder, a slice of another bag, a name without a number; twice of one name as well."""
     home = tmp_path / 'home'
@@ -89,52 +74,6 @@ def test_what_is_no_slice_is_set_aside(folder: Path, tmp_path: Path) -> None:
         'other_20251018_120000_0.mcap', f'{BAG}_5.mcap', 'x.mcap.open', 'x.mcap.open.1',
     ]  # fmt: skip
     assert (aside / 'x.mcap.open').read_bytes() == b'before'
-
-
-SLICE: dict[str, Any] = {'file': f'{BAG}_0.mcap', 'bytes': 1, 'sha256': 'ab' * 32, 't_start_ns': 1, 't_end_ns': 2, 'messages': 3,
-                         'counts': {'/talk': 3}, 'channels': []}  # fmt: skip
-
-
-@pytest.mark.parametrize('content', [
-    b'', b'\0' * 5000, os.urandom(5000), b'{"slice": ', b'[' * 100_000, b'{"a":' * 100_000, b'[1]\n7\n"x"\nnull\n',
-    b'{"slice": {"file": "../../../precious", "bytes": 1}}',
-    json.dumps({'slice': {**SLICE, 'file': '../../../precious'}}).encode(),
-    json.dumps({'slice': {**SLICE, 'messages': '3'}}).encode(), json.dumps({'slice': {**SLICE, 't_end_ns': 1 << 80}}).encode(),
-    json.dumps({'slice': {**SLICE, 'channels': [{'topic': 7}]}}).encode(), b'{"missing": {"file": 1}}\n{"mission": "patrol"}',
-    b'{"event": {"name": "x", "triggers": 5}}', b'{"named": {"bag": "../../x", "clock": null}}', b'{"clock": {"boot_id": 1}}',
-])  # fmt: skip
-def test_lines_that_make_no_sense(folder: Path, tmp_path: Path, content: bytes) -> None:
-    """They cost what they would have told: what is in the folder is recovered by what it is."""
-    precious = tmp_path / 'home' / 'precious'
-    precious.write_text('precious')
-    (folder / LINES).write_bytes(content)
-    home = tmp_path / 'home'
-    found = recovered(home)
-    assert counts(found, home) == WHOLE
-    assert manifest({f'{BAG}/manifest.json': found[f'{BAG}/manifest.json']}, BAG)['state'] == 'recovered'
-    assert precious.read_text() == 'precious'
-    assert not folder.exists()
-
-
-def test_what_follows_a_line_that_makes_no_sense_counts(folder: Path) -> None:
-    """Also after one that is longer than any line may be."""
-    with (folder / LINES).open('ab') as file:
-        file.write(b'{"slice": "' + b'x' * (5 << 20) + b'"}\n\xff\xfe\n{"ended": true}\n')
-    state = BagState.of_lines(folder, ROBOT)
-    assert (list(state.slices), state.ended) == ([f'{BAG}_0.mcap'], True)
-
-
-@pytest.mark.long('processes with little memory')
-def test_lines_of_any_size_take_little_memory(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A file that has grown to gigabytes, in one line or none."""
-    os.truncate(folder / LINES, 4 * MOST_BYTES)
-    tracemalloc.start()
-    state = BagState.of_lines(folder, ROBOT)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert list(state.slices) == [f'{BAG}_0.mcap']
-    assert peak < 20 << 20
-    assert 'the rest of it is not read' in caplog.text
 
 
 def test_a_bag_that_cannot_be_made_whole_keeps_none_of_the_others(folder: Path, tmp_path: Path) -> None:

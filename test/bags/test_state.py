@@ -1,18 +1,16 @@
-"""What is known of a bag until it is whole: read as it was told, by the index, by a slice, and by what an older version wrote."""
+"""What is known of a bag until it is whole: read back from the index and from a slice."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from bags.slices import fill, messages
 
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, Missing, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.naming import slice_file
-from shadowhound_data_logger.bags.state import LEAST_ROWS_BYTES, LINES, RECORD, BagState
+from shadowhound_data_logger.bags.state import LEAST_ROWS_BYTES, RECORD, BagState
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.index import read_metadata
 from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
@@ -101,38 +99,3 @@ def test_what_makes_no_sense_is_refused(state: BagState, change: dict[str, str])
     """Whatever a flipped bit or somebody else made of it."""
     with pytest.raises(BagDamaged):
         BagState.of_record(state.folder, 'thor', {**state.record('thor', 2), **change})
-
-
-def old_lines(folder: Path, *slices: SliceInfo) -> list[dict[str, Any]]:
-    """What version 6 wrote of a bag."""
-    said: list[dict[str, Any]] = [
-        {'bag': folder.name, 'robot': 'thor', 'mission': {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': None}}
-    ]
-    for one in slices:
-        bare = tuple(replace(channel, definition='') for channel in one.channels)
-        fields = asdict(replace(one, path=Path(one.path.name), channels=bare))
-        fields['file'] = fields.pop('path').name
-        del fields['damage']
-        said.append({'slice': fields})
-    return said
-
-
-def write_lines(folder: Path, lines: list[dict[str, Any]]) -> None:
-    (folder / LINES).write_text(''.join(f'\n{json.dumps(line)}\n' for line in lines))
-
-
-def test_what_an_older_version_wrote(tmp_path: Path) -> None:
-    """A torn last line included."""
-    folder = tmp_path / 'b'
-    folder.mkdir()
-    more = [{'missing': asdict(Missing('b_0.mcap', 'why', None))}, {'event': asdict(EVENT)}, {'clock': asdict(CLOCK)}]
-    more += [{'named': {'bag': 'c', 'clock': asdict(replace(CLOCK, known='set_later', offset_ns=5))}}, {'ended': True}]
-    write_lines(folder, [*old_lines(folder, info(folder, 0), info(folder, 1, channels=(POSE, IMU))), *more])
-    with (folder / LINES).open('ab') as file:
-        file.write(b'{"slice": {"file": "b_2.m')
-    found = BagState.of_lines(folder, 'thor')
-    assert (list(found.slices), found.ended, found.event, found.bag) == (['b_0.mcap', 'b_1.mcap'], True, EVENT, 'c')
-    assert (found.mission, found.missing) == (MissionOf('patrol', 'patrol_1', None), [Missing('b_0.mcap', 'why', None)])
-    assert (found.is_named, found.clock) == (True, replace(CLOCK, known='set_later', offset_ns=5))
-    assert found.slices['b_1.mcap'].counts == {'/pose': 0, '/imu': 3}
-    assert BagState.of_rows(folder, 'thor', found.all_rows()[1]) == found

@@ -26,6 +26,7 @@ def a_topic(**figures: Any) -> dict[str, Any]:
     row = {
         'type': 'x/msg/Y', 'accounting': 'exact', 'published': 100, 'received': 100, 'missed': 0, 'missed_by': {}, 'skipped': 40,
         'rejected': {}, 'dropped': {}, 'stored': 60, 'open': 0, 'stored_in': dict.fromkeys(STATES, 0) | {'delivered': 60},
+        'gaps': {},
     }  # fmt: skip
     row = {'published_estimated': None, 'missed_estimated': None, **row, **figures}
     if 'by_grade' not in row:

@@ -17,8 +17,8 @@ import pytest
 import shadowhound_data_logger
 from shadowhound_data_logger.cli import main as main_module
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode
-from shadowhound_data_logger.cli.main import GONE, PROGRAM, SECTIONS, cli, described, main, verb_of
-from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError, SettingGone
+from shadowhound_data_logger.cli.main import PROGRAM, SECTIONS, cli, described, main, verb_of
+from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -175,7 +175,6 @@ def test_a_remedy_of_its_own_comes_first() -> None:
     """That of its class is for those without."""
     error = BagError('no bag x', remedy='look again')
     assert described(error, ['bag', 'info', 'x']) == (f'{PROGRAM} bag info', 'no bag x', 'look again')
-    assert described(SettingGone('a.b', 1, 'c does its job'), [])[2] == 'remove it: c does its job'
     missing = FileNotFoundError(2, 'No such file or directory', '/nowhere')
     assert described(missing, ['spool', '--spool', 'x', 'list'])[:2] == (
         f'{PROGRAM} spool list', '/nowhere: No such file or directory',
@@ -222,17 +221,6 @@ def test_a_group_without_a_verb_helps(
     assert lines[0].startswith(' '.join(('Usage:', PROGRAM, *arguments)))
     assert lines[-1].startswith('  ')
     assert '->' not in lines[-1]
-
-
-@pytest.mark.parametrize(('verb', 'option'), GONE)
-def test_an_option_that_is_gone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, option: str
-) -> None:
-    """Wrong usage, with what does its job now."""
-    code, lines = ended(monkeypatch, capsys, *verb.split(), option, '8')
-    assert code == ExitCode.USAGE
-    assert lines == [f'{PROGRAM} {verb}: {option} no longer exists', f'  -> leave it out: {GONE[verb, option]}']
-    assert option not in {name for each in VERBS[verb].params for name in each.opts}
 
 
 def test_the_environment_is_usage_too(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -397,15 +397,6 @@ def test_a_slow_disk_is_named_in_time(robot: Scene, monkeypatch: pytest.MonkeyPa
     assert now_s[0] < next(check.deadline_s for check in CHECKS if check.name == 'disk')
 
 
-def test_an_index_of_an_older_version_is_not_damaged(robot: Scene) -> None:
-    """The next start of the node brings it up to date."""
-    with sqlite3.connect(robot.spool / 'index.db') as index:
-        index.execute('DROP INDEX held')
-        index.execute('PRAGMA user_version = 1')
-    index.close()
-    assert robot.findings('spool') == []
-
-
 @pytest.fixture
 def small_disk(scene: Scene) -> Path:
     """A file system of its own under the home."""

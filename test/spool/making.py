@@ -22,25 +22,6 @@ NOON_NS = 1_760_788_800 * SECOND
 BUCKET = 'sensor-data'
 READY = f'ready/{BUCKET}'
 KEY = 'thor/camera/20251018/120000_front.jpg'
-WITHOUT_SHORT_ROWS = """
-DROP TABLE statistics; DROP TRIGGER statistics_told; DROP TRIGGER statistics_lost; DROP TRIGGER statistics_forgotten;
-DROP TRIGGER kept_here; DROP TRIGGER kept_again; DROP TRIGGER kept_lost; DROP TRIGGER kept_forgotten; DROP TRIGGER answered;
-DROP TRIGGER never_kept;
-DROP INDEX kept; DROP TABLE untold; DROP TABLE requests; DROP TABLE requested;
-DROP TABLE recordings; DROP TABLE slices; DROP TABLE missing;
-DROP TABLE folders; DROP TABLE compact_objects; DROP TABLE gaps_told;
-PRAGMA user_version = 6;
-"""
-"""What makes an index of version 6, with full rows alone, of a new one."""
-WITHOUT_GAPS = f"""
-{WITHOUT_SHORT_ROWS}
-DROP TRIGGER object_lost; DROP TRIGGER contents_lost; DROP TRIGGER lost_or_found; DROP TABLE gaps;
-ALTER TABLE accounts DROP COLUMN first_ns; ALTER TABLE accounts DROP COLUMN heard_ns;
-ALTER TABLE accounts DROP COLUMN complete_ns;
-ALTER TABLE publishers DROP COLUMN heard_ns;
-PRAGMA user_version = 5;
-"""
-"""What makes an index of version 5, the last without times of losses, of a new one."""
 IN_SPOOL = {State.PENDING: 'ready', State.HELD: 'held', State.QUARANTINED: 'quarantine', State.KEPT: 'kept'}
 
 

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from profiles import examples
 from spool.conftest import Open
-from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, abandon, make, new_spool, put
+from spool.making import NOON_NS, FakeClock, abandon, make, new_spool, put
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import Outcome, SpooledObject, State
@@ -353,28 +353,6 @@ def test_an_object_without_room_is_in_the_journal(root: Path) -> None:
     spool.close()
     found = short(root)
     assert ('evicted', 'no_room', 1, 5.0, 5.0) in found
-    assert ledger.read(root, 'thor')['balanced']
-
-
-def test_losses_of_older_homes_have_no_times(root: Path, opened: Open) -> None:
-    """A row for each session, topic, kind and cause of what was counted; of objects that are remembered the times are known."""
-    spool = opened()
-    hear(spool, 1, 5)
-    spool.accounts.drop(CAMERA, 'queue_full', 1)
-    spool.accounts.reject(CAMERA, {'truncated': 1})
-    hear(spool, 6)
-    (item,) = spool.commit([make('a')])
-    spool.commit(outcomes=[Outcome(item, State.QUARANTINED, 'refused')])
-    spool.close()
-    with closing(sqlite3.connect(root / 'index.db')) as db:
-        db.executescript(WITHOUT_GAPS)
-    assert ledger.read(root, 'thor')['topics'][CAMERA]['gaps'] is None
-    opened()
-    found = journal(root)
-    assert sorted((gap.kind, gap.cause, gap.count, gap.from_ns) for gap in found if gap.kind != 'quarantined') == [
-        ('dropped', 'queue_full', 1, None), ('missed', 'transport', 3, None), ('rejected', 'truncated', 1, None),
-    ]  # fmt: skip
-    assert [(gap.kind, gap.from_ns) for gap in found if gap.kind == 'quarantined'] == [('quarantined', NOON_NS)]
     assert ledger.read(root, 'thor')['balanced']
 
 

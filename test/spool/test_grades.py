@@ -1,29 +1,24 @@
-"""Grades belong to sessions: what is known of each, what is estimated, and what an older version wrote."""
+"""Grades belong to sessions: what is known of each and what is estimated."""
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from spool.conftest import Open
-from spool.making import BUCKET, READY, abandon, make, new_spool
+from spool.making import abandon, new_spool
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing
-from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 from shadowhound_data_logger.spool.spool import Spool
 
 TOPIC = '/odom'
 PERIOD_NS = SECOND // 100
 ALONE = Hearing(gid='a')
-VERSION_3 = Path(__file__).with_name('index_version_3.sql')
-"""What a node of the version before left: an exact session, and one whose losses its middleware reported."""
 
 
 def session(opened: Callable[..., Spool], received: int, first: int | None = None, hearing: Hearing = ALONE, *,
@@ -155,49 +150,3 @@ def test_what_is_carried_keeps_its_grade(opened: Open, root: Path) -> None:
     bag = found['bags'][TOPIC]
     assert {grade: part['received'] for grade, part in bag['by_grade'].items()} == {'estimated': 5, 'received-only': 5}
     assert (bag['skipped'], bag['dropped'], bag['open']) == (4, {'restart': 6}, 0)
-
-
-# -- the version before ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def older(root: Path) -> Path:
-    """A spool of the version before, closed."""
-    for name, body in ((f'{READY}/thor/odom/a.json', b'content'), (f'held/clock/{BUCKET}/thor/imu/h.json', b'held')):
-        (root / name).parent.mkdir(parents=True)
-        (root / name).write_bytes(body)
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        connection.executescript(VERSION_3.read_text())
-    return root
-
-
-def test_an_older_index_reads_as_it_is(older: Path) -> None:
-    """Beside a node of that version that may still run: nothing is written, and what was reported is not believed."""
-    before = (older / 'index.db').read_bytes()
-    assert row(older)['accounting'] == 'received-only'
-    assert grades(older) == {'exact': (7, 5, 2), 'received-only': (None, 10, None)}
-    assert row(older, '/never')['missed'] is None
-    assert (older / 'index.db').read_bytes() == before
-
-
-def test_an_older_index_goes_on(older: Path, opened: Open) -> None:
-    """It is brought up to date where it stands: the files stay, no session is lost, and the next one is exact."""
-    told = ledger.read(older, 'thor')
-    spool = opened()
-    assert not spool.recovery.found_anything
-    spool.carry(BAG)
-    spool.accounts.drop_carried('restart')
-    with spool.accounts.entry(TOPIC) as account:
-        account.receive('p', 20)
-    (item,) = spool.commit([make('thor/odom/b.json', topic=TOPIC)])
-    assert item.key == 'thor/odom/b.json'
-    spool.close()
-    with closing(sqlite3.connect(older / 'index.db')) as connection:
-        assert connection.execute('PRAGMA user_version').fetchone() == (SCHEMA_VERSION,)
-        assert connection.execute("SELECT count(*) FROM accounts WHERE accounting = 'reported'").fetchone() == (0,)
-    assert row(older)['accounting'] == 'exact'
-    assert grades(older) == {'exact': (8, 6, 2), 'received-only': (None, 10, None)}
-    found = ledger.read(older, 'thor')
-    assert found['bags'][TOPIC]['dropped'] == {'restart': 10}
-    assert found['balanced']
-    assert {topic: {**row, 'gaps': None} for topic, row in found['events'].items()} == told['events']

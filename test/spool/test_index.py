@@ -1,36 +1,24 @@
-"""The index by itself: what a look at a long backlog costs, and files of older versions."""
+"""The index: the cost of a look at a long backlog, and recordings."""
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 from spool.conftest import Open
-from spool.making import NOON_NS, WITHOUT_GAPS, FakeClock, assert_whole, files, make, put, reopened, rows
+from spool.making import NOON_NS, FakeClock, make
 
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow, State
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.schema import SCHEMA_VERSION
 from shadowhound_data_logger.spool.spool import Spool
 
 FEW, MANY = 300, 15_000
 STEP = 20
-VERSION_1 = f"""
-{WITHOUT_GAPS}
-DROP INDEX pending; DROP INDEX waiting; DROP INDEX held;
-DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten;
-DROP TABLE uncatalogued; DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;
-DROP TABLE estimates; DROP TABLE rhythms;
-CREATE INDEX pending ON objects (priority, id) WHERE state = 'pending';
-CREATE INDEX waiting ON objects (id) WHERE state = 'pending';
-PRAGMA user_version = 1;
-"""
 
 
 @pytest.fixture
@@ -86,39 +74,6 @@ def test_the_order_holds_across_buckets(index: Index, oldest: bool) -> None:
     expected = [(place % 9, place + 1) for place in range(30) if place % 3 != 2]
     assert found == (expected if oldest else sorted(expected))[:20]
     assert index.oldest_pending_ns() == NOON_NS
-
-
-def test_an_index_of_version_1(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """The spool of a robot that is updated goes on as it was, with the newer tables."""
-    before = rows(root)
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        connection.executescript(VERSION_1)
-    assert reopened(opened, root) == {}
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        assert connection.execute('PRAGMA user_version').fetchone() == (SCHEMA_VERSION,)
-    assert rows(root)[: len(before)] == before
-    assert files(root).items() >= used.items()
-
-
-def test_an_index_of_version_1_that_lacks_a_part(opened: Open, root: Path, used: dict[str, bytes]) -> None:
-    """One that cannot be brought up to date is rebuilt as any damaged one."""
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        connection.executescript(f'{VERSION_1} DROP INDEX waiting;')
-    assert reopened(opened, root) == {'damaged index rebuilt': 1, 'files adopted': 7}
-    assert_whole(root)
-
-
-def test_an_index_of_version_1_can_be_read_as_it_is(opened: Open, root: Path) -> None:
-    """The verbs of a newer program work beside an older node that runs."""
-    spool = opened()
-    put(spool, make('one'), make('two'))
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        connection.executescript(VERSION_1)
-    view = Index(root / 'index.db', read_only=True)
-    view.open()
-    assert len(view.pending(9, oldest=True)) == 2
-    assert view.oldest_pending_ns() == NOON_NS
-    view.close()
 
 
 SLICE = SliceRow(0, 10, 'ab', 1, 2, 3, '[3]')

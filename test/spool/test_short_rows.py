@@ -14,11 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from profiles import examples
 from spool.conftest import Open
-from spool.making import BUCKET, NOON_NS, WITHOUT_SHORT_ROWS, FakeClock, assert_whole, make, new_spool, put, rows, short_rows
+from spool.making import BUCKET, NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows, short_rows
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import DataObject, Outcome, State
-from shadowhound_data_logger.spool import schema
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import COMPACT_STATES, Index
@@ -162,16 +161,11 @@ def test_what_a_full_disk_never_took_in_is_forgotten_too(root: Path) -> None:
     spool.close()
 
 
-def test_an_older_home_is_made_short_step_by_step(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not by the migration: each commit does a step, and what is asked meanwhile is answered from both."""
+def test_rows_are_made_short_step_by_step(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each commit does a step, and between the steps every key is found."""
     spool = opened()
     leave(spool, *(frame(second) for second in range(5)))
     spool.close()
-    with closing(sqlite3.connect(root / 'index.db')) as db:
-        db.executescript(WITHOUT_SHORT_ROWS)
-    with closing(Index(root / 'index.db', read_only=True)) as index:
-        index.open()
-        assert len(index.rows()) == 5, 'it can be read as it is'
     monkeypatch.setattr('shadowhound_data_logger.spool.index.COMPACT_STEP', 2)
     spool = opened()
     left = [len(rows(root))]
@@ -237,13 +231,3 @@ def test_keys_that_begin_so_are_the_same_with_short_rows(
             sorted(row['key'] for row in index.with_content(BUCKET, prefix, f'{1:064x}')),
         ))  # fmt: skip
     assert found[0] == found[1]
-
-
-def test_the_schema_is_what_its_migrations_make(opened: Open, root: Path) -> None:
-    """A home of version 6 has the tables of a new one once it was opened."""
-    opened().close()
-    with closing(sqlite3.connect(root / 'index.db')) as db:
-        db.executescript(WITHOUT_SHORT_ROWS)
-    opened().close()
-    with closing(sqlite3.connect(root / 'index.db')) as db:
-        assert schema.definitions(db) >= schema.expected()

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from spool.conftest import Moments, Open
 from spool.making import (
-    WITHOUT_GAPS,
     FakeClock,
     abandon,
     assert_whole,
@@ -140,24 +137,6 @@ def test_what_is_listed_is_not_forgotten(opened: Open, root: Path, clock: FakeCl
     clock.now_ns += 10**14
     spool.commit()
     assert rows(root) == []
-
-
-def test_a_spool_from_before_the_catalogue(opened: Open, root: Path) -> None:
-    """What version 2 delivered and still remembers is listed when a robot is updated."""
-    spool = opened()
-    delivered(spool, 'a')
-    put(spool, make('b'))
-    spool.close()
-    with closing(sqlite3.connect(root / 'index.db')) as connection:
-        connection.executescript(
-            f'{WITHOUT_GAPS}'
-            ' DROP TABLE contents; DROP TRIGGER contents_moved; DROP TRIGGER contents_forgotten; DROP TABLE uncatalogued;'
-            ' DROP TRIGGER arrived; DROP TRIGGER known; DROP TRIGGER forgotten; DROP TABLE other_types;'
-            ' DROP TABLE estimates; DROP TABLE rhythms;'
-            ' PRAGMA user_version = 2;'
-        )
-    assert not opened().recovery.found_anything
-    assert listed(root) == ['a']
 
 
 def test_an_object_says_what_its_row_needs(spool: Spool) -> None:
