@@ -98,9 +98,9 @@ class KeptCut:
 
     def _objects(self, info: SliceInfo) -> list[DataObject]:
         said = self.slices[0].metadata
-        marks = {name: said[name] for name in (words.ROBOT, words.MISSION_ID, words.RUN_ID) if name in said}
+        marks = {name: said[name] for name in (words.ROBOT, words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if name in said}
         marks |= {words.BAG: self.bag, words.CUT_OF: self._of}
-        mission = MissionOf(self._of.rsplit('_', 2)[0], said.get(words.MISSION_ID), said.get(words.RUN_ID))
+        mission = MissionOf(said.get(words.MISSION_TYPE, ''), said.get(words.MISSION_ID), said.get(words.RUN_ID))
         manifest = Manifest(
             bag=self.bag, robot=self.robot, mission=mission if mission.mission_id or mission.run_id else None, state=COMPLETE,
             missing=(), topics=topics_of([info]), slices=(SliceEntry.of(info, self.places[0][1]),),

@@ -116,8 +116,9 @@ def _marks(state: BagState) -> dict[str, str]:
     if state.event is not None:
         marks[words.EVENT] = state.event.name
     if state.mission is not None:
-        ids = {words.MISSION_ID: state.mission.mission_id, words.RUN_ID: state.mission.run_id}
-        marks |= {word: value for word, value in ids.items() if value}
+        mission = {words.MISSION_ID: state.mission.mission_id, words.RUN_ID: state.mission.run_id,
+                   words.MISSION_TYPE: state.mission.type}  # fmt: skip
+        marks |= {word: value for word, value in mission.items() if value}
     return marks
 
 

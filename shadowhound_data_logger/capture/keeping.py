@@ -15,7 +15,6 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import BagSettings, KeepSettings, SensorSettings
-from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.model import PREVIEWS, DataObject
 from shadowhound_data_logger.options import ON_REQUEST
 from shadowhound_data_logger.untrusted import open_image
@@ -42,7 +41,7 @@ class Keeping:
 
     def __init__(self, settings: KeepSettings, sensors: Mapping[str, SensorSettings], robot: str) -> None:
         """``sensors`` are the settings in force."""
-        self._always = always_shipped(settings)
+        self._always = settings.missions
         self._period_ns = round(settings.preview_s * SECOND)
         self._sensors = sensors
         self._robot = robot
@@ -93,12 +92,7 @@ class Keeping:
 def keeps_bag(settings: BagSettings, keep: KeepSettings, state: BagState) -> bool:
     """Whether the slices of a bag stay on the robot until somebody asks for them; those of events never do."""
     mission = state.mission
-    return settings.ship == ON_REQUEST and (mission is None or safe_type(mission.type) not in always_shipped(keep))
-
-
-def always_shipped(settings: KeepSettings) -> frozenset[str]:
-    """Types of missions of which nothing stays on the robot, as they stand in metadata."""
-    return frozenset(safe_type(name) for name in settings.missions if name)
+    return settings.ship == ON_REQUEST and (mission is None or mission.type not in keep.missions)
 
 
 def _picture(body: bytes, content_type: str) -> bytes | None:

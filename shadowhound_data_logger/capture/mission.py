@@ -22,7 +22,6 @@ from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import now_ns
-from shadowhound_data_logger.missions.folder import safe_type
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.model import Batch, DataObject
 from shadowhound_data_logger.policies.folder import PolicyFolder
@@ -128,7 +127,7 @@ class MissionWatch:
 
     def _join(self, mission: Active) -> None:
         """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
-        self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: safe_type(mission.mission_type)}
+        self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: mission.mission_type}
         self._find_run(mission)
         if self._settings.join:
             node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)))

@@ -23,7 +23,7 @@ from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared
 from shadowhound_data_logger.missions.batch import send
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
-from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, run_name, stamped, write_json
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, summary_of
@@ -220,7 +220,7 @@ class Delivery:
         if self.run is None:
             start = self._story.start
             tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
-            name = stamped(start['type'], int(start['t']))
+            name = run_name(start['type'], int(start['t']))
             run = self._tracking.run_of(self.folder.mission_id, name, int(start['t']) // 1_000_000, tags)
             self.folder.set_run(run)
             self.run = run

@@ -163,7 +163,10 @@ def missions(home: Path) -> Iterator[MissionFolder]:
 
 
 def safe_type(mission_type: str) -> str:
-    """The mission type as it stands in names: unchanged where it can, else the nearest that can."""
+    """The mission type in keys and names of files: unchanged if possible, otherwise the nearest valid name.
+
+    Two types may have the same one. Everywhere else a type keeps the spelling that the agent passed.
+    """
     try:
         return check_name(mission_type, 'the mission type')
     except NameRefused:
@@ -171,8 +174,13 @@ def safe_type(mission_type: str) -> str:
 
 
 def stamped(mission_type: str, start_ns: int) -> str:
-    """The name of the run: ``<mission type>_YYYYMMDD_HHMMSS``, UTC."""
-    return f'{safe_type(mission_type)}_{utc(start_ns):%Y%m%d_%H%M%S}'
+    """For keys and names of files: ``<mission type>_YYYYMMDD_HHMMSS``, UTC."""
+    return run_name(safe_type(mission_type), start_ns)
+
+
+def run_name(mission_type: str, start_ns: int) -> str:
+    """The name of the run in MLflow: the same, with the type as the agent spelled it."""
+    return f'{mission_type}_{utc(start_ns):%Y%m%d_%H%M%S}'
 
 
 def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:

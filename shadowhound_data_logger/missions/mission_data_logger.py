@@ -84,8 +84,9 @@ class MissionDataLogger:
         """Begin a mission; a mission that is active ends as KILLED.
 
         Returns the MLflow run id when it is made within ``start_timeout_s``, else the mission's own id: both find the mission
-        from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). A type that cannot be
-        in a name has its odd characters replaced there, and stands as it is in the run's params.
+        from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). The type keeps its
+        spelling (at most 128 characters) everywhere but in keys and names of files, where other characters than A-Z, a-z, 0-9,
+        ``_``, ``-`` and ``.`` are replaced.
         """
         mission = self._start(mission_type, mission_command)
         return mission.run_id or mission.id

@@ -20,7 +20,7 @@ from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.clock import Clock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SpoolError, StoreUnavailable
-from shadowhound_data_logger.missions.folder import MissionFolder, Run, safe_type, stamped
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.model import Binding, DataObject
 from shadowhound_data_logger.ship.uploader import delivering
@@ -62,7 +62,7 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     """
     kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
-    metadata = {words.ROBOT: robot, words.MISSION_ID: folder.mission_id, words.MISSION_TYPE: safe_type(start['type'])}
+    metadata = {words.ROBOT: robot, words.MISSION_ID: folder.mission_id, words.MISSION_TYPE: start['type']}
     metadata |= {words.RUN_ID: run.run_id} if run else {}
     time_ns = int(record.get('t', 0))
     if kind == 'frame':

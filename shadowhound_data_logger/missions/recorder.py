@@ -21,7 +21,7 @@ from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
 from shadowhound_data_logger.missions.dating import now_ns
-from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, safe_type, stamped
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, stamped
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
 from shadowhound_data_logger.policies.folder import PolicyFolder
@@ -274,9 +274,7 @@ class Beginning:
 
     def mission(self, mission_type: str, mission_command: str) -> Mission | None:
         """A new one; None when the disk does not take it, which is said."""
-        time_ns, given = now_ns(self.clock), values.text(mission_type, values.MAX_PARAM)
-        if safe_type(given) != given:
-            log.warning('the mission type %.80r cannot be part of a name: using %s there', given, safe_type(given))
+        time_ns, given = now_ns(self.clock), values.text(mission_type, values.MAX_TYPE)
         start = {'k': 'start', 't': time_ns, 'type': given, 'command': values.text(mission_command), 'robot': self.robot,
                  'pid': os.getpid()}  # fmt: skip
         if policy := PolicyFolder(self.home).current():
@@ -293,7 +291,7 @@ class Beginning:
 
     def nothing(self, mission_type: str) -> Mission:
         """A mission that is over: all its calls do nothing. For a disk that takes no journal."""
-        name = stamped(values.text(mission_type, values.MAX_PARAM), now_ns(self.clock))
+        name = stamped(values.text(mission_type, values.MAX_TYPE), now_ns(self.clock))
         folder = MissionFolder(self.home / MISSIONS / f'{name}_unlogged')
         mission = Mission(folder, Journal(folder.journal), 0.0, self.clock)
         mission.end()

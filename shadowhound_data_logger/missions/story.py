@@ -16,7 +16,7 @@ from datetime import timedelta
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.clock import SECOND, iso, utc
-from shadowhound_data_logger.missions.folder import MissionSent, Run, stamped
+from shadowhound_data_logger.missions.folder import MissionSent, Run, run_name, stamped
 from shadowhound_data_logger.missions.values import MAX_PARAM
 
 MS: Final = 1_000_000
@@ -148,7 +148,7 @@ class Story:
     def params(self) -> dict[str, str]:
         """What the run begins with."""
         return {
-            'mission_type': self.start['type'][:MAX_PARAM],
+            'mission_type': self.start['type'],
             'mission_command': self.start['command'][:MAX_PARAM],
             'robot': self.start['robot'],
             'timestamp': utc(int(self.start['t'])).isoformat(),
@@ -198,7 +198,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictu
     start, end = story.start, story.end
     node = story.node or Story()
     return {
-        'mission_id': mission_id, 'run_id': run.run_id, 'run_name': stamped(start['type'], int(start['t'])),
+        'mission_id': mission_id, 'run_id': run.run_id, 'run_name': run_name(start['type'], int(start['t'])),
         'robot': start['robot'], 'mission_type': start['type'], 'mission_command': start['command'],
         'policy': start.get('policy'), 'policies': story.policy_names or None,
         'policy_changes': [{'policy': name, 'time': iso(time_ns)} for name, time_ns in story.policies[1:]],

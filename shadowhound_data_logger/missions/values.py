@@ -17,6 +17,8 @@ from shadowhound_data_logger.errors import Rejected
 MAX_KEY: Final = 250
 MAX_KEYS: Final = 50
 """Metrics in one record."""
+MAX_TYPE: Final = 128
+"""Letters of a mission's type: a word, which must fit into an object's metadata."""
 MAX_PARAM: Final = 6000
 MAX_TAG: Final = 5000
 """What 2.14 takes; 3.17 takes 8,000."""

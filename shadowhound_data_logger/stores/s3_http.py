@@ -34,8 +34,9 @@ from botocore.utils import get_environ_proxies
 from shadowhound_data_logger.bandwidth import Body, Pace
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.stores.content import Part, object_metadata
+from shadowhound_data_logger.stores.content import Part
 from shadowhound_data_logger.stores.credentials import Keys
+from shadowhound_data_logger.stores.s3_metadata import to_headers
 
 ALGORITHM: Final = 'AWS4-HMAC-SHA256'
 AGENT: Final = 'shadowhound-data-logger'
@@ -156,7 +157,7 @@ class ContentRequests:
         headers = {
             'host': self._host, 'content-length': str(item.size), 'content-type': item.content_type,
             'x-amz-checksum-crc32': crc32,
-            **{f'x-amz-meta-{name}': value for name, value in object_metadata(item).items()},
+            **{f'x-amz-meta-{name}': value for name, value in to_headers(item).items()},
         }  # fmt: skip
         if conditional:
             headers['if-none-match'] = '*'

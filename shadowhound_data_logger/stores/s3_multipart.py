@@ -20,8 +20,9 @@ from botocore.exceptions import ClientError
 
 from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.stores.content import Part, check_content, object_metadata, opened, parts
+from shadowhound_data_logger.stores.content import Part, check_content, opened, parts
 from shadowhound_data_logger.stores.s3_errors import code_of, status_of
+from shadowhound_data_logger.stores.s3_metadata import to_headers
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 MULTIPART_BYTES: Final = 16 << 20
@@ -142,7 +143,7 @@ class _Uploads:
         """A new upload, with all that is to be known of the object; returns its id."""
         with self._s3.asking(item.bucket, item.key) as client:
             answer = client.create_multipart_upload(
-                Bucket=item.bucket, Key=item.key, ContentType=item.content_type, Metadata=object_metadata(item)
+                Bucket=item.bucket, Key=item.key, ContentType=item.content_type, Metadata=to_headers(item)
             )
         self._s3.confirm({'ETag': answer.get('UploadId')}, item.bucket, item.key)
         return str(answer['UploadId'])

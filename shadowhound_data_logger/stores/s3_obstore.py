@@ -33,6 +33,7 @@ from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
+from shadowhound_data_logger.stores.s3_metadata import from_headers
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.bandwidth import Pace
@@ -291,7 +292,7 @@ def _shown(endpoint: str) -> str:
 def _info(bucket: str, key: str, found: Any) -> ObjectInfo:
     """Metadata have lower-case names, as S3 has them."""
     attributes: Mapping[str, str] = found.attributes
-    metadata = {name.lower(): value for name, value in attributes.items() if name not in _HEADERS}
+    metadata = from_headers({name.lower(): value for name, value in attributes.items() if name not in _HEADERS})
     return ObjectInfo(bucket, key, found.meta['size'], metadata.get('sha256'), metadata, attributes.get('Content-Type', ''))
 
 

@@ -24,6 +24,7 @@ from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
 from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
+from shadowhound_data_logger.stores.s3_metadata import from_headers
 
 OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
@@ -127,7 +128,7 @@ class S3Requests:
         self.confirm(answer, bucket, key)
         if 'ContentLength' not in answer:
             raise self._not_s3(bucket, key)
-        metadata = answer.get('Metadata', {})
+        metadata = from_headers(answer.get('Metadata', {}))
         return ObjectInfo(bucket, key, answer['ContentLength'], metadata.get('sha256'), metadata, answer.get('ContentType', ''))
 
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
@@ -152,7 +153,8 @@ class S3Requests:
             if version not in {'', headers['etag']}:  # of a server that does not know the condition
                 body.close()
                 raise changed_meanwhile(bucket, key)
-        metadata = {name.lower()[len(META) :]: value for name, value in headers.items() if name.lower().startswith(META)}
+        marked = {name.lower()[len(META) :]: value for name, value in headers.items() if name.lower().startswith(META)}
+        metadata = from_headers(marked)
         kind = headers.get('content-type', '')
         info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind, headers['etag'])
         return Content(info, self._pieces(bucket, key, body), body.close)

@@ -42,6 +42,20 @@ def test_head_tells_size_type_and_metadata(store: ObjectStore, spool: Spool, buc
     assert info.metadata == {'topic': '/point_cloud2', 'samples': '7', 'sha256': item.sha256}
 
 
+@pytest.mark.parametrize('value', [
+    '巡逻', 'Küche', 'e\u0301', '\N{DOG FACE}', 'a\nb', ' edges ', 'two  blanks', '=?UTF-8?B?QQ==?=', '=?', 'a=?b', 'a:b%20#"*',
+    '巡' * 128,
+])  # fmt: skip
+def test_any_text_is_metadata(store: ObjectStore, spool: Spool, bucket: str, value: str) -> None:
+    """A mission's type reads as the agent spelled it, in ``head`` and next to the content."""
+    store.put(spool('a', b'x', metadata={'mission_type': value, 'topic': '/odom'}))
+    info = store.head(bucket, 'a')
+    assert info is not None
+    assert (info.metadata['mission_type'], info.metadata['topic']) == (value, '/odom')
+    with store.content(bucket, 'a') as content:
+        assert content.info.metadata['mission_type'] == value
+
+
 def test_sha256_is_kept_where_the_item_has_no_metadata(store: ObjectStore, spool: Spool, bucket: str) -> None:
     """An object is verifiable even when its spooled metadata leave the hash out."""
     item = dataclasses.replace(spool('a', b'x'), metadata={})

@@ -1,0 +1,94 @@
+"""A mission's type has one spelling, the agent's, everywhere but in keys and names of files."""
+
+from __future__ import annotations
+
+import io
+import json
+from contextlib import closing
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+from missions.fakes import FakeSpooler, FakeTracking, journalling
+
+from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import Settings, UploadSettings
+from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.missions import recorder
+from shadowhound_data_logger.missions.delivery import Delivery
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
+from shadowhound_data_logger.missions.journal import read
+from shadowhound_data_logger.missions.objects import Spooler, objects_of
+from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.stores import open_store
+
+NOON_NS = 1_760_788_800 * 10**9
+ROBOT = 'thor-types'
+"""The shared store has objects of other tests as well."""
+TYPES = ('巡逻', '探索', 'night patrol', 'night_patrol', 'ночь', 'a/b', '\N{DOG FACE}')
+
+
+@pytest.fixture(params=['folder', pytest.param('s3', marks=pytest.mark.seaweedfs)])
+def environ(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
+    """A store for the missions of a home."""
+    if request.param == 'folder':
+        return {'SHADOWHOUND_HOME': str(tmp_path)}
+    tower: Tower = request.getfixturevalue('tower')
+    return {**tower.environment(), 'SHADOWHOUND_HOME': str(tmp_path)}
+
+
+@pytest.fixture
+def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[MissionFolder]:
+    """A mission of each type, all of one second, each with a trajectory of its own."""
+    monkeypatch.setattr(recorder, 'now_ns', lambda _: NOON_NS)
+    for given in TYPES:
+        csv = tmp_path / 't.csv'
+        csv.write_text(f'timestamp,x,y,yaw\n{given}\n')
+        with journalling(tmp_path, robot=ROBOT) as logger:
+            logger.start_mission(given, '')
+            logger.log_trajectory(csv)
+    return list(missions(tmp_path))
+
+
+def first(folder: MissionFolder) -> dict[str, object]:
+    return dict(next(read(folder.journal)).record or {})
+
+
+def test_every_object_and_row_has_the_agent_s_spelling(
+    environ: dict[str, str], tmp_path: Path, flown: list[MissionFolder]
+) -> None:
+    """Types with one key-safe form have keys of their own, each with its own content; catalogue and store have the spelling."""
+    settings = Settings.load({'spool.min_free_bytes': 0, 'robot': ROBOT}, environ)
+    with closing(Spooler(settings, SystemClock('boot'))) as spooler:
+        for number, folder in enumerate(flown):
+            records = [line.record or {} for line in read(folder.journal)]
+            spooler.add([item.content for record in records[:-1]
+                         for item in objects_of(record, records[0], folder, Run(f'run{number}', '1', 'x'))])  # fmt: skip
+        for _ in range(20):
+            spooler.drain()
+        assert spooler.pending() == 0
+    with closing(open_store(settings.store, UploadSettings())) as store:
+        found = {}
+        for entry in store.list('trajectories', f'{ROBOT}/'):
+            info, content = store.head('trajectories', entry.key), store.get('trajectories', entry.key).decode()
+            assert info is not None
+            assert content == f'timestamp,x,y,yaw\n{info.metadata["mission_type"]}\n'
+            found[check_key(entry.key)] = info.metadata['mission_type']
+        assert sorted(found.values()) == sorted(TYPES)
+        parts = [store.get('sensor-data', entry.key) for entry in store.list('sensor-data', f'{ROBOT}/_catalog/')]
+    rows = [row for part in parts if part.startswith(b'PAR1') for row in pyarrow.parquet.read_table(io.BytesIO(part)).to_pylist()]
+    types = {folder.mission_id: first(folder)['type'] for folder in flown}
+    assert {(row['mission_id'], row['mission_type']) for row in rows if row['mission_id']} == set(types.items())
+
+
+def test_the_run_and_the_summary_have_the_agent_s_spelling(flown: list[MissionFolder]) -> None:
+    """The run's name, its params and ``summary.json``."""
+    for folder in flown:
+        given, tracking = first(folder)['type'], FakeTracking()
+        delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
+        while not delivery.complete():
+            for work in (delivery.track, delivery.attach, delivery.spool):
+                work()
+        summary = json.loads(tracking.artifacts['summary.json'])
+        assert tracking.params['mission_type'] == summary['mission_type'] == given
+        assert tracking.names[folder.mission_id].rpartition(' ')[0] == summary['run_name'] == f'{given}_20251018_120000'
