@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -95,11 +96,13 @@ def of_slices(slices: Sequence[SliceInfo]) -> Description:
 
 def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> SliceInfo:
     """A slice as its own summary tells it."""
-    counts: dict[str, int] = {channel.topic: 0 for channel in index.channels.values()}
+    counts, repeated = {channel.topic: 0 for channel in index.channels.values()}, Counter[str]()
     for number, count in index.counts.items():
         if number in index.channels:
             counts[index.channels[number].topic] += count
-    return SliceInfo(path, size, sha256, index.t_start_ns, index.t_end_ns, index.messages, counts, tuple(index.channels.values()))
+            repeated[index.channels[number].topic] += count if index.channels[number].repeated else 0
+    return SliceInfo(path, size, sha256, index.t_start_ns, index.t_end_ns, index.messages, counts, tuple(index.channels.values()),
+                     repeated=+repeated)  # fmt: skip
 
 
 def profiles(qos: object) -> Sequence[Mapping[str, Any]]:

@@ -6,11 +6,11 @@
                  "topic": null, "reason": null}],
      "topics": [{"topic": "/imu", "type": "sensor_msgs/msg/Imu", "messages": 6000}],
      "slices": [{"file": "patrol_20261121_120000_0.mcap", "key": "thor/rosbags/...", "bytes": 1, "sha256": "...",
-                 "messages": 1, "t_start_ns": 1, "t_end_ns": 1, "counts": {"/imu": 1}}]}
+                 "messages": 1, "t_start_ns": 1, "t_end_ns": 1, "counts": {"/imu": 1}, "repeated": {}}]}
 
 ``mission`` is null for a bag of no mission, ``run_id`` where it was not known yet. ``missing`` is empty where ``state`` is
 ``complete``; its ``messages`` is null where nobody counted them, ``topic`` and ``reason`` where it is not of one topic. Unknown
-fields are a later version's, and ignored.
+fields are a later version's, and ignored. Counts are those of the files, with the messages that a slice repeats.
 ``event`` is what made the bag of an event, in the order of the triggers:
 
     {"name": "low_battery", "pre_s": 30.0, "held_s": 30.0, "post_s": 10.0,
@@ -128,10 +128,18 @@ class SliceEntry:
     t_start_ns: int
     t_end_ns: int
     counts: Mapping[str, int]
+    repeated: Mapping[str, int]
+    """Of ``counts``, the latched messages of earlier slices with which this one begins, on channels of their own."""
+
+    @property
+    def recorded(self) -> Mapping[str, int]:
+        """As in SliceInfo."""
+        return {topic: count - self.repeated.get(topic, 0) for topic, count in self.counts.items()}
 
     @classmethod
     def of(cls, info: SliceInfo, key: str) -> SliceEntry:
-        return cls(info.path.name, key, info.bytes, info.sha256, info.messages, info.t_start_ns, info.t_end_ns, dict(info.counts))
+        return cls(info.path.name, key, info.bytes, info.sha256, info.messages, info.t_start_ns, info.t_end_ns, dict(info.counts),
+                   dict(info.repeated))  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,5 +230,5 @@ def _slice(one: JsonObject) -> SliceEntry:
         raise one.wrong('sha256', 'a SHA-256 in hex')
     return SliceEntry(
         one.text('file'), one.text('key'), one.count('bytes'), sha256, one.count('messages'), one.count('t_start_ns'),
-        one.count('t_end_ns'), one.counts('counts'),
+        one.count('t_end_ns'), one.counts('counts'), one.counts('repeated'),
     )  # fmt: skip

@@ -49,7 +49,7 @@ def slice_object(state: BagState, info: SliceInfo, priority: int, *, is_kept: bo
         content_type='application/octet-stream', sensor=SENSOR, topic=None, type='', samples=info.messages,
         t_start_ns=start_ns, t_end_ns=end_ns, priority=EVENT_PRIORITY if is_event else priority,
         protected=is_event, metadata=metadata,
-        counts={f'{state.sink}{topic}': count for topic, count in info.counts.items() if count},
+        counts={f'{state.sink}{topic}': count for topic, count in info.recorded.items() if count},
     )  # fmt: skip
 
 

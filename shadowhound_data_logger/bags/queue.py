@@ -26,6 +26,10 @@ class Lot(NamedTuple):
     qos: str
     """As rosbag2 writes it (``mcap.rosbag2_metadata``)."""
     messages: Sequence[Taken]
+    latched: int = 0
+    """How many publishers of the topic keep their last message for subscribers that join later; 0 for most topics."""
+    paused: bool = False
+    """Whether they are only to be remembered as latched, not recorded."""
 
 
 Mark = Callable[[], None]
@@ -52,11 +56,13 @@ class BagQueue:
         """Messages, since it was made."""
 
     def put(self, lot: Lot) -> int:
-        """Take in what fits; how many messages, the last ones, did not."""
+        """Take in what fits; how many messages, the last ones, did not. Those of a pause count nowhere."""
         sizes = [len(message.cdr) for message in lot.messages]
         size, lost = sum(sizes), 0
         with self._changed:
             if self.bytes + size > self._max_bytes:
+                if lot.paused:
+                    return 0
                 fitting = list(takewhile(lambda total: self.bytes + total <= self._max_bytes, accumulate(sizes)))
                 lost = len(sizes) - len(fitting)
                 self.dropped += lost

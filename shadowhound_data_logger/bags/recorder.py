@@ -286,7 +286,7 @@ class Recorder:
                 item()
             elif self._writing is not None:
                 self._writing.write(item)
-            else:
+            elif not item.paused:
                 messages = item.messages
                 self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].source_ns,
                                                 messages[-1].source_ns)  # fmt: skip

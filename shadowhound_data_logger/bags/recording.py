@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.bags.latched import Latched
 from shadowhound_data_logger.bags.manifest import EventOf, Missing, MissionOf
 from shadowhound_data_logger.bags.naming import slice_file
 from shadowhound_data_logger.bags.objects import finish, ros_distro, slice_object
@@ -32,6 +33,11 @@ from shadowhound_data_logger.spool.retention import NO_ROOM
 
 log = logging.getLogger(__name__)
 
+MAX_LATCHED_BYTES: Final = 64 << 20
+"""Of all latched messages that are kept for the next slice; never more than a slice may have."""
+REPEAT_LEAD_NS: Final = 300_000_000
+"""How much earlier than the first message of a slice the latched ones are logged. The intake drains topics one after the other,
+up to a quarter of a second apart, so the next topic's messages may be older than this first one."""
 RETRY_S: Final = 5.0
 """Between two tries to write to a disk that took nothing."""
 UNWRITABLE: Final = 'unwritable'
@@ -59,7 +65,10 @@ class Recording:
         self._recovery = recovery
         self._monotonic = monotonic
         self._writer: SliceWriter | None = None
-        self._channels: dict[tuple[str, str], Channel] = {}
+        self._channels: dict[tuple[str, str, bool], Channel] = {}
+        self._latched = Latched(min(MAX_LATCHED_BYTES, settings.slice_bytes))
+        self._repeated_bytes = 0
+        """Of the open slice: a slice does not end early because much is latched."""
         self._written = Counter[str]()  # into the open slice
         self._unnumbered: dict[str, Iterator[int]] = {}
         """By topic, the numbers in this bag of messages that have none of their publisher."""
@@ -77,25 +86,42 @@ class Recording:
         return self._closed_bytes + (writer.size if writer is not None else 0)
 
     def write(self, lot: Lot) -> None:
-        """Record messages, or drop and count them while the disk takes nothing."""
+        """Record messages, or drop and count them while the disk takes nothing; later slices begin with the latched ones."""
+        if not lot.paused:
+            self._record(self._place.by_clock_of(self.state, lot))
+        if lot.latched:
+            self._latched.keep(lot)
+
+    def _record(self, lot: Lot) -> None:
         if self._writer is None and not self._begin():
             self._drop(lot)
             return
         writer = self._writer
         assert writer is not None
-        if not self._written:
-            self._began_s = self._monotonic()
+        is_first = not self._written
         self._written[lot.topic] += len(lot.messages)
         self.messages += len(lot.messages)
         channel, places = self._channel(lot), self._unnumbered.setdefault(lot.topic, itertools.count(1))
         try:
-            for cdr, source_ns, _, number, received_ns in self._place.by_clock_of(self.state, lot).messages:
+            if is_first:
+                self._began_s = self._monotonic()
+                self._repeat(writer, lot.messages[0].received_ns)
+            for cdr, source_ns, _, number, received_ns in lot.messages:
                 writer.write(channel, received_ns, source_ns, next(places) if number is None else number, cdr)
         except OSError as error:
             self._break(error)
         else:
-            if writer.size >= self._settings.slice_bytes:
+            if writer.size - self._repeated_bytes >= self._settings.slice_bytes:
                 self.split()
+
+    def _repeat(self, writer: SliceWriter, first_ns: int) -> None:
+        """Begin a slice with what is latched. Raises OSError."""
+        log_ns, size = max(0, first_ns - REPEAT_LEAD_NS), writer.size
+        for lot in self._latched:
+            channel = self._channel(lot, repeated=True)
+            for cdr, source_ns, _, number, _ in lot.messages:
+                writer.write(channel, log_ns, source_ns, number or 0, cdr)
+        self._repeated_bytes = writer.size - size
 
     def leave_out(self, lost: Mapping[tuple[str, str], int]) -> None:
         """Messages that were dropped before they came here, by topic and reason; they count in the accounts already."""
@@ -175,12 +201,12 @@ class Recording:
 
     # -- slices ----------------------------------------------------------------------------------------------------
 
-    def _channel(self, lot: Lot) -> Channel:
-        channel = self._channels.get((lot.topic, lot.type))
+    def _channel(self, lot: Lot, *, repeated: bool = False) -> Channel:
+        channel = self._channels.get((lot.topic, lot.type, repeated))
         if channel is None:
             encoding, definition, type_hash = describe(lot.type)
-            channel = Channel(lot.topic, lot.type, encoding, definition, type_hash, lot.qos)
-            self._channels[lot.topic, lot.type] = channel
+            channel = Channel(lot.topic, lot.type, encoding, definition, type_hash, lot.qos, repeated)
+            self._channels[lot.topic, lot.type, repeated] = channel
         return channel
 
     def _begin(self) -> bool:
@@ -234,11 +260,11 @@ class Recording:
                 self._refuse(_reason(error), str(error))
                 return False
             self._broken.pop(0)
-            lost = written - Counter(info.counts if info else {})
+            lost = written - Counter(info.recorded if info else {})
             for topic, count in lost.items():
                 self._count(topic, reason, count)
                 self._note(Missing(final.name, 'the disk did not take it', count, topic, reason))
-            if info is not None and info.messages:
+            if info is not None and any(info.recorded.values()):
                 self._hand_over(replace(info, damage=None))
             elif info is not None:
                 info.path.unlink(missing_ok=True)

@@ -233,7 +233,7 @@ class BagRecovery:
         if info.damage is not None and (info.damage.tail_bytes or info.damage.chunks):
             damage = f'{info.damage.tail_bytes} bytes at its end and {info.damage.chunks} chunks in it were not whole'
             self._note(state, Missing(info.path.name, damage, info.damage.messages))
-        if info.messages:
+        if any(info.recorded.values()):
             self._place.writer.put(rows=[state.add_slice(info)], wait=False)
         else:
             info.path.unlink()
@@ -272,7 +272,7 @@ def _runs(path: Path) -> dict[str, list[NumberRun]]:
     found: dict[str, list[NumberRun]] = {}
     try:
         source = LocalFile(path)
-        for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda _: True)):
+        for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda channel: not channel.repeated)):
             number, stamp_ns = message.sequence, message.publish_ns
             runs = found.setdefault(message.channel.topic, [])
             if runs and number == runs[-1].stop:

@@ -1,8 +1,8 @@
 """The last seconds of some topics, serialized as they came: bounded in bytes, filled by the intake, which never waits for it.
 
 It holds references to what was taken, never a copy. An event claims what is in it and what comes, and takes it out piece by
-piece: what an event has taken is in the ring no more, so that no message is in two events' bags. But for what is latched: the
-last message of each publisher stays, however long ago it came, and each event begins with it.
+piece: what an event has taken is no longer in the ring, so that no message is in two events' bags. Latched messages are the
+exception: the last one of each publisher stays, however old it is, and each event begins with them.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
+from shadowhound_data_logger.bags.latched import MESSAGE_BYTES, Latched
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.spool.accounts import EVENT, Accounts, Losses
 
-MESSAGE_BYTES: Final = 256
-"""What CPython needs for a message beside its content: a tuple of five, its bytes' head, three integers, a place in a list."""
 PIECE_BYTES: Final = 1 << 20
 """A lot that is larger is kept in pieces: what goes, goes by pieces, and what is written as well."""
 RING_FULL: Final = 'ring_full'
@@ -33,8 +32,6 @@ class Held(NamedTuple):
     at_s: float
     """When it was drained, by the monotonic clock."""
     size: int
-    latched: int = 0
-    """How many of the topic's publishers send what they sent last to whoever comes."""
     again: bool = False
     """Whether it is latched and came before all that is in the ring; it may have been in an event already."""
 
@@ -46,18 +43,31 @@ class Ring:
     """
 
     def __init__(self, max_bytes: int, keep_s: float) -> None:
-        self.max_bytes = max_bytes
+        self._max_bytes = max_bytes
         self.keep_s = keep_s
         """For how long what nobody claimed stays, as far as its bytes have room."""
         self._lock = threading.Lock()
         self._items: deque[Held] = deque()
-        self._latched: dict[str, deque[Held]] = {}
-        """Topic -> what left the ring last of it, a message each, the oldest first; with the bytes of ``bytes``."""
+        self._latched = Latched(max_bytes // 2)
+        """Of what left the ring."""
         self._first: deque[Held] = deque()
         """What is latched, for the event that goes on."""
         self._claimed = False
-        self.bytes = 0
+        self._bytes = 0
+        """Of ``_items``."""
+
+    @property
+    def max_bytes(self) -> int:
+        return self._max_bytes
+
+    @max_bytes.setter
+    def max_bytes(self, value: int) -> None:
+        self._max_bytes, self._latched.max_bytes = value, value // 2
+
+    @property
+    def bytes(self) -> int:
         """Of the messages in it, with what Python needs for them."""
+        return self._bytes + self._latched.bytes
 
     @property
     def claimed(self) -> bool:
@@ -70,13 +80,12 @@ class Ring:
         with self._lock:
             return self._items[-1].at_s - self._items[0].at_s if self._items else 0.0
 
-    def put(self, lot: Lot, lost: Losses, now_s: float, latched: int = 0) -> list[Held]:
+    def put(self, lot: Lot, lost: Losses, now_s: float) -> list[Held]:
         """Take in messages; whatever is too old or too much goes, the oldest first. What an event asked for of that."""
-        pieces = [piece._replace(latched=latched) for piece in _pieces(lot, lost, now_s)]
         with self._lock:
-            for piece in pieces:
+            for piece in _pieces(lot, lost, now_s):
                 self._items.append(piece)
-                self.bytes += piece.size
+                self._bytes += piece.size
             gone = []
             while self.bytes > self.max_bytes and self._items:
                 gone.append(self._pop())
@@ -96,10 +105,9 @@ class Ring:
             oldest = self._items[0] if self._items else None
             start_ns, at_s = (oldest.lot.messages[0].received_ns, oldest.at_s) if oldest else (now_ns, since_s)
             self._first = deque(
-                held._replace(at_s=at_s, again=True, lot=held.lot._replace(
-                    messages=[message._replace(received_ns=start_ns) for message in held.lot.messages]))
-                for kept in self._latched.values() for held in kept
-            )  # fmt: skip
+                Held(single._replace(messages=[single.messages[0]._replace(received_ns=start_ns)]), {}, at_s, 0, again=True)
+                for single in self._latched
+            )
             return oldest.at_s if oldest else None
 
     def next(self, until_s: float) -> Held | None:
@@ -121,31 +129,10 @@ class Ring:
 
     def _pop(self) -> Held:
         held = self._items.popleft()
-        self.bytes -= held.size
-        if held.latched:
-            self._keep(held)
+        self._bytes -= held.size
+        if held.lot.latched:
+            self._latched.keep(held.lot)
         return held
-
-    def _keep(self, held: Held) -> None:
-        """The last message of each publisher; where nobody knows who sent what, as many as there are publishers.
-
-        All of them take half of the ring at most, whose oldest messages go for them as for others.
-        """
-        kept = self._latched.setdefault(held.lot.topic, deque())
-        for message in held.lot.messages:
-            before = [each for each in kept if _is_of(message, each.lot.messages[0])]
-            if not before and not message.publisher and len(kept) >= held.latched:
-                before = [kept[0]]
-            for each in before:
-                kept.remove(each)
-                self.bytes -= each.size
-            size = len(message.cdr) + MESSAGE_BYTES
-            if self._latched_bytes() + size <= self.max_bytes // 2:
-                kept.append(held._replace(lot=held.lot._replace(messages=[message]), size=size))
-                self.bytes += size
-
-    def _latched_bytes(self) -> int:
-        return sum(held.size for kept in self._latched.values() for held in kept)
 
 
 def _pieces(lot: Lot, lost: Losses, now_s: float) -> Iterator[Held]:
@@ -161,11 +148,6 @@ def _pieces(lot: Lot, lost: Losses, now_s: float) -> Iterator[Held]:
         size += cost
     if part:
         yield Held(lot._replace(messages=part), lost, now_s, size)
-
-
-def _is_of(message: Taken, kept: Taken) -> bool:
-    """Whether a message takes the place of an earlier one: of the same sender, or the very same again."""
-    return message.publisher == kept.publisher if message.publisher else message.cdr == kept.cdr
 
 
 class Claims:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -177,7 +178,7 @@ class BagState:
     def add_slice(self, info: SliceInfo) -> RecordingRows:
         """A slice was closed."""
         for channel in info.channels:
-            self._channels.setdefault((channel.topic, channel.type), replace(channel, definition=''))
+            self._channels.setdefault((channel.topic, channel.type), replace(channel, definition='', repeated=False))
         known = tuple(one for one in self._channels.values() if one.topic in info.counts)
         self.slices[info.path.name] = info = replace(info, channels=known, damage=None)
         return self.rows([info])
@@ -218,18 +219,29 @@ class BagState:
 
     def _row(self, info: SliceInfo, topics: Sequence[str]) -> SliceRow:
         return SliceRow(slice_number(self.folder.name, info.path.name) or 0, info.bytes, info.sha256, info.t_start_ns,
-                        info.t_end_ns, info.messages, json.dumps([info.counts.get(topic) for topic in topics]))  # fmt: skip
+                        info.t_end_ns, info.messages, json.dumps([_count(info, topic) for topic in topics]))  # fmt: skip
 
     def _slice(self, row: SliceRow) -> SliceInfo:
         """The opposite of ``_row``. Raises ValueError."""
         topics, found = dict.fromkeys(topic for topic, _ in self._channels), _list(from_json(row.counts.encode()))
-        numbers = [row.number, row.bytes, row.t_start_ns, row.t_end_ns, row.messages, *(one for one in found if one is not None)]
+        pairs = [one if isinstance(one, list) else (one, 0) for one in found[: len(topics)] if one is not None]
+        if any(len(pair) != 2 for pair in pairs):
+            raise ValueError(f'a row of a slice counts {row.counts:.200}')
+        numbers = [row.number, row.bytes, row.t_start_ns, row.t_end_ns, row.messages, *(one for pair in pairs for one in pair)]
         if not isinstance(row.sha256, str) or not all(type(one) is int and 0 <= one < MOST for one in numbers):  # type: ignore[redundant-expr]
             raise ValueError(f'a row of a slice is {row!r:.200}')
-        by_topic = {topic: count for topic, count in zip(topics, found, strict=False) if count is not None}
+        known = (topic for topic, count in zip(topics, found, strict=False) if count is not None)
+        by_topic = dict(zip(known, pairs, strict=True))
+        counts, repeated = ({topic: pair[place] for topic, pair in by_topic.items()} for place in (0, 1))
         channels = tuple(one for one in self._channels.values() if one.topic in by_topic)
         return SliceInfo(self.folder / slice_file(self.folder.name, row.number), row.bytes, row.sha256, row.t_start_ns,
-                         row.t_end_ns, row.messages, by_topic, channels)  # fmt: skip
+                         row.t_end_ns, row.messages, counts, channels, repeated=+Counter(repeated))  # fmt: skip
+
+
+def _count(info: SliceInfo, topic: str) -> int | list[int] | None:
+    """Of a topic's messages in a slice, or with it that of the repeated ones among them."""
+    count, repeated = info.counts.get(topic), info.repeated.get(topic)
+    return [count, repeated] if repeated and count is not None else count
 
 
 def _fields(channel: Channel) -> list[str]:

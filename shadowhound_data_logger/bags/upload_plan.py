@@ -164,7 +164,7 @@ def _earlier(path: Path) -> Manifest | None:
 def _entries(files: list[Outgoing], described: Description) -> Iterator[SliceEntry]:
     """``counts`` are those of the slice where it tells them, or where it is the only one."""
     for file in files:
-        counts = {topic.name: topic.messages for topic in described.topics} if len(files) == 1 else {}
+        counts, repeated = {topic.name: topic.messages for topic in described.topics} if len(files) == 1 else {}, dict[str, int]()
         messages = int(file.metadata.get(words.MESSAGES, sum(counts.values())))
         t_start_ns, t_end_ns = file.t_start_ns or described.t_start_ns, file.t_end_ns or described.t_end_ns
         if file.name.endswith('.mcap'):
@@ -172,4 +172,5 @@ def _entries(files: list[Outgoing], described: Description) -> Iterator[SliceEnt
             if index.is_indexed:
                 info = slice_info(index, file.path, file.size)
                 counts, messages, t_start_ns, t_end_ns = dict(info.counts), info.messages, info.t_start_ns, info.t_end_ns
-        yield SliceEntry(file.name, file.key, file.size, file.sha256, messages, t_start_ns, t_end_ns, counts)
+                repeated = dict(info.repeated)
+        yield SliceEntry(file.name, file.key, file.size, file.sha256, messages, t_start_ns, t_end_ns, counts, repeated)

@@ -270,7 +270,8 @@ def _wait_for_delivery(settings: Settings, writer: SpoolWriter, workers: Sequenc
 def _told(manifest: Manifest, dropped: int, *, waiting: bool, last_error: str) -> dict[str, Any]:
     """What became of the bag."""
     return {
-        'robot': manifest.robot, 'bag': manifest.bag, 'messages': sum(each.messages for each in manifest.slices),
+        'robot': manifest.robot, 'bag': manifest.bag,
+        'messages': sum(sum(each.recorded.values()) for each in manifest.slices),
         'slices': len(manifest.slices), 'bytes': sum(each.bytes for each in manifest.slices),
         'topics': {each.topic: each.messages for each in manifest.topics}, 'delivered': not waiting,
         'last_error': last_error if waiting else '', 'dropped': dropped,

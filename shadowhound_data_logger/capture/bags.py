@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
 from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
@@ -18,6 +18,10 @@ from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, TopicAccount
 
+MAX_OFFERS: Final = 1000
+"""Publishers whose offers are remembered."""
+INFINITE_NS: Final = (1 << 63) - 10**9
+"""A lifespan from here on is none: middlewares differ in the last digits."""
 MAX_AGAIN: Final = 10_000
 """Latched messages that a recording has again, of all publishers; each of these sends what it kept, some at most."""
 
@@ -32,14 +36,13 @@ class BagConsumer(Consumer):
         self.wanted_topics = TopicChoice(settings, [node.resolve_topic_name(topic) for topic in settings.topics if topic])
         self._before: dict[str, dict[str, int]] = {}
         self._again: set[tuple[str, str, int]] = set()
-        self._node = node
         self._accounts = accounts
         self._queue = queue
-        self._qos: dict[tuple[str, str], str] = {}
+        self._offers = Offers(node)
 
     def begin(self) -> None:
         """A recording begins: what earlier ones had of latched topics belongs into it as well."""
-        self._qos.clear()
+        self._offers.clear()
         self._again.clear()
         self._before = self._accounts.last_numbers(BAG)
 
@@ -59,11 +62,14 @@ class BagConsumer(Consumer):
             if paused and fresh:
                 account.drop(PAUSED, len(fresh), fresh[0].source_ns, fresh[-1].source_ns)
             account.gaps.heard_ns = newest_ns
-        if fresh and paused:
+        if not fresh:
+            return
+        if paused:
             self._queue.leave_out(topic, PAUSED, len(fresh))
-        elif fresh:
-            dropped = self._queue.put(Lot(topic, type_name, self._qos_of(topic, type_name), fresh))
-            if dropped:
+        qos, latched = self._offers.of(topic, type_name, fresh[-1].publisher)
+        if not paused or latched:  # slices after the pause begin with what was latched in it
+            dropped = self._queue.put(Lot(topic, type_name, qos, fresh, latched, paused))
+            if dropped and not paused:
                 self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].source_ns, fresh[-1].source_ns)
 
     def _is_earlier(self, topic: str, message: Taken, account: TopicAccount) -> bool:
@@ -78,15 +84,41 @@ class BagConsumer(Consumer):
         account.receive_again(mark[1], message.number)
         return True
 
-    def _qos_of(self, topic: str, type_name: str) -> str:
-        """What the publishers of the topic offer, as it was when the recording first heard of it."""
-        qos = self._qos.get((topic, type_name))
-        if qos is None:
-            qos = self._qos[topic, type_name] = offered_qos(profiles_offered(self._node, topic, type_name))
-        return qos
+
+class Offers:
+    """What the publishers of topics offer. New; owned by the intake thread."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._known: dict[tuple[str, str, str | None], tuple[str, bool]] = {}
+
+    def clear(self) -> None:
+        self._known.clear()
+
+    def of(self, topic: str, type_name: str, publisher: str | None) -> tuple[str, int]:
+        """The offered QoS as rosbag2 writes it, as of the first message of this publisher; how many publishers are latched now.
+
+        The second is asked again for each message of a topic that has latched publishers; those publish rarely.
+        """
+        key = topic, type_name, publisher
+        if (known := self._known.get(key)) is not None and not known[1]:
+            return known[0], 0
+        profiles = profiles_offered(self._node, topic, type_name)
+        latched = sum(map(_is_latched, profiles))
+        if known is None:
+            if len(self._known) >= MAX_OFFERS:
+                self._known.clear()
+            known = self._known[key] = offered_qos(profiles), latched > 0
+        return known[0], max(latched, 1) if known[1] else 0
 
 
 def profiles_offered(node: Node, topic: str, type_name: str) -> list[QoSProfile]:
     """By the publishers of a topic with this type."""
     found = node.get_publishers_info_by_topic(topic)
     return [info.qos_profile for info in found if info.topic_type == type_name]
+
+
+def _is_latched(profile: QoSProfile) -> bool:
+    """Whether the publisher keeps its last message for later subscribers; ``/rosout``, whose messages expire, does not count."""
+    lifespan_ns = profile.lifespan.nanoseconds
+    return int(profile.durability) == int(DurabilityPolicy.TRANSIENT_LOCAL) and (not lifespan_ns or lifespan_ns >= INFINITE_NS)

@@ -8,30 +8,25 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Held, Ring
-from shadowhound_data_logger.capture.bags import profiles_offered
+from shadowhound_data_logger.capture.bags import Offers
 from shadowhound_data_logger.capture.consumers import Consumer, Drained, TopicChoice
 from shadowhound_data_logger.capture.triggers import EventWatch, Inbox
 from shadowhound_data_logger.conditions import conditions
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.options import EventSettings
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.spool.accounts import PAUSED
 from shadowhound_data_logger.worker import Worker
-
-MAX_QOS: Final = 1000
-"""Publishers whose offers are remembered."""
 
 
 class EventConsumer(Consumer):
@@ -44,10 +39,9 @@ class EventConsumer(Consumer):
         self.wanted_topics = TopicChoice(settings, [*named, *self.inbox.conditions])
         kept = TopicChoice(settings, named).wanted((), self.inbox.conditions)
         self._unkept = frozenset(self.inbox.conditions) - kept
-        self._node = node
         self._ring = ring
         self._claims = claims
-        self._offers: dict[tuple[str, str, str | None], tuple[str, bool]] = {}
+        self._offers = Offers(node)
 
     def take(self, drained: Drained) -> None:
         """Take in messages; repeats are left out by whoever writes them."""
@@ -56,32 +50,13 @@ class EventConsumer(Consumer):
             self.inbox.put(topic, drained.type, messages, now_s)
         if topic in self._unkept:
             return
-        qos, is_latched = self._offered(topic, drained.type, messages[-1].publisher)
-        lot = Lot(topic, drained.type, qos, messages)
+        qos, latched = self._offers.of(topic, drained.type, messages[-1].publisher)
+        lot = Lot(topic, drained.type, qos, messages, latched)
         if not drained.paused:
-            latched = self._latched(topic, drained.type) if is_latched else 0
-            if gone := self._ring.put(lot, drained.lost, now_s, latched):
+            if gone := self._ring.put(lot, drained.lost, now_s):
                 self._claims.lose(gone)
         elif self._ring.claimed:
             self._claims.lose([Held(lot, drained.lost, now_s, 0)], PAUSED)
-
-    def _offered(self, topic: str, type_name: str, publisher: str | None) -> tuple[str, bool]:
-        """What the publishers of the topic offered when this one was first heard, and whether one of them was latched."""
-        key = topic, type_name, publisher
-        if key not in self._offers:
-            if len(self._offers) >= MAX_QOS:
-                self._offers.clear()
-            profiles = profiles_offered(self._node, topic, type_name)
-            self._offers[key] = offered_qos(profiles), any(map(_is_latched, profiles))
-        return self._offers[key]
-
-    def _latched(self, topic: str, type_name: str) -> int:
-        """How many publishers of the topic are latched; asked again with each of their few messages."""
-        return max(1, sum(map(_is_latched, profiles_offered(self._node, topic, type_name))))
-
-
-def _is_latched(profile: QoSProfile) -> bool:
-    return int(profile.durability) == int(DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class EventBuffer:

@@ -71,7 +71,7 @@ class Halving:
         try:
             for message in read_messages(source, index, MessageFilter(0, _ALWAYS, lambda _: True)):
                 topic = message.channel.topic
-                if topic in bulk:
+                if topic in bulk and not message.channel.repeated:
                     seen[topic] += 1
                     if seen[topic] % 2 == 0:
                         lost[topic] += 1

@@ -235,10 +235,10 @@ class Recordings:
             for topic in bag.topics:
                 if not self._is_of(sensor, topic.topic, topic.type):
                     continue
-                slices = [each for each in bag.slices if each.counts.get(topic.topic) and self._overlaps(bag, each)]
-                count = sum(each.counts[topic.topic] for each in slices)
+                slices = [each for each in bag.slices if each.recorded.get(topic.topic) and self._overlaps(bag, each)]
+                count = sum(each.recorded[topic.topic] for each in slices)
                 # A slice's span is that of all its topics: of a short one it says little about one of them.
-                spans = [(each.counts[topic.topic], each.t_end_ns - each.t_start_ns) for each in slices]
+                spans = [(each.recorded[topic.topic], each.t_end_ns - each.t_start_ns) for each in slices]
                 rates = [found / span * 1e9 for found, span in spans if span >= LEAST_SPAN_NS]
                 yield RecordedSensor(sensor, topic.topic, topic.type, BAGS, count, max(rates, default=0.0))
 
@@ -295,14 +295,14 @@ class Recordings:
 
     def _slices(self, topic: str) -> Iterator[tuple[Manifest, SliceEntry]]:
         """Of the bag that has most of it: two bags of one time would have each message twice."""
-        counts = [sum(each.counts.get(topic, 0) for each in bag.slices if self._overlaps(bag, each)) for bag in self._bags]
+        counts = [sum(each.recorded.get(topic, 0) for each in bag.slices if self._overlaps(bag, each)) for bag in self._bags]
         if any(counts):
             bag = self._bags[int(np.argmax(counts))]
-            yield from ((bag, each) for each in bag.slices if each.counts.get(topic) and self._overlaps(bag, each))
+            yield from ((bag, each) for each in bag.slices if each.recorded.get(topic) and self._overlaps(bag, each))
 
     def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
         source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
-        wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic)
+        wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic and not channel.repeated)
         known: dict[Channel, MessageTypes] = {}
         for message in Plain([source], None).messages(wanted):
             if message.channel not in known:
@@ -428,7 +428,7 @@ def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[
     found: dict[tuple[str, int], bytes] = {}
     known: dict[Channel, MessageTypes] = {}
     offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
-    wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic)
+    wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic and not channel.repeated)
     for message in Plain([StoredFile(store, held.bucket, held.key, held.size)], None).messages(wanted):
         if message.channel not in known:
             folder = stack.enter_context(tempfile.TemporaryDirectory(dir=work))

@@ -27,6 +27,8 @@ _FOOTER: Final = struct.Struct('<QQI')
 _PLACE: Final = struct.Struct('<HQ')
 _COUNTED: Final = struct.Struct('<HI')
 CDR: Final = 'cdr'
+REPEATED: Final = 'shadowhound_repeated'
+"""In the metadata of a channel: see ``Channel.repeated``."""
 
 
 def record(op: int, *parts: bytes) -> bytes:
@@ -103,8 +105,9 @@ class Contents:
             records = record(Opcode.SCHEMA, struct.pack('<H', number), *map(text, schema))
             self.schemas[number] = records
         track = ChannelTrack(len(self.tracks) + 1, channel)
-        said = mapping({'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash})
-        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), said)
+        said = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
+        said |= {REPEATED: 'true'} if channel.repeated else {}
+        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), mapping(said))
         self.tracks[track.number], self.declared[track.number] = track, declared
         return track, records + declared
 
@@ -138,7 +141,8 @@ class Contents:
         for track in self.tracks.values():
             counts[track.channel.topic] = counts.get(track.channel.topic, 0) + track.count
         channels = tuple(track.channel for track in self.tracks.values())
-        return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, counts, channels, damage)
+        repeated = {track.channel.topic: track.count for track in self.tracks.values() if track.channel.repeated and track.count}
+        return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, counts, channels, damage, repeated)
 
     def ending(self, at: int, metadata: str) -> bytes:
         """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""

@@ -21,7 +21,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Metadata, Schema, Statistics
 
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.format import MAGIC, RECORD
+from shadowhound_data_logger.mcap.format import MAGIC, RECORD, REPEATED
 from shadowhound_data_logger.mcap.ranges import Ranged
 from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
 from shadowhound_data_logger.mcap.slice_info import Channel
@@ -114,7 +114,7 @@ class Schemas:
         self.channels[channel.id] = Channel(
             topic=channel.topic, type=name, encoding=encoding, definition=definition,
             type_hash=channel.metadata.get('topic_type_hash', ''),
-            qos=in_numbers(channel.metadata.get('offered_qos_profiles', '')),
+            qos=in_numbers(channel.metadata.get('offered_qos_profiles', '')), repeated=channel.metadata.get(REPEATED) == 'true',
         )  # fmt: skip
 
 

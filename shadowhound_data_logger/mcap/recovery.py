@@ -16,6 +16,7 @@ import os
 import struct
 import zlib
 from array import array
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -297,20 +298,23 @@ def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
     index = read_index(source)
     sha256 = fingerprint(path)[1] if digest else ''
     channels, messages, span = list(index.channels.values()), index.messages, (index.t_start_ns, index.t_end_ns)
-    counts = {channel.topic: 0 for channel in channels}
+    counts, repeated = {channel.topic: 0 for channel in channels}, Counter[str]()
     told = messages and sum(index.counts.values()) == messages and index.counts.keys() <= index.channels.keys()
     if index.is_indexed or told:
         for number, count in index.counts.items():
             counts[index.channels[number].topic] += count
+            repeated[index.channels[number].topic] += count if index.channels[number].repeated else 0
     else:
         channels, messages, span, counts = [], 0, (0, 0), {}
         for message in read_messages(source, index, MessageFilter(*_EVER, lambda _: True)):
             if message.channel.topic not in counts:
                 channels.append(message.channel)
             counts[message.channel.topic] = counts.get(message.channel.topic, 0) + 1
+            repeated[message.channel.topic] += message.channel.repeated
             span = (min(span[0], message.log_ns), max(span[1], message.log_ns)) if messages else (message.log_ns, message.log_ns)
             messages += 1
-    return SliceInfo(path, source.size, sha256, *(span if messages else (0, 0)), messages, counts, tuple(channels))
+    return SliceInfo(path, source.size, sha256, *(span if messages else (0, 0)), messages, counts, tuple(channels),
+                     repeated=+repeated)  # fmt: skip
 
 
 def _write(file: int, at: int, content: bytes) -> None:

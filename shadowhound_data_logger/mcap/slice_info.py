@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
@@ -23,6 +23,9 @@ class Channel:
     definition: str
     type_hash: str
     qos: str
+    repeated: bool = False
+    """Whether its messages repeat latched messages of earlier slices, so that this slice can be played on its own. They have a
+    channel of their own in addition to that of the topic's other messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,7 @@ class SliceInfo:
     """A finished MCAP file. Times are log times, Unix nanoseconds, both inclusive, 0 in a slice without messages.
 
     ``sha256`` is in hex, empty where it was not asked for. ``counts`` has every channel's topic, also those without messages.
-    ``damage`` is None unless the slice was recovered.
+    ``damage`` is None unless the slice was recovered. ``repeated`` has those of ``counts`` that are on repeated channels.
     """
 
     path: Path
@@ -55,3 +58,9 @@ class SliceInfo:
     counts: Mapping[str, int]
     channels: tuple[Channel, ...]
     damage: Damage | None = None
+    repeated: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def recorded(self) -> Mapping[str, int]:
+        """By topic, the messages that were received while the slice was written: all but the repeated ones."""
+        return {topic: count - self.repeated.get(topic, 0) for topic, count in self.counts.items()}

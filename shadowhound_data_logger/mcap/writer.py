@@ -89,7 +89,7 @@ class SliceWriter:
         Stamps are Unix nanoseconds; where the publisher's is not known (0 or less), it is the log time, as MCAP wants it.
         """
         track = self._tracks.get(channel.topic)
-        if track is None or (track.channel is not channel and track.channel.type != channel.type):
+        if track is None or (track.channel is not channel and _kind(track.channel) != _kind(channel)):
             track = self._declare(channel)
         log_ns = max(log_ns, 0)
         if publish_ns <= 0:
@@ -139,7 +139,7 @@ class SliceWriter:
     def _declare(self, channel: Channel) -> ChannelTrack:
         """The track of a topic's type, which another type of the same topic may have taken the place of."""
         tracks = self._contents.tracks.values()
-        track = next((one for one in tracks if (one.channel.topic, one.channel.type) == (channel.topic, channel.type)), None)
+        track = next((one for one in tracks if one.channel.topic == channel.topic and _kind(one.channel) == _kind(channel)), None)
         if track is None:
             track, records = self._contents.declare(channel)
             self._declared += records
@@ -176,6 +176,11 @@ class SliceWriter:
             while view:
                 view = view[os.write(self._file, view) :]
             self._written += len(part)
+
+
+def _kind(channel: Channel) -> tuple[str, bool]:
+    """Messages of one topic are on channels of their own where they differ in this."""
+    return channel.type, channel.repeated
 
 
 def _zstd(raw: memoryview) -> bytes:

@@ -75,8 +75,10 @@ class Desk:
     def root(self) -> Path:
         return self.home / 'bags' / ROBOT
 
-    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, *, numbered: bool = True) -> None:
-        heard = lot(numbers, topic, size)
+    def hear(self, numbers: range, topic: str = '/talk', size: int = 0, *, numbered: bool = True, latched: int = 0,
+             publisher: str = 'p') -> None:  # fmt: skip
+        heard = lot(numbers, topic, size)._replace(latched=latched)
+        heard = heard._replace(messages=[message._replace(publisher=publisher) for message in heard.messages])
         if not numbered:
             heard = heard._replace(messages=[message._replace(publisher=None, number=None) for message in heard.messages])
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:

@@ -151,7 +151,7 @@ def test_repeats_are_in_it_once(tmp_path: Path) -> None:
 def test_what_is_latched_is_in_each_event(tmp_path: Path) -> None:
     """Though it came long before; each time it counts as received, and nothing of it is missed."""
     with buffer(tmp_path) as it:
-        it.ring.put(Lot('/tf_static', STRING, '', messages(range(40, 42))), None, it.now_s[0], 1)
+        it.ring.put(Lot('/tf_static', STRING, '', messages(range(40, 42)), 1), None, it.now_s[0])
         it.pass_s(60.0)
         for number, name in enumerate(('one', 'two'), 1):
             it.hear(range(number, number + 1))

@@ -24,7 +24,7 @@ from shadowhound_data_logger.bags.manifest import (
 )
 from shadowhound_data_logger.errors import BagDamaged
 
-ENTRY = SliceEntry('bag_0.mcap', 'thor/rosbags/bag/bag_0.mcap', 1000, 'ab' * 32, 5, 10, 20, {'/imu': 5})
+ENTRY = SliceEntry('bag_0.mcap', 'thor/rosbags/bag/bag_0.mcap', 1000, 'ab' * 32, 5, 10, 20, {'/imu': 5}, {'/imu': 1})
 WHOLE = Manifest(
     bag='patrol_20261121_120000', robot='thor', mission=MissionOf('patrol', 'm1', None), state='recovered',
     missing=(Missing('bag_0.mcap', 'the last second', None), Missing('bag_0.mcap', 'a broken chunk', 12)),
@@ -44,7 +44,8 @@ def test_the_fields_that_others_read() -> None:
     assert list(found) == ['version', 'bag', 'robot', 'mission', 'state', 'missing', 'topics', 'slices', 'event',
                            'clock']  # fmt: skip
     assert found['version'] == 1
-    assert list(found['slices'][0]) == ['file', 'key', 'bytes', 'sha256', 'messages', 't_start_ns', 't_end_ns', 'counts']
+    assert list(found['slices'][0]) == ['file', 'key', 'bytes', 'sha256', 'messages', 't_start_ns', 't_end_ns', 'counts',
+                                              'repeated']  # fmt: skip
     assert found['mission'] == {'type': 'patrol', 'mission_id': 'm1', 'run_id': None}
     assert found['missing'][0] == {
         'file': 'bag_0.mcap', 'what': 'the last second', 'messages': None, 'topic': None, 'reason': None,

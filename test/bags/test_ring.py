@@ -125,9 +125,9 @@ def test_memory_is_bounded_by_the_limit_of_bytes(size: int) -> None:
     assert grown <= 1.1
 
 
-def latched(*numbers: int, publisher: str | None = 'p', size: int = 0) -> Lot:
+def latched(*numbers: int, publisher: str | None = 'p', size: int = 0, publishers: int = 2) -> Lot:
     found = lot(range(min(numbers), max(numbers) + 1), '/tf_static', size)
-    return found._replace(messages=[each._replace(publisher=publisher) for each in found.messages])
+    return found._replace(messages=[each._replace(publisher=publisher) for each in found.messages], latched=publishers)
 
 
 def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
@@ -139,8 +139,8 @@ def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
 def test_what_is_latched_is_at_the_start_of_each_event() -> None:
     """The last message of each publisher, however long ago it left the ring, with the time of the oldest that is there."""
     ring = Ring(1 << 20, KEEP_S)
-    ring.put(latched(1, 2), None, 0.0, 2)
-    ring.put(latched(5, publisher='q'), None, 0.0, 2)
+    ring.put(latched(1, 2), None, 0.0)
+    ring.put(latched(5, publisher='q'), None, 0.0)
     ring.put(lot(range(7, 8)), None, 50.0)
     for _ in range(2):
         ring.put(lot(range(8, 9)), None, 100.0)
@@ -152,7 +152,7 @@ def test_what_is_latched_is_at_the_start_of_each_event() -> None:
         assert first.lot.messages[0].source_ns == messages(range(2, 3))[0].source_ns
         assert of_event(ring) == [('/tf_static', 'q', [5], True), ('/talk', 'p', [8], False)]
         ring.release()
-    ring.put(latched(3), None, 100.0, 2)
+    ring.put(latched(3), None, 100.0)
     ring.claim(95.0)
     assert of_event(ring) == [('/tf_static', 'p', [2], True), ('/tf_static', 'q', [5], True), ('/tf_static', 'p', [3], False)]
     ring.claim(95.0)
@@ -162,8 +162,8 @@ def test_what_is_latched_is_at_the_start_of_each_event() -> None:
 def test_without_senders_as_many_are_latched_as_there_are() -> None:
     """Where the middleware does not say who sent what (Humble), the last ones stay, as many as there are publishers."""
     ring = Ring(1 << 20, KEEP_S)
-    ring.put(latched(1, 2, 3, publisher=None), None, 0.0, 2)
-    ring.put(latched(3, publisher=None), None, 0.0, 2)
+    ring.put(latched(1, 2, 3, publisher=None), None, 0.0)
+    ring.put(latched(3, publisher=None), None, 0.0)
     ring.claim(50.0)
     assert of_event(ring) == [('/tf_static', None, [2], True), ('/tf_static', None, [3], True)]
 
@@ -171,7 +171,7 @@ def test_without_senders_as_many_are_latched_as_there_are() -> None:
 def test_an_event_without_anything_else_begins_with_what_is_latched() -> None:
     """Now; and one that is over leaves nothing for the next."""
     ring = Ring(1 << 20, KEEP_S)
-    ring.put(latched(1), None, 0.0, 1)
+    ring.put(latched(1), None, 0.0)
     for now_ns in (77, 78):
         assert ring.claim(50.0, now_ns) is None
         ring.release()
@@ -181,12 +181,12 @@ def test_an_event_without_anything_else_begins_with_what_is_latched() -> None:
 
 
 def test_what_is_latched_counts_as_bytes() -> None:
-    """At most half of the ring is for it, and what no room is left for is not kept."""
+    """At most half of the ring is for it; when that is full, the oldest messages of the same topic are dropped."""
     ring = Ring(1 << 20, KEEP_S)
     for number in range(12):
-        ring.put(latched(number, publisher=str(number), size=100_000), None, 0.0, 12)
+        ring.put(latched(number, publisher=str(number), size=100_000), None, 0.0)
         assert ring.bytes <= ring.max_bytes
     ring.put(lot(range(3)), None, 50.0)
     assert 500_000 < ring.bytes < 600_000
     ring.claim(0.0)
-    assert [numbers for topic, _, numbers, _ in of_event(ring) if topic == '/tf_static'] == [[0], [1], [2], [3], [4]]
+    assert [numbers for topic, _, numbers, _ in of_event(ring) if topic == '/tf_static'] == [[7], [8], [9], [10], [11]]

@@ -29,8 +29,9 @@ from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
 class Graph:
     """A node that knows of one publisher without QoS of note; counts how often it is asked."""
 
-    def __init__(self) -> None:
+    def __init__(self, durability: int = 2, lifespan_ns: int = 0) -> None:
         self.asked = 0
+        self._durability, self._lifespan = durability, SimpleNamespace(nanoseconds=lifespan_ns)
 
     def resolve_topic_name(self, topic: str) -> str:
         return topic
@@ -39,17 +40,18 @@ class Graph:
         assert topic == TOPIC
         self.asked += 1
         forever = SimpleNamespace(nanoseconds=0)
-        qos = SimpleNamespace(history=1, depth=5, reliability=1, durability=2, deadline=forever, lifespan=forever, liveliness=1,
-                              liveliness_lease_duration=forever, avoid_ros_namespace_conventions=False)  # fmt: skip
+        qos = SimpleNamespace(history=1, depth=5, reliability=1, durability=self._durability, deadline=forever,
+                              lifespan=self._lifespan, liveliness=1, liveliness_lease_duration=forever,
+                              avoid_ros_namespace_conventions=False)  # fmt: skip
         return [SimpleNamespace(topic_type=TYPE, qos_profile=qos), SimpleNamespace(topic_type='other', qos_profile=qos)]
 
 
 class Ear:
     """The bag's consumer behind a stream: of a sensor that keeps one message a second, or of the bag alone."""
 
-    def __init__(self, *, own: bool, max_bytes: int = 1 << 20) -> None:
+    def __init__(self, *, own: bool, max_bytes: int = 1 << 20, graph: Graph | None = None) -> None:
         self.accounts, self.queue, self.batches = Accounts(), BagQueue(max_bytes), Batches()
-        self.graph: Any = Graph()
+        self.graph: Any = graph or Graph()
         batches: Any = self.batches
         self.bags = BagConsumer(self.graph, BagSettings(), self.accounts, self.queue)
         sensor, types = SensorSettings(name='talk', rate_hz=1.0), MessageTypes()
@@ -182,6 +184,33 @@ def test_what_is_latched_is_in_each_bag() -> None:
     assert ear.heard() == [1, 2, 3]
     assert (ear.account.received, ear.account.missed) == (5, 0)
     assert ear.account.publishers['p'].published == 5
+
+
+@pytest.mark.parametrize(
+    ('durability', 'lifespan_ns', 'latched'), [(1, 0, 1), (1, (1 << 63) - 1, 1), (1, 10 * 10**9, 0), (2, 0, 0)]
+)
+def test_what_is_latched_is_marked(durability: int, lifespan_ns: int, latched: int) -> None:
+    """A publisher that is TRANSIENT_LOCAL counts, unless its messages expire, as those of ``/rosout`` do."""
+    ear = Ear(own=True, graph=Graph(durability, lifespan_ns))
+    for number in range(3):
+        ear.add(messages(number))
+        lot = ear.queue.next()
+        assert isinstance(lot, Lot)
+        assert (lot.latched, lot.paused) == (latched, False)
+    assert ear.graph.asked == (3 if latched else 1)
+
+
+def test_what_is_latched_in_a_pause_is_remembered() -> None:
+    """It is counted and dropped as anything else, and put for the slices that follow."""
+    ear = Ear(own=True, graph=Graph(durability=1), max_bytes=8)
+    ear.queue.paused = True
+    ear.add(messages(1))
+    ear.add(messages(2))
+    lot = ear.queue.next()
+    assert isinstance(lot, Lot)
+    assert ([message.number for message in lot.messages], lot.paused) == ([1], True)
+    assert ear.queue.next() is None
+    assert (ear.account.received, ear.account.dropped, ear.queue.dropped) == (2, {'paused': 2}, 0)
 
 
 @pytest.mark.parametrize(('named', 'expected'), [((), {'/imu', '/odom'}), (('/rosout',), {'/rosout'})])

@@ -9,6 +9,7 @@ from e2e.bag_reading import Bag, bags
 from e2e.processes import Processes, until
 from e2e.reading import STRING, decode, texts
 from e2e.station import Station
+from rosbags.highlevel import AnyReader
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.sim.tower import Tower
@@ -78,3 +79,37 @@ def test_what_is_latched_is_at_the_start_of_every_bag(
     for row in (*ledger['bags'].values(), *ledger['events'].values()):
         assert not row['missed']  # not known where publishers have no names
         assert (row['open'], row['received']) == (0, row['stored'])
+
+
+def test_each_slice_can_be_played_on_its_own(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
+    """Another reader finds the latched messages of both publishers in the second slice alone, before all others."""
+    parameters = {'sensors': ['talk'], 'talk.topics': ['/l_other'], 'bag.record': 'always', 'bag.regex': '^/l_'}
+    node = processes.node(seaweed.environment(), parameters)
+
+    def recorded(topic: str) -> int:
+        return int(node.ledger()['bags'].get(topic, {}).get('received', 0))
+
+    publisher = processes.publisher()
+    for name in ('left', 'right'):
+        publisher = processes.publisher()
+        publisher.create(STATIC, STRING, latched=True, depth=1)
+        publisher.matched(STATIC)
+        publisher.publish(STATIC, texts([name]))
+    until(lambda: recorded(STATIC) == 2, 'both are recorded')
+    publisher.create(TALK, STRING)
+    publisher.matched(TALK)
+    for part in range(3):
+        publisher.publish(TALK, texts(range(10 * part, 10 * part + 10)), 0.01)
+        until(lambda part=part: recorded(TALK) == 10 * part + 10, 'all that was said is recorded')
+        assert station.bag('split')[0]
+    ledger = node.stop()
+    (bag,) = bags(store, processes.robot, processes.folder / 'bags')
+    bag.check()
+    assert [each['repeated'] for each in bag.manifest['slices']] == [{}, {STATIC: 2}, {STATIC: 2}]
+    assert (ledger['bags'][STATIC]['received'], ledger['bags'][STATIC]['stored']) == (2, 2)
+    for path in bag.slices[1:]:
+        with AnyReader([path]) as reader:
+            found = [(connection.topic, decode(STRING, bytes(cdr)).data) for connection, _, cdr in reader.messages()]
+        assert sorted(found[:2]) == [(STATIC, 'left'), (STATIC, 'right')]
+        assert {topic for topic, _ in found[2:]} == {TALK}
+        assert len(found) == 12

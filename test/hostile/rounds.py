@@ -598,7 +598,7 @@ MANIFEST: Final = {
     'missing': [{'file': 'a_1.mcap', 'what': 'x', 'messages': 3, 'topic': '/a', 'reason': 'y'}],
     'topics': [{'topic': '/imu', 'type': 'a/msg/B', 'messages': 1}],
     'slices': [{'file': 'a_0.mcap', 'key': 'thor/rosbags/a/a_0.mcap', 'bytes': 7, 'sha256': 64 * '0', 'messages': 1,
-                't_start_ns': 1, 't_end_ns': 2, 'counts': {'/imu': 1}}],
+                't_start_ns': 1, 't_end_ns': 2, 'counts': {'/imu': 1}, 'repeated': {}}],
 }  # fmt: skip
 
 
