@@ -25,13 +25,14 @@ from rclpy.node import Node
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.capture.intake import until_poll
 from shadowhound_data_logger.capture.sampling import Batcher, KeepRule, rule_for
-from shadowhound_data_logger.clock import SystemClock, stamp_of
+from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import SensorSettings, Settings
 from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, DataObject, Sample, SpooledObject
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, endpoints
+from shadowhound_data_logger.stamps import StampRule
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ class LeastNode:
     def __init__(self, folder: Path) -> None:
         self.folder, self.used, self.put = folder, Counter[str](), 0
         settings = Settings.load({}, os.environ)
-        self._types, self._clock = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), SystemClock.of_this_machine()
+        self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+        self._stamps = StampRule(SystemClock.of_this_machine())
         self._store = open_store(settings.store, settings.upload)
         self._index = sqlite3.connect(folder / 'least.db', isolation_level=None)
         self._index.executescript(f'PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; {TABLE}')
@@ -94,7 +96,8 @@ class LeastNode:
 
     def _taken(self, topic: Topic) -> Iterator[Batch]:
         for message in topic.reader.drain():
-            stamp_ns = stamp_of(header_stamp_ns(message.cdr) if topic.has_header else 0, message.source_ns, self._clock)
+            header_ns = header_stamp_ns(message.cdr) if topic.has_header else 0
+            stamp_ns = self._stamps.date(header_ns, message.source_ns, message.received_ns).ns
             if topic.rule.keep(stamp_ns, message.cdr):
                 yield from topic.batcher.add(Sample(stamp_ns, message.cdr), time.monotonic())
 

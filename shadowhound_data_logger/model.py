@@ -24,7 +24,10 @@ class Sample(NamedTuple):
     """One message as it was taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
 
     stamp_ns: int
+    """By ``stamps.StampRule``."""
     cdr: bytes
+    received_ns: int = 0
+    """When it arrived, as of ``Taken``."""
 
 
 class Taken(NamedTuple):
@@ -32,6 +35,7 @@ class Taken(NamedTuple):
 
     cdr: bytes
     source_ns: int
+    """When it was sent, Unix nanoseconds; to the consumers of a stream, its arrival where that cannot be trusted."""
     publisher: str | None
     number: int | None
     received_ns: int = 0

@@ -160,7 +160,14 @@ class ShutdownSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockSettings:
-    """What becomes of objects that are taken before the clock of this machine was set."""
+    """Which times are trusted, and what becomes of objects that are taken before the clock of this machine was set."""
+
+    max_offset_s: float = _setting(
+        86_400.0,
+        'Seconds that a stamp may be before or after the arrival of its message; a message outside this is dated by its arrival.',
+        low=1.0,
+        high=1e9,
+    )
 
     hold_s: float = _setting(
         600.0,

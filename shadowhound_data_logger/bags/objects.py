@@ -131,7 +131,7 @@ def _is_dated(state: BagState) -> bool:
 
 
 def _times(state: BagState, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Log times as UTC; where nobody knows that, by the boot clock, as those of objects are (``clock.stamp_of``)."""
+    """Log times as UTC; where nobody knows that, by the boot clock, as those of objects are (``stamps.StampRule``)."""
     clock = state.clock
     if clock is None:
         return start_ns, end_ns

@@ -36,7 +36,7 @@ from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.capture.bags import BagConsumer
 from shadowhound_data_logger.capture.intake import Intake
 from shadowhound_data_logger.capture.node import StopSignals
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.durable_files import flock
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -47,6 +47,7 @@ from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoi
 from shadowhound_data_logger.ship.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stamps import StampRule
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.worker import Worker
@@ -199,7 +200,8 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     clock, accounts = SystemClock.of_this_machine(), writer.spool.accounts
     queue = BagQueue()
     bags = BagConsumer(node, settings.bag, accounts, queue)
-    intake = Intake(node, {}, accounts, MessageTypes(), [bags])
+    stamps = StampRule(clock, round(settings.clock.max_offset_s * SECOND))
+    intake = Intake(node, {}, accounts, MessageTypes(), stamps, [bags])
     place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
     recovery = BagRecovery(place, settings.bag.priority)
     recorder = Recorder(settings.bag, place, queue, recovery, partial(intake.listen, bags))

@@ -205,7 +205,7 @@ class EncodePool:
                 worker.stop()
 
     def _encode(self, batch: Batch) -> None:
-        first_ns, last_ns = batch.samples[0].stamp_ns, batch.samples[-1].stamp_ns
+        first_ns, last_ns = batch.samples[0].received_ns, batch.samples[-1].received_ns  # what is wrong may have any stamp
         try:
             encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
         except BaseException:

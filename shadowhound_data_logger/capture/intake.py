@@ -24,6 +24,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.stamps import StampRule
 from shadowhound_data_logger.worker import Worker
 
 REFRESH_S: Final = 0.5
@@ -40,7 +41,7 @@ class Intake:
     ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
     """
 
-    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes, stamps: StampRule,
                  consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
         """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
 
@@ -48,7 +49,7 @@ class Intake:
         """
         self._sensors = sensors
         self._consumers = consumers
-        around = Surroundings(node, PolledGroup(), accounts, types)
+        around = Surroundings(node, PolledGroup(), accounts, types, stamps)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
         self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)

@@ -43,7 +43,7 @@ from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.unheard import Unheard
 from shadowhound_data_logger.capture.upload_rules import KEEP_WHEN, UploadRules
 from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.clock import SystemClock, utc
+from shadowhound_data_logger.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.clock_watch import ClockWatch
 from shadowhound_data_logger.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -62,6 +62,7 @@ from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.redating import Redating
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stamps import StampRule
 from shadowhound_data_logger.stores import open_store
 
 log = logging.getLogger(__name__)
@@ -141,18 +142,19 @@ class Pipeline:
         # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
         bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
-        track = RobotTrack(settings.mission, types, self._clock, node.resolve_topic_name)
+        stamps = StampRule(self._clock, round(settings.clock.max_offset_s * SECOND))
+        track = RobotTrack(settings.mission, types, stamps, node.resolve_topic_name)
         self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)
         self.uploader.wait_for(self._rules.closed)
         self._make_request_server(track)
         keeps = self._requests is not None
         self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
-        sampler = Sampler(sensors, accounts, types, self._clock, queue)
+        sampler = Sampler(sensors, accounts, types, stamps, queue)
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
-        self.intake = Intake(node, sensors, accounts, types, consumers, first=[track.odometry])
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=[track.odometry])
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)

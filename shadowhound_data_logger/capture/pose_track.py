@@ -16,13 +16,14 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.mission_observer import number_at, yaw_of
-from shadowhound_data_logger.clock import SECOND, Clock, stamp_of
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.metadata_words import BATTERY, POSE
 from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.stamps import StampRule
 
 SPAN_NS: Final = 60 * SECOND
 """How far back is remembered: batches, queues and slow encoders ask late."""
@@ -108,10 +109,10 @@ class RobotTrack(Consumer):
     New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread.
     """
 
-    def __init__(self, settings: MissionSettings, types: MessageTypes, clock: Clock, resolve: Callable[[str], str]) -> None:
+    def __init__(self, settings: MissionSettings, types: MessageTypes, stamps: StampRule, resolve: Callable[[str], str]) -> None:
         """The topics are those of missions; ``resolve`` makes their full names."""
         self._types = types
-        self._clock = clock
+        self._stamps = stamps
         self.odometry = resolve(settings.odometry) if settings.odometry else ''
         topic, _, field = settings.battery.partition(':')
         self._battery, self._field = resolve(topic) if topic else '', field.split('.')
@@ -122,8 +123,9 @@ class RobotTrack(Consumer):
         kept = self.of(drained.topic, drained.type)
         if kept is not None:
             has_header = self._types.has_header(drained.type)
-            for cdr, source_ns, _, _, _ in drained.messages:
-                kept.add(stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, self._clock), cdr)
+            for cdr, source_ns, _, _, received_ns in drained.messages:
+                dated = self._stamps.date(header_stamp_ns(cdr) if has_header else 0, source_ns, received_ns)
+                kept.add(dated.ns, cdr)
 
     def of(self, topic: str, type_name: str) -> KeptMessages | None:
         """Where messages of a topic are kept; None where nobody needs them."""

@@ -12,13 +12,14 @@ from zlib import crc32
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
 from shadowhound_data_logger.capture.encode_pool import BatchQueue
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, stamp_of
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.model import Batch, Sample
 from shadowhound_data_logger.options import ARCHIVES
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.spool.accounts import PAUSED, Accounts, TopicAccount
+from shadowhound_data_logger.stamps import StampRule
 
 QUEUE_FULL: Final = 'queue_full'
 """Why samples are dropped that the encoders' queue has no room for."""
@@ -153,13 +154,13 @@ class Batcher:
 class Sampler(Consumer):
     """Chooses which messages of the sensors' topics are logged, and batches them. New; ``take`` what the intake drained."""
 
-    def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, clock: Clock,
+    def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, stamps: StampRule,
                  queue: BatchQueue) -> None:  # fmt: skip
         """``sensors`` are the settings in force, by name; ``queue`` gets the batches."""
         self._sensors = sensors
         self._accounts = accounts
         self._types = types
-        self._clock = clock
+        self._stamps = stamps
         self._queue = queue
         self._sampled: dict[str, _Sampled] = {}
         self._kept_ns: dict[str, int] = {}
@@ -178,7 +179,7 @@ class Sampler(Consumer):
         messages = drained.messages
         sampled = self._sampled[drained.topic]
         try:
-            kept = self._kept(sampled, drained)
+            kept = self._kept(sampled, drained, account)
         except Exception:
             account.drop(SAMPLER_FAILED, len(messages), messages[0].source_ns, messages[-1].source_ns)
             raise
@@ -191,15 +192,17 @@ class Sampler(Consumer):
         else:
             account.skipped += len(messages) - len(kept)
 
-    def _kept(self, sampled: _Sampled, drained: Drained) -> list[Sample]:
+    def _kept(self, sampled: _Sampled, drained: Drained, account: TopicAccount) -> list[Sample]:
         sampled.follow(self._sensors[drained.sensor])
         kept: list[Sample] = []
         if not (drained.paused or self.idle):
-            keep, has_header, clock = sampled.rule.keep, sampled.has_header, self._clock
-            for cdr, source_ns, _, _, _ in drained.messages:
-                stamp_ns = stamp_of(header_stamp_ns(cdr) if has_header else 0, source_ns, clock)
+            keep, has_header, date = sampled.rule.keep, sampled.has_header, self._stamps.date
+            for cdr, source_ns, _, _, received_ns in drained.messages:
+                stamp_ns, refused = date(header_stamp_ns(cdr) if has_header else 0, source_ns, received_ns)
+                if refused:
+                    account.by_arrival[refused] += 1
                 if keep(stamp_ns, cdr):
-                    kept.append(Sample(stamp_ns, cdr))
+                    kept.append(Sample(stamp_ns, cdr, received_ns))
         return kept
 
     def take(self, drained: Drained) -> None:

@@ -21,6 +21,7 @@ from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import EXACT
+from shadowhound_data_logger.stamps import Dated, StampRule
 
 log = logging.getLogger(__name__)
 
@@ -121,11 +122,12 @@ class Arrivals:
 class TopicStream:
     """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
 
-    def __init__(self, topic: str, type_name: str, consumers: Sequence[Consumer]) -> None:
+    def __init__(self, topic: str, type_name: str, stamps: StampRule, consumers: Sequence[Consumer]) -> None:
         """The first of ``consumers`` gets all of it, the others as far as the topic is one of theirs."""
         self._topic = topic
         self._type = type_name
         self._owner, self._others = consumers[0], consumers[1:]
+        self._stamps = stamps
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._estimate = TopicEstimate()
@@ -135,11 +137,11 @@ class TopicStream:
         fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
         for message in taken:
-            _, source_ns, gid, number, _ = message
+            _, source_ns, gid, number, received_ns = message
             publisher = gid or senders.name(number, source_ns)
             if (gid is None or number is None) and self._recent.has(message):
                 continue
-            fresh.append(message if publisher is gid else message._replace(publisher=publisher))
+            fresh.append(_known(message, publisher, self._stamps.date(0, source_ns, received_ns)))
             if publisher is None or number is None:
                 sent.setdefault(gid or '', []).append(source_ns)
         lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
@@ -163,7 +165,8 @@ class SensorStream:
     """A topic of a sensor: each message is counted once, in the topic's account. New for each topic and type."""
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str, accounts: Accounts, types: MessageTypes,
-                 consumers: Sequence[Consumer]) -> None:  # fmt: skip
+                 stamps: StampRule, consumers: Sequence[Consumer]) -> None:  # fmt: skip
+        self._stamps = stamps
         self._sensor = sensor.name
         self._topic = topic
         self._type = type_name
@@ -195,17 +198,21 @@ class SensorStream:
         """Count messages, in the order in which they came, and hand on those that are not repeats."""
         fresh: list[Taken] = []
         sent: dict[str, list[int]] = {}
-        counter = self._counter
+        counter, date = self._counter, self._stamps.date
         failed: dict[Consumer, Exception] = {}
         with self._entry as account:
             for message in taken:
-                cdr, source_ns, gid, number, _ = message
+                cdr, source_ns, gid, number, received_ns = message
                 publisher = gid or senders.name(number, source_ns)
                 if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
                     continue
-                if not account.receive(publisher, number, source_ns):
+                dated = date(0, source_ns, received_ns)
+                known = _known(message, publisher, dated)
+                if not account.receive(publisher, number, known.source_ns):
                     continue
-                fresh.append(message if publisher is gid else message._replace(publisher=publisher))
+                if dated.refused:
+                    account.by_arrival[dated.refused] += 1
+                fresh.append(known)
                 if publisher is None or number is None:
                     sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
             newest_ns = fresh[-1].source_ns if fresh else 0
@@ -238,3 +245,10 @@ class SensorStream:
         for consumer in self._consumers:
             if consumer.wanted_topics is None or self._topic in consumer.topics:
                 consumer.leave(self._topic)
+
+
+def _known(message: Taken, publisher: str | None, sent: Dated) -> Taken:
+    """The message with its sender, and with its arrival for a time of sending that is not trusted."""
+    if sent.refused:
+        return message._replace(publisher=publisher, source_ns=sent.ns)
+    return message if publisher is message.publisher else message._replace(publisher=publisher)

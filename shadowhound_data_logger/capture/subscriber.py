@@ -25,6 +25,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
+from shadowhound_data_logger.stamps import StampRule
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +111,7 @@ class OtherTypes:
     def _count(self, topic: str, reader: Reader) -> None:
         refused = reader.drain()
         if refused:
-            self._accounts.refuse(topic, reader.plan.type, len(refused), refused[0].source_ns, refused[-1].source_ns)
+            self._accounts.refuse(topic, reader.plan.type, len(refused), refused[0].received_ns, refused[-1].received_ns)
 
     def _make(self, topic: str, type_name: str) -> Reader | None:
         """None where that cannot be done; whether it can be done at all is tried once."""
@@ -141,6 +142,7 @@ class Surroundings(NamedTuple):
     group: PolledGroup
     accounts: Accounts
     types: MessageTypes
+    stamps: StampRule
 
 
 class Subscriber:
@@ -155,7 +157,7 @@ class Subscriber:
         """
         self.sensor = sensor
         self._others = others
-        self._node, self._group, self._accounts, self._message_types = around
+        self._node, self._group, self._accounts, self._message_types, self._stamps = around
         self._consumers = consumers
         node = self._node
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
@@ -335,10 +337,10 @@ class Subscriber:
         """Begin with a topic that is new, or of another type than before."""
         self._leave(now_s)
         if self._others is None:
-            self._stream = TopicStream(self._chosen, type_name, self._consumers)
+            self._stream = TopicStream(self._chosen, type_name, self._stamps, self._consumers)
         else:
             self._stream = SensorStream(
-                self.sensor, self._chosen, type_name, self._accounts, self._message_types, self._consumers
+                self.sensor, self._chosen, type_name, self._accounts, self._message_types, self._stamps, self._consumers
             )
         self._type = type_name
         self._history = HistoryDepth(type_name)

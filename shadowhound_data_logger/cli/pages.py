@@ -186,7 +186,11 @@ SECTIONS: Final = (
         'Only where messages carry no numbers: without Fast DDS ([formats](formats.md)).',
         ('SENSOR.expected_hz', 'SENSOR.counter'),
     ),
-    Section('Wait for the clock', 'For a robot that starts before its clock is set.', ('clock.hold_s',)),
+    Section(
+        'Clocks',
+        'Which stamps are trusted ([formats.md](formats.md#which-stamps-are-trusted)), and what happens before the clock is set.',
+        ('clock.max_offset_s', 'clock.hold_s'),
+    ),
     Section('Fit the machine and its network', '', ('capture.rmw', 'queue.max_bytes')),
 )
 OWN: Final = """

@@ -136,6 +136,8 @@ def _status_remedy(text: str) -> str:
     remedies = {
         'missed': 'shadowhound-data ledger  # by restart: no node ran; by transport: doctor --only sockets --only ros',
         'dropped': 'top -H -p $(pgrep -f sensor_logger_node)  # the encoders cannot keep up: set a lower rate_hz',
+        'dated by arrival': 'date -u ; ros2 topic echo --once --field header.stamp TOPIC  # a wrong clock, sim time, a replayed '
+        'bag, or a forgery: docs/formats.md, Which stamps are trusted',
         'the node is paused': 'ros2 service call /sensor_logger_node/pause std_srvs/srv/SetBool "{data: false}"',
         'bucket': 'shadowhound-data doctor --only s3',
         'the clock': 'timedatectl  # docs/thor.md, Wrong clock',

@@ -61,6 +61,8 @@ class TopicRow:
     """Stamp of the newest message; 0 where it is not known."""
     complete_ns: int = 0
     """No message up to this stamp can still be lost on its way into the spool."""
+    by_arrival: Mapping[str, int] = field(default_factory=dict)
+    """Messages that were dated by their arrival, by the reason why their own time was not trusted."""
 
     @property
     def open(self) -> int:
@@ -95,6 +97,8 @@ class Totals:
     """By cause, those that are estimated among them."""
     gaps: int = 0
     """How often messages were lost in a row, for whatever cause."""
+    by_arrival: Mapping[str, int] = field(default_factory=dict)
+    """As of ``TopicRow``."""
 
 
 @dataclass(frozen=True, slots=True)

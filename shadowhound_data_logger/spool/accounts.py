@@ -80,6 +80,8 @@ class TopicAccount:
     stored: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    by_arrival: Counter[str] = field(default_factory=Counter)
+    """Messages whose stamp or time of sending was replaced by their arrival, by reason (``stamps``)."""
     publishers: dict[str, Span] = field(default_factory=dict)
     estimated: int = 0
     """Of ``received``, those without numbers that a rhythm counts."""
@@ -603,7 +605,7 @@ class Accounts:
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
             account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, heard_ns,
-            account.complete_ns,
+            account.complete_ns, dict(account.by_arrival),
         )  # fmt: skip
 
 
@@ -618,5 +620,5 @@ def _totals(account: TopicAccount) -> Totals:
         account.dropped.total() - paused, paused, account.missed, account.about_missed, account.open,
         account.rejected[WRONG_TYPE],
         {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
-        dict(missed_by), account.gaps.count,
+        dict(missed_by), account.gaps.count, dict(account.by_arrival),
     )  # fmt: skip

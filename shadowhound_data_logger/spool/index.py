@@ -808,6 +808,10 @@ class Index:
             'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
             ((session, row.topic, row.type, json.dumps(row.publishers), row.messages) for row in snapshot.other_types),
         )  # fmt: skip
+        self._db.executemany(
+            'INSERT OR REPLACE INTO by_arrival VALUES (?,?,?,?)',
+            ((session, row.topic, reason, count) for row in snapshot.topics for reason, count in row.by_arrival.items()),
+        )
         self.gaps.write(session, snapshot.gaps, snapshot.taken_back)
 
     def sessions(self, *, ended: bool) -> list[int]:
@@ -844,6 +848,14 @@ class Index:
         """Of all sessions, in their order."""
         rows = self._db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
+
+    def by_arrival(self) -> dict[str, dict[str, int]]:
+        """Topic -> reason -> messages that were dated by their arrival, over all sessions."""
+        found: dict[str, dict[str, int]] = {}
+        rows = self._db.execute('SELECT topic, reason, sum(messages) FROM by_arrival GROUP BY topic, reason')
+        for topic, reason, count in rows:
+            found.setdefault(topic, {})[reason] = count
+        return found
 
     def rhythms(self) -> list[RhythmRow]:
         """What is known of topics without numbers, one row each."""

@@ -67,11 +67,12 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
     with index.snapshot():
         topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
-        journal = index.gaps.sums()
+        journal, by_arrival = index.gaps.sums(), index.by_arrival()
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     for topic, row in accounts.items():
         row['gaps'] = _journaled(topic, journal)
+        row['by_arrival'] = by_arrival.get(topic, {})
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip

@@ -1,6 +1,6 @@
 """Dates objects whose time was taken while the clock of this machine was not set.
 
-A time before 2024 is that of the boot clock (``clock.stamp_of`` sees to that). An object that begins at such a time is held
+A time before 2024 is that of the boot clock (``stamps.StampRule`` sees to that). An object that begins at such a time is held
 under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``, with all that its final name is made of in its metadata,
 where it survives a restart and a lost index. Once the clock is set the offset between the clocks is known, and key, times and
 metadata are those of UTC; content stays as it is. Which offset that is, and how long an object waits for it, is decided in

@@ -32,7 +32,7 @@ _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
-    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0,
+    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {},
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
@@ -190,11 +190,19 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
         if lost:
             yield f'{what} in this session: {_most(lost)}'
     yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
+    yield from _by_arrival(found['topics'])
     yield from _other_types(found)
     yield from _left_out(found)
     yield from _given_up(found['spool'] or {})
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def _by_arrival(topics: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each reason: a clock that is wrong, old data that is replayed, or a stranger in the network."""
+    for reason in sorted({reason for row in topics.values() for reason in row['by_arrival']}):
+        found = {topic: row['by_arrival'][reason] for topic, row in topics.items() if row['by_arrival'].get(reason)}
+        yield f'dated by arrival in this session, because of {reason}: {_most(found)}'
 
 
 def _given_up(spool: Mapping[str, Any]) -> Iterator[str]:

@@ -24,6 +24,9 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.options import BagSettings
 from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
+from shadowhound_data_logger.stamps import StampRule
+
+STAMPS = StampRule(SystemClock.of_this_machine())
 
 
 class Graph:
@@ -55,12 +58,12 @@ class Ear:
         batches: Any = self.batches
         self.bags = BagConsumer(self.graph, BagSettings(), self.accounts, self.queue)
         sensor, types = SensorSettings(name='talk', rate_hz=1.0), MessageTypes()
-        self.sampler = Sampler({'talk': sensor}, self.accounts, types, SystemClock.of_this_machine(), batches)
+        self.sampler = Sampler({'talk': sensor}, self.accounts, types, STAMPS, batches)
         self.stream: TopicStream | SensorStream
         if own:
-            self.stream = TopicStream(TOPIC, TYPE, [self.bags])
+            self.stream = TopicStream(TOPIC, TYPE, STAMPS, [self.bags])
         else:
-            self.stream = SensorStream(sensor, TOPIC, TYPE, self.accounts, types, [self.sampler, self.bags])
+            self.stream = SensorStream(sensor, TOPIC, TYPE, self.accounts, types, STAMPS, [self.sampler, self.bags])
         self.begin()
 
     def begin(self) -> None:
@@ -85,7 +88,7 @@ class Ear:
     def record_again(self) -> None:
         """The recording ends and another one begins, with a subscription of its own."""
         self.begin()
-        self.stream = TopicStream(TOPIC, TYPE, [self.bags])
+        self.stream = TopicStream(TOPIC, TYPE, STAMPS, [self.bags])
 
     @property
     def account(self) -> TopicAccount:
@@ -218,7 +221,7 @@ def test_what_only_the_ring_takes_is_in_a_bag_where_it_is_named_alone(named: tup
     """Without settings a bag has what the sensors take, whatever events keep; what is named needs no subscription more."""
     bags: Any = SimpleNamespace(topics=frozenset(), wants_latched=True, wanted_topics=TopicChoice(BagSettings(), named))
     nothing: Any = None
-    extra = ExtraTopics(Surroundings(nothing, nothing, nothing, nothing), [bags], {})
+    extra = ExtraTopics(Surroundings(nothing, nothing, nothing, nothing, STAMPS), [bags], {})
     sensors = dict.fromkeys(('/imu', '/odom'), False)
     extra.refresh(sensors | {'/rosout': False}, sensors, 0.0, paused=False)
     assert bags.topics == expected
@@ -246,14 +249,14 @@ def test_each_consumer_gets_its_own_topics() -> None:
     sensors_only, chose, chose_not = Listener(None), Listener(choice, TOPIC), Listener(choice, '/other')
     everyone = [chose, sensors_only, chose_not]
     sensor = SensorSettings(name='talk')
-    of_sensor = SensorStream(sensor, TOPIC, TYPE, Accounts(), MessageTypes(), everyone)
+    of_sensor = SensorStream(sensor, TOPIC, TYPE, Accounts(), MessageTypes(), STAMPS, everyone)
     of_sensor.add(messages(1, 2, 2, 3), Senders(), 0.0, paused=False)
     of_sensor.add(messages(3), Senders(), 0.0, paused=False)
     of_sensor.close()
     for each in (sensors_only, chose):
         assert each.given == [(TOPIC, 'talk', [1, 2, 3]), (TOPIC, 'left', [])]
         each.given.clear()
-    unsampled = TopicStream(TOPIC, TYPE, [chose_not, chose, sensors_only])
+    unsampled = TopicStream(TOPIC, TYPE, STAMPS, [chose_not, chose, sensors_only])
     unsampled.add(messages(1), Senders(), 0.0, paused=False)
     unsampled.close()
     assert chose_not.given == chose.given == [(TOPIC, '', [1]), (TOPIC, 'left', [])]

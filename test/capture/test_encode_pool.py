@@ -18,6 +18,7 @@ from shadowhound_data_logger.model import Batch, DataObject, Sample
 
 TEXT = b'\x00\x01\x00\x00\x03\x00\x00\x00hi\x00'
 STAMP_NS = 1_760_788_800 * 10**9
+ARRIVAL_NS = STAMP_NS + 10**9
 
 
 class Outcome:
@@ -44,7 +45,7 @@ class Outcome:
 
     def reject(self, topic: str, reasons: Mapping[str, int], from_ns: int, to_ns: int) -> None:
         assert topic == '/talk'
-        assert 0 < from_ns <= to_ns
+        assert (from_ns, to_ns) == (ARRIVAL_NS, ARRIVAL_NS)
         with self.lock:
             self.rejected.update(reasons)
 
@@ -54,7 +55,9 @@ class Outcome:
 
 
 def talk(*cdrs: bytes, sensor: str = 'talk') -> Batch:
-    return Batch(sensor, '/talk', 'std_msgs/msg/String', tuple(Sample(STAMP_NS, cdr) for cdr in cdrs), sum(map(len, cdrs)))
+    return Batch(
+        sensor, '/talk', 'std_msgs/msg/String', tuple(Sample(STAMP_NS, cdr, ARRIVAL_NS) for cdr in cdrs), sum(map(len, cdrs))
+    )
 
 
 def test_good_and_bad_samples_are_told_apart() -> None:

@@ -21,10 +21,12 @@ from shadowhound_data_logger.capture import extra_topics as module
 from shadowhound_data_logger.capture.consumers import TopicChoice
 from shadowhound_data_logger.capture.extra_topics import ExtraTopics
 from shadowhound_data_logger.capture.subscriber import Surroundings
+from shadowhound_data_logger.clock import SystemClock
 from shadowhound_data_logger.config import BagSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.stamps import StampRule
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0
@@ -58,7 +60,9 @@ class Recording:
         self.bags: Any = SimpleNamespace(topics=frozenset(), wanted_topics=choice, wants_latched=True, take=lambda _: None,
                                          leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
-        self.extra = ExtraTopics(Surroundings(node, self.group, Accounts(), MessageTypes()), [self.bags], {})
+        stamps = StampRule(SystemClock.of_this_machine())
+        around = Surroundings(node, self.group, Accounts(), MessageTypes(), stamps)
+        self.extra = ExtraTopics(around, [self.bags], {})
         self.now_s = time.monotonic()
 
     def look(self, seconds: float = 0.0) -> set[str]:

@@ -31,6 +31,7 @@ from shadowhound_data_logger.ros.endpoints import Endpoint
 from shadowhound_data_logger.ros.reader import FAST_DDS, PolledGroup
 from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
+from shadowhound_data_logger.stamps import StampRule
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0
@@ -59,8 +60,9 @@ class Listening(Participant):
         types = (type_name, fallback[1]) if fallback[0] else (type_name,) if type_name else ()
         sensor = SensorSettings(name='sensor', topics=topics, types=types, rate_hz=0.0, batch_s=3600.0)
         types_here = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        around = Surroundings(self.node, PolledGroup(), self.accounts, types_here)
-        self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, SystemClock.of_this_machine(), self.batches)
+        stamps = StampRule(SystemClock.of_this_machine())
+        around = Surroundings(self.node, PolledGroup(), self.accounts, types_here, stamps)
+        self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, stamps, self.batches)
         self.source = Subscriber(around, sensor, [self.sampler], self.others)
 
     def turn(self) -> None:

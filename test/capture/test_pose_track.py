@@ -20,6 +20,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import DataObject, Taken
 from shadowhound_data_logger.sim.floor_plan import FloorPlan
 from shadowhound_data_logger.sim.patrol import Patrol
+from shadowhound_data_logger.stamps import StampRule
 
 STORE = get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
@@ -44,7 +45,7 @@ def charge(percent: float) -> bytes:
 
 
 def robot(settings: MissionSettings = SETTINGS) -> RobotTrack:
-    return RobotTrack(settings, TYPES, SystemClock.of_this_machine(), lambda topic: f'/{topic}')
+    return RobotTrack(settings, TYPES, StampRule(SystemClock.of_this_machine()), lambda topic: f'/{topic}')
 
 
 def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
@@ -56,7 +57,7 @@ def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
 
 def take(found: RobotTrack, topic: str, type_name: str, *sent: tuple[float, bytes]) -> None:
     """Messages as the intake hands them over."""
-    messages = [Taken(cdr, ns(t), 'p', None) for t, cdr in sent]
+    messages = [Taken(cdr, ns(t), 'p', None, ns(t)) for t, cdr in sent]
     found.take(Drained(topic, type_name, topic[1:], messages, None, 0.0, paused=False))
 
 

@@ -31,6 +31,7 @@ from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.reader import FAST_DDS
 from shadowhound_data_logger.ros.shared_memory import FOLDER
 from shadowhound_data_logger.spool.accounts import EXACT, Accounts
+from shadowhound_data_logger.stamps import StampRule
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0
@@ -71,9 +72,10 @@ class Listening:
             sensors[name] = SensorSettings(name=name, topics=(f'/{name}',), types=types, rate_hz=0.0, batch_s=3600.0)
         self._accounts, self._batches = Accounts(), Batches()
         installed, queue = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), self._batches
-        sampler = Sampler(sensors, self._accounts, installed, SystemClock.of_this_machine(), queue)  # type: ignore[arg-type]
+        stamps = StampRule(SystemClock.of_this_machine())
+        sampler = Sampler(sensors, self._accounts, installed, stamps, queue)  # type: ignore[arg-type]
         self.logger = self.join('logger')
-        self._intake = Intake(self.logger.node, sensors, self._accounts, installed, [sampler])
+        self._intake = Intake(self.logger.node, sensors, self._accounts, installed, stamps, [sampler])
         self._intake.open()
         stack.callback(self._intake.close, WAIT_S)
         self.late = self.join('late')

@@ -18,6 +18,7 @@ from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, Taken
 from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
+from shadowhound_data_logger.stamps import DAY_NS, StampRule
 
 TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
 NOON_NS = 1_760_788_800 * SECOND
@@ -43,19 +44,19 @@ class Talk:
         self.numbers = count(1)
         if last_kept_ns:
             self.accounts.store({TOPIC: (0, last_kept_ns)})
-        self.sensors, types, clock = {'talk': self.sensor}, MessageTypes(), SystemClock.of_this_machine()
+        self.sensors, types, self.stamps = {'talk': self.sensor}, MessageTypes(), StampRule(SystemClock.of_this_machine())
         queue: Any = self.batches
-        self.sampler = Sampler(self.sensors, self.accounts, types, clock, queue)
+        self.sampler = Sampler(self.sensors, self.accounts, types, self.stamps, queue)
         self.listen(self.sampler)
 
     def listen(self, *consumers: Consumer) -> None:
         """Begin a stream."""
-        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, MessageTypes(), consumers)
+        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, MessageTypes(), self.stamps, consumers)
 
     def messages(self, how_many: int, **fields: object) -> list[Taken]:
         """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
         taken = [next(self.numbers) for _ in range(how_many)]
-        made = [Taken(b'%d' % number, NOON_NS + number * SECOND // 10, 'p', number) for number in taken]
+        made = [Taken(b'%d' % number, sent_ns := NOON_NS + number * SECOND // 10, 'p', number, sent_ns) for number in taken]
         return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
 
     def add(self, taken: list[Taken], now_s: float = 0.0, *, paused: bool = False, idle: bool = False) -> None:
@@ -328,7 +329,7 @@ def test_what_a_sampler_fails_to_choose_is_dropped_at_once(monkeypatch: pytest.M
     talk.listen(talk.sampler, last)
     talk.add(talk.messages(2))
     with monkeypatch.context() as patched:
-        patched.setattr(sampling, 'stamp_of', lambda *_: 1 // 0)
+        patched.setattr(sampling, 'Sample', lambda *_: 1 // 0)
         talk.add(talk.messages(3))
     talk.add(talk.messages(1))
     assert talk.kept() == [1, 2, 6]
@@ -340,7 +341,7 @@ def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
     """As above, where the consumers themselves asked for it."""
     broken, other = Broken('take'), Drains()
     other.topics = frozenset({TOPIC})
-    TopicStream(TOPIC, TYPE, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
+    TopicStream(TOPIC, TYPE, Talk().stamps, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
     assert (other.sizes, broken.failures) == ([4], 1)
 
 
@@ -372,3 +373,23 @@ def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
     talk.sampler.flush()
     finish()
     assert complete() == 12
+
+
+@pytest.mark.parametrize(('sent_ns', 'dated_ns', 'why'), [
+    (NOON_NS - 2 * DAY_NS, NOON_NS, {'sent_too_old': 1}), (NOON_NS + 2 * DAY_NS, NOON_NS, {'sent_ahead': 1}),
+    (60 * SECOND, NOON_NS, {'sent_before_2024': 1}), (NOON_NS - DAY_NS // 2, NOON_NS - DAY_NS // 2, {}),
+])  # fmt: skip
+def test_nobody_in_the_network_dates_a_loss(sent_ns: int, dated_ns: int, why: dict[str, int]) -> None:
+    """A gap before a message with a forged time of sending is dated by its arrival, and the message is counted by reason."""
+    talk = Talk()
+    talk.add([Taken(b'1', NOON_NS - SECOND, 'p', 1, NOON_NS - SECOND), Taken(b'5', sent_ns, 'p', 5, NOON_NS)])
+    snapshot = talk.accounts.snapshot({})
+    assert snapshot is not None
+    (gap,) = snapshot.gaps
+    assert (gap.from_ns, gap.to_ns, gap.messages) == (*sorted((NOON_NS - SECOND, dated_ns)), 3)
+    assert snapshot.topics[0].by_arrival == talk.account.by_arrival == why
+    assert talk.accounts.totals()[TOPIC].by_arrival == why
+    talk.sampler.flush()
+    assert [(sample.stamp_ns, sample.received_ns) for batch in talk.batches for sample in batch.samples] == [
+        (NOON_NS - SECOND, NOON_NS - SECOND), (dated_ns, NOON_NS),
+    ]  # fmt: skip

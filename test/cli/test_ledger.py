@@ -141,6 +141,12 @@ def test_other_types_of_a_topic_are_told() -> None:
     assert 'published as b/msg/B too, by a program that is not a ROS node; it was not listened to' in text
 
 
+def test_messages_that_were_dated_by_their_arrival_are_told() -> None:
+    """How many of which topic, by the reason why their own time was not trusted."""
+    text = shown(a_ledger(odom=a_topic(by_arrival={'sent_ahead': 3, 'stamp_too_old': 1200})), 200)
+    assert '/odom: dated by arrival, not by the message: stamp_too_old 1,200, sent_ahead 3' in text
+
+
 def test_what_is_not_delivered_is_said() -> None:
     """Stored messages whose objects are elsewhere than in the store are named with where they are."""
     text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))

@@ -155,6 +155,7 @@ def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
 
 
 MANY = {'/a': {'missed': 1}, '/b': {'missed': 4_000}, '/c': {'missed': 1}, '/d': {'missed': 2}, '/e': {'missed': 0}}
+FORGED = {'/odom': {'by_arrival': {'stamp_too_old': 3, 'sent_ahead': 2}}, '/imu': {'by_arrival': {'stamp_too_old': 4}}}
 CAUSES = {'/odom': {'missed': 5, 'missed_by': {'restart': 3, 'transport': 2}}}
 TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected': 1, 'missed': 0}}
 
@@ -167,6 +168,8 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'topics': CAUSES}, 'missed in this session by restart: /odom 3'),
         ({'topics': CAUSES}, 'missed in this session by transport: /odom 2'),
         ({'topics': TOPICS}, 'rejected in this session: /camera 1'),
+        ({'topics': FORGED}, 'dated by arrival in this session, because of sent_ahead: /odom 2'),
+        ({'topics': FORGED}, 'dated by arrival in this session, because of stamp_too_old: /imu 4, /odom 3'),
         ({'topics': MANY}, 'missed in this session: /b 4,000, /d 2, /a 1 and 1 more'),
         ({'store': {'quarantined': 4}}, 'quarantined in this session: 4 objects'),
         (
