@@ -39,8 +39,10 @@ LASTS_S: Final = 12 * 3600
 """A sign-in."""
 MOST_FAILURES: Final = 5
 FAILURES_S: Final = 60.0
-"""So many wrong tokens of one address within this time, and it has to wait; of all addresses together, ten times as many."""
+"""After this many wrong tokens within this time an address must wait. There is no limit for all addresses together: it would
+let any host in the network lock out the operator, and nobody guesses one of our tokens, which have 192 random bits."""
 MOST_ADDRESSES: Final = 1000
+"""Addresses whose wrong tokens are remembered; beyond it the one that failed least recently is forgotten."""
 LEAST_TOKEN: Final = 16
 """Letters of a token that somebody wrote into the file."""
 MOST_ENDED: Final = 1000
@@ -225,10 +227,12 @@ class Access:
     ``is_open``: whoever reaches the page may watch, which holds for a page that listens on the loopback alone.
     """
 
-    def __init__(self, tokens: dict[str, Path], *, is_open: bool, now: Callable[[], float] = time.time) -> None:
+    def __init__(self, tokens: dict[str, Path], *, is_open: bool, now: Callable[[], float] = time.time,
+                 monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
         self._paths = tokens
         self._is_open = is_open
         self._now = now
+        self._monotonic = monotonic
         self._failures: dict[str, deque[float]] = {}
         self._refused: dict[str, str] = {}
         # One each: a viewer who signs out again and again ends no operator's sign-in.
@@ -251,20 +255,18 @@ class Access:
                     self.sign_out(over)
                     expires = self._ended[role].expiry()  # where the list is full, it is later than what that has ended
                 text = f'{role}.{expires}.{nonce}'
-                self._failures.pop(address, None)
+                self._failures.pop(network_of(address), None)
                 return self._of(role, nonce, expires), f'{text}.{self._sign(role, text)}'
         self._fail(address)
         return None
 
     def wait_s(self, address: str) -> float:
         """How long this address must wait before it may try another token; 0 where it need not."""
-        now = self._now()
-        for known, most in ((self._failures.get(address), MOST_FAILURES), (self._failures.get(''), 10 * MOST_FAILURES)):
-            while known and known[0] < now - FAILURES_S:
-                known.popleft()
-            if known and len(known) >= most:
-                return max(1.0, known[0] + FAILURES_S - now)
-        return 0.0
+        known = self._failures.get(network_of(address))
+        if known is None or len(known) < MOST_FAILURES:
+            return 0.0
+        left_s = known[0] + FAILURES_S - self._monotonic()
+        return max(1.0, left_s) if left_s > 0 else 0.0
 
     def who(self, cookie: str | None) -> SignIn | None:
         """Who has this cookie; None where nobody may watch who has none."""
@@ -333,10 +335,12 @@ class Access:
         return token
 
     def _fail(self, address: str) -> None:
+        network = network_of(address)
+        known = self._failures.pop(network, None) or deque(maxlen=MOST_FAILURES)
+        known.append(self._monotonic())
+        self._failures[network] = known  # the last one now
         if len(self._failures) > MOST_ADDRESSES:
-            self._failures = {'': self._failures.get('', deque())}
-        for known in (address, ''):
-            self._failures.setdefault(known, deque(maxlen=10 * MOST_FAILURES)).append(self._now())
+            del self._failures[next(iter(self._failures))]
 
 
 class OwnNames:
@@ -378,6 +382,15 @@ def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     """Without zone, and without the form that IPv4 has on a socket of IPv6. Raises ValueError."""
     found = ipaddress.ip_address(text.partition('%')[0])
     return getattr(found, 'ipv4_mapped', None) or found
+
+
+def network_of(address: str) -> str:
+    """The address, or of IPv6 its /64: a host there may have any address of it."""
+    try:
+        found = _address(address)
+    except ValueError:
+        return address
+    return str(found) if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))
 
 
 def is_loopback(address: str) -> bool:

@@ -168,8 +168,8 @@ class TopicGaps:
             grade: str = EXACT) -> GapKey:  # fmt: skip
         """Messages were lost between these stamps, 0 where they are not known. Returns the row's key.
 
-        Stamps of a wall clock that was never set become those of the boot clock, as in ``stamps.StampRule``. What is not a time, or
-        more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts.
+        Stamps of a wall clock that was never set become those of the boot clock, as in ``stamps.StampRule``. What is not a time,
+        or more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts.
         """
         from_ns, to_ns = self._time(from_ns), self._time(to_ns)
         if (from_ns < EARLIEST_SANE_NS) != (to_ns < EARLIEST_SANE_NS):

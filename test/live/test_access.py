@@ -261,6 +261,64 @@ def test_wrong_tokens_have_to_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     asyncio.run(run())
 
 
+class Door:
+    """Tokens, and a clock of ours: who tries which token when."""
+
+    def __init__(self, folder: Path) -> None:
+        self.paths = access_module.make_tokens(folder)
+        self.now_s = 1000.0
+        self.access = access_module.Access(self.paths, is_open=False, monotonic=lambda: self.now_s)
+
+    def guess(self, address: str) -> bool:
+        """Whether the address may try at all; its token is wrong."""
+        if self.access.wait_s(address):
+            return False
+        assert self.access.sign_in('a wrong token', address) is None
+        return True
+
+    def lets_in(self, address: str) -> bool:
+        token = access_module.token_of(self.paths[access_module.OPERATOR])
+        return not self.access.wait_s(address) and self.access.sign_in(token, address) is not None
+
+
+def test_strangers_lock_out_nobody_but_themselves(tmp_path: Path) -> None:
+    """Wrong tokens of many addresses, one a second and for an hour, do not keep the operator from signing in."""
+    door = Door(tmp_path)
+    for second in range(3600):
+        door.now_s += 1.0
+        door.guess(f'10.0.0.{second % 50}')
+        assert door.lets_in('10.0.1.1'), second
+
+
+def test_an_address_that_guesses_waits_a_minute_from_its_first_guess(tmp_path: Path) -> None:
+    """It may try as often as is allowed in any minute; the wait is said, and a right token after it clears the record."""
+    door = Door(tmp_path)
+    assert [door.guess('10.0.0.1') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert door.access.wait_s('10.0.0.1') == access_module.FAILURES_S
+    door.now_s += access_module.FAILURES_S
+    assert door.lets_in('10.0.0.1')
+    assert [door.guess('10.0.0.1') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+
+
+def test_a_host_with_many_addresses_of_ipv6_is_one(tmp_path: Path) -> None:
+    """All addresses of a /64 wait together, an IPv4 address is the same within IPv6, and other networks do not wait."""
+    door = Door(tmp_path)
+    assert [door.guess(f'fd00::{n:x}') for n in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert door.lets_in('fd00:0:0:1::1')
+    assert [door.guess('::ffff:10.0.0.1') for _ in range(MOST_FAILURES)] == [True] * MOST_FAILURES
+    assert not door.guess('10.0.0.1')
+
+
+def test_what_is_remembered_of_wrong_tokens_is_bounded(tmp_path: Path) -> None:
+    """However many addresses guess, a bounded number of them is remembered, and those that guess now are among them."""
+    door = Door(tmp_path)
+    for number in range(3 * access_module.MOST_ADDRESSES):
+        door.guess(f'10.{number >> 16 & 255}.{number >> 8 & 255}.{number & 255}')
+    failures = door.access._failures
+    assert (len(failures), max(map(len, failures.values()))) == (access_module.MOST_ADDRESSES, 1)
+    assert [door.guess('10.9.9.9') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+
+
 def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The cookie is worth nothing then, wherever it was copied to."""
 

@@ -62,8 +62,8 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'published_estimated': None, 'missed_estimated': None, 'by_grade': {
                     'received-only': {'published': None, 'published_estimated': None, 'received': 5, 'missed': None,
                                       'missed_estimated': None, 'missed_by': {}}},
-                'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'by_arrival': {}, 'stored': 0, 'open': 5,
-                'stored_in': {
+                'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'by_arrival': {},
+                'stored': 0, 'open': 5, 'stored_in': {
                     'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0, 'kept': 0,
                 },
             },
