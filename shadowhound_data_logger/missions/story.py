@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.clock import SECOND, iso, utc
 from shadowhound_data_logger.missions.folder import MissionSent, Run, run_name, stamped
-from shadowhound_data_logger.missions.values import MAX_PARAM
+from shadowhound_data_logger.missions.values import MAX_PARAM, MAX_STEP
 
 MS: Final = 1_000_000
 BATTERY, TEMPERATURE, DISTANCE, FRAMES = 'battery_pct', 'temperature_c', 'distance_traveled_m', 'camera_frames'
@@ -54,8 +54,8 @@ class Story:
     """The one that was active at the start and those that followed it, each with the time from which on; None: there was none."""
     first: dict[str, float] = field(default_factory=dict)
     last: dict[str, float] = field(default_factory=dict)
-    steps: dict[str, int] = field(default_factory=dict)
-    """The greatest step of each key: MLflow takes the point of the greatest step for the newest."""
+    latest: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Step and time (ms) of each key's point that MLflow shows: that of the highest step, then of the latest time."""
     last_ns: int = 0
     node: Story | None = None
     """What the node measured beside the agent; where both state the same, the agent's stands."""
@@ -71,15 +71,19 @@ class Story:
         if kind == 'start':
             self.start = record
             self.policies = [(record.get('policy'), time_ns)]
+            self._note_latest(DISTANCE, 0, time_ns)
             return [Point(DISTANCE, 0.0, time_ns // MS, 0)]  # so that every run has one, whatever becomes of it
         if kind == 'metrics':
             step = int(record['s'])
             for key, value in record['m'].items():
-                self._note(key, value, step)
+                self.first.setdefault(key, value)
+                self.last[key] = value
+                self._note_latest(key, step, time_ns)
             self.counts['points'] += len(record['m'])
             return [Point(key, value, time_ns // MS, step) for key, value in record['m'].items()]
         if kind == 'frame':
             number = int(record['id'])
+            self._note_latest(FRAMES, self.counts['frame'], time_ns)
             return [Point(f'camera_frame_{number}', 1.0, time_ns // MS, max(number, 0)),
                     Point(FRAMES, float(self.counts['frame']), time_ns // MS, self.counts['frame'])]  # fmt: skip
         if kind == 'event':
@@ -104,9 +108,9 @@ class Story:
 
     @property
     def distance_m(self) -> float | None:
-        """What the agent states when it is positive, else what was measured, else what it states (0, say)."""
+        """What the agent states if positive; otherwise what it logged or what was measured; otherwise what it states (0)."""
         stated = self.end.get('distance_m')
-        return stated if stated is not None and stated > 0 else self.newest.get(DISTANCE) or stated
+        return stated if stated is not None and stated > 0 else self.last.get('distance_m') or self.newest.get(DISTANCE) or stated
 
     @property
     def newest(self) -> dict[str, float]:
@@ -115,9 +119,9 @@ class Story:
 
     @property
     def duration_s(self) -> float:
-        """What the agent states when it is positive, else what was measured."""
+        """What the agent states if positive; otherwise what it logged, otherwise what was measured."""
         stated = self.end.get('duration_s')
-        return float(stated) if stated is not None and stated > 0 else self.measured_s
+        return float(stated) if stated is not None and stated > 0 else self.last.get('duration_s') or self.measured_s
 
     @property
     def measured_s(self) -> float:
@@ -165,26 +169,28 @@ class Story:
         if len(self.events) < MOST_EVENTS and len(str(said)) <= MOST_EVENT:
             self.events.append(said)
 
-    def _note(self, key: str, value: float, step: int) -> None:
-        self.first.setdefault(key, value)
-        self.last[key] = value
-        self.steps[key] = max(step, self.steps.get(key, 0))
+    def _note_latest(self, key: str, step: int, time_ns: int) -> None:
+        self.latest[key] = max((step, time_ns // MS), self.latest.get(key, (-MAX_STEP, 0)))
 
     def _final(self, time_ms: int) -> list[Point]:
-        points = [Point('success', float(self.success), time_ms, 0), Point('duration_s', self.duration_s, time_ms, 0)]
-        if self.distance_m is not None:
-            points += [Point('distance_m', self.distance_m, time_ms, 0),
-                       Point(DISTANCE, self.distance_m, time_ms, self._next_step(DISTANCE))]  # fmt: skip
-        if self.battery_consumed_pct is not None:
-            points.append(Point('battery_consumed_pct', self.battery_consumed_pct, time_ms, 0))
+        """The values that MLflow shows of a run that has ended: those of ``summary.json``."""
+        stated: dict[str, float | None] = {
+            'success': float(self.success), 'duration_s': self.duration_s, 'distance_m': self.distance_m,
+            DISTANCE: self.distance_m, 'battery_consumed_pct': self.battery_consumed_pct,
+        }  # fmt: skip
         if self.node and self.node.counts['frame'] and self.counts['frame']:
-            points.append(Point(FRAMES, float(self.frames), time_ms, max(self.counts['frame'], self.node.counts['frame']) + 1))
-        both = set(self.last).intersection(self.node.last if self.node else ()) - {DISTANCE}
-        return points + [Point(key, self.last[key], time_ms, self._next_step(key)) for key in sorted(both)]
+            stated[FRAMES] = float(self.frames)
+        both = set(self.last).intersection(self.node.last if self.node else ()) - set(stated)
+        stated |= {key: self.last[key] for key in sorted(both)}
+        return [self._newest(key, value, time_ms) for key, value in stated.items() if value is not None]
 
-    def _next_step(self, key: str) -> int:
-        """Beyond those of agent and node, for what shall be the newest."""
-        return max(self.steps.get(key, 0), self.node.steps.get(key, 0) if self.node else 0) + 1
+    def _newest(self, key: str, value: float, time_ms: int) -> Point:
+        """A point that MLflow shows, whatever agent and node logged under its key."""
+        logged = [story.latest[key] for story in (self, self.node) if story is not None and key in story.latest]
+        step, last_ms = max(logged, default=(-1, 0))
+        if step < MAX_STEP:
+            return Point(key, value, time_ms, max(step + 1, 0))
+        return Point(key, value, max(time_ms, last_ms + 1), MAX_STEP)
 
 
 def named(policies: Iterable[str | None]) -> str:
