@@ -115,7 +115,7 @@ class MissionDataLogger:
 
     # -- what happens in it ----------------------------------------------------------------------------------------
 
-    def log_camera_frame(self, frame_data: bytes, frame_id: int) -> None:
+    def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
         """See Mission, as of the calls below; without a mission they do nothing."""
         if mission := self._active('log_camera_frame'):
             mission.log_camera_frame(frame_data, frame_id)

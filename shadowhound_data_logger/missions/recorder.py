@@ -78,11 +78,14 @@ class Mission:
     def is_active(self) -> bool:
         return not self._ended
 
-    def log_camera_frame(self, frame_data: bytes, frame_id: int) -> None:
-        """A JPEG; all go to the store, a sample of them (``frame_artifact_every_s``) to the run's artifacts as well."""
+    def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
+        """The bytes of a JPEG, or an array of pixels, which this call encodes: uint8, gray, RGB or RGBA (see ``values.jpeg``).
+
+        All frames are stored, a sample of them (``frame_artifact_every_s``) becomes artifacts of the run as well.
+        """
         try:
             number = values.whole(frame_id, 'frame_id')
-            data = values.content(frame_data, f'frame {number}')
+            data = values.jpeg(frame_data, f'frame {number}')
             if self._is_over():
                 return
             self._append('frame', id=number, file=self._frames.write(data), artifact=self._is_sampled())

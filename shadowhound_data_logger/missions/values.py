@@ -27,6 +27,13 @@ MAX_TEXT: Final = 1 << 20
 MAX_STEP: Final = (1 << 63) - 1
 MAX_BITS: Final = 1024
 """Of a number in an event: far larger ones Python does not even write."""
+JPEG: Final = b'\xff\xd8'
+JPEG_QUALITY: Final = 90
+MAX_SIDE: Final = 65_500
+"""Pixels; libjpeg's limit."""
+_ARRAYS: Final = ('__array__', '__array_interface__')
+_SPACES: Final = {(): 'GRAY', (1,): 'GRAY', (3,): 'RGB', (4,): 'RGBA'}
+"""What simplejpeg calls an array of so many channels."""
 _KEY: Final = re.compile(r'[/\w.\- ]+')
 
 
@@ -40,7 +47,7 @@ def metric_key(key: object) -> str:
 def number(value: Any, what: str) -> float:
     """A finite float; raises Rejected for anything else. Arrays of one element and numpy's scalars are numbers, texts are not."""
     try:
-        found = math.nan if isinstance(value, (str, bytes)) else float(value)
+        found = math.nan if isinstance(value, (str, bytes)) else float(_element(value))
     except (TypeError, ValueError, OverflowError, RuntimeError):
         found = math.nan
     if not math.isfinite(found):
@@ -51,7 +58,7 @@ def number(value: Any, what: str) -> float:
 def whole(value: Any, what: str) -> int:
     """A step or id; raises Rejected for what is none or too large for 64 bits."""
     try:
-        found = int(value)
+        found = int(_element(value))
     except (TypeError, ValueError, OverflowError, RuntimeError):
         raise Rejected('not_a_number', f'{what} = {text(value, 80)!r}') from None
     if not -MAX_STEP <= found <= MAX_STEP:
@@ -59,15 +66,54 @@ def whole(value: Any, what: str) -> int:
     return found
 
 
-def content(value: Any, what: str) -> memoryview:
-    """The bytes of a file; raises Rejected for what are none, or no single one."""
+def _element(value: Any) -> Any:
+    """The number in an array or tensor of one element, of any shape; anything else unchanged."""
+    if isinstance(value, (int, float)) or getattr(getattr(value, 'dtype', None), 'kind', 'f') not in 'biuf':
+        return value
+    item = getattr(value, 'item', None)
+    return item() if callable(item) else value
+
+
+def jpeg(value: Any, what: str) -> memoryview:
+    """The bytes of a JPEG, unchanged, or the pixels of an image, encoded. Raises Rejected for anything else.
+
+    Pixels are uint8 of the shape (height, width), or (height, width, 3 or 4) in the order red, green, blue (and alpha, which a
+    JPEG does not have), as in ``mlflow.log_image``: a numpy array, a Pillow image or another object that numpy reads.
+    """
     try:
-        found = memoryview(value).cast('B')
-    except TypeError:
-        found = memoryview(b'')
-    if not found:
-        raise Rejected('no_image', f'{what} is {type(value).__name__}, not the bytes of a JPEG')
-    return found
+        view = memoryview(value)
+        is_line = view.itemsize == 1 and view.nbytes == max(
+            view.shape or (), default=1
+        )  # OpenCV's encoder gives a column of bytes
+        data = view.cast('B') if is_line else memoryview(b'')
+    except (TypeError, ValueError, BufferError):  # no buffer, or one with gaps
+        data = memoryview(b'')
+    if bytes(data[: len(JPEG)]) == JPEG:
+        return data
+    if not isinstance(value, (bytes, bytearray)) and any(hasattr(value, name) for name in _ARRAYS):
+        return memoryview(_encoded(value, what))
+    begins = f' that begins with {bytes(data[:4]).hex(" ")}' if data else ''
+    said = f'{what} is {type(value).__name__}{begins}, not a JPEG: encode it, or pass its pixels as an array of uint8'
+    raise Rejected('no_image', said)
+
+
+def _encoded(value: Any, what: str) -> bytes:
+    import numpy as np  # noqa: PLC0415 - not needed by agents that pass JPEGs
+    import simplejpeg  # noqa: PLC0415
+
+    try:
+        pixels = np.asarray(value)
+    except Exception as error:  # a tensor of another device, for one
+        raise Rejected('no_image', f'{what} is {type(value).__name__}, which numpy cannot read: {error}') from error
+    if pixels.dtype != np.uint8:
+        raise Rejected('no_image', f'{what} is an array of {pixels.dtype}, not of uint8: scale it, (image * 255).astype("uint8") '
+                                   'if its values are between 0 and 1')  # fmt: skip
+    space = _SPACES.get(pixels.shape[2:] if pixels.ndim == 3 else () if pixels.ndim == 2 else (0,))
+    if space is None or not 0 < min(pixels.shape[:2]) <= max(pixels.shape[:2]) <= MAX_SIDE:
+        raise Rejected('no_image', f'{what} is an array of the shape {pixels.shape}, not (height, width) or (height, width, 3 or '
+                                   f'4), with sides of at most {MAX_SIDE}')  # fmt: skip
+    encoded: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)), JPEG_QUALITY, space)
+    return encoded
 
 
 def text(value: object, limit: int = MAX_TEXT) -> str:

@@ -19,7 +19,7 @@ def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
     """Its sender delivers, writes a part of what it delivered, and delivers that; rows have mission, run, time and pose."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        logger.log_camera_frame(b'one', 7)
+        logger.log_camera_frame(b'\xff\xd8one', 7)
     (folder,) = missions(tmp_path)
     records = [line.record or {} for line in read(folder.journal)]
     (frame,) = (record for record in records if record['k'] == 'frame')

@@ -38,8 +38,8 @@ def folder(tmp_path: Path) -> MissionFolder:
     csv.write_text('timestamp,x,y,yaw\n')
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        logger.log_camera_frame(b'one', 7)
-        logger.log_camera_frame(b'two', 7)
+        logger.log_camera_frame(b'\xff\xd8one', 7)
+        logger.log_camera_frame(b'\xff\xd8two', 7)
         logger.log_trajectory(csv)
     return next(missions(tmp_path))
 
@@ -96,7 +96,7 @@ def test_without_a_node_it_is_delivered(tmp_path: Path, spooler: Spooler, folder
     assert set(spooled(tmp_path).values()) == {'delivered'}
     assert spooler.owes, 'their rows of the catalogue'
     spooler.drain()
-    assert (tmp_path / 'store/sensor-data/thor/missions/abc/camera/frame_000007.jpg').read_bytes() == b'one'
+    assert (tmp_path / 'store/sensor-data/thor/missions/abc/camera/frame_000007.jpg').read_bytes() == b'\xff\xd8one'
     assert not spooler.owes
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False) as free:
         assert free
