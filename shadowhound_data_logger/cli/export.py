@@ -244,15 +244,18 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
         yield plain(f'  {mission} is refused: {why}', 'red')
     for mission, why in list(result.waiting.items())[:SHOWN]:
         yield plain(f'  {mission} waits: {why}', 'yellow')
+    others = [(number(len(result.refused)), 'refused')] if result.refused else []
+    others += [(number(len(result.waiting)), 'waiting')] if result.waiting else []
+    rest = ''.join(f', {count} {what}' for count, what in others)
     if is_dry:
         yield plain(f'{counted(len(result.streams), "mission")} would be exported to {where} at {result.fps} frames a second, '
-                    f'with {result.action} as action; {number(len(result.present))} are in it already.')  # fmt: skip
+                    f'with {result.action} as action; {number(len(result.present))} in it already{rest}.')  # fmt: skip
         return
     if not (result.added or result.present):
-        yield plain(f'No mission was exported.{store_hint()}')
+        yield plain(f'No mission was exported{rest}.{"" if rest else store_hint()}')
         return
     yield from (plain(line) for line in result.absent)
-    yield plain(f'{counted(len(result.added), "episode")} added to {where}, {number(len(result.present))} were in it already; '
+    yield plain(f'{counted(len(result.added), "episode")} added to {where}, {number(len(result.present))} in it already{rest}; '
                 f'digest {result.digest[:16]}.')  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.clocks import ClockOffset
 from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions
-from shadowhound_data_logger.datasets.plan import ArmPlan, EpisodePlan, StreamPlan
+from shadowhound_data_logger.datasets.plan import BEFORE_NS, ArmPlan, EpisodePlan, StreamPlan, refusal
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.datasets.ticks import (
     LATE,
@@ -38,7 +38,6 @@ from shadowhound_data_logger.datasets.ticks import (
     phase_of,
     sample,
     ticks_of,
-    whole_fps,
 )
 from shadowhound_data_logger.datasets.video import VideoWriter
 from shadowhound_data_logger.durable_files import replacing
@@ -95,11 +94,11 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
     try:
         place, work = Place(settings), folder / 'tmp'
         with ExitStack() as stack:
-            of_robot = Recordings(place, store, plan.tracks, plan.topics, plan.span_ns, plan.bags, work)
+            of_robot = Recordings(place, store, plan.tracks, plan.topics, plan.span_ns, plan.bags, work, early_ns=BEFORE_NS)
             recordings = {False: stack.enter_context(of_robot)}
             if plan.arm is not None:
                 span = plan.arm.span_ns(*plan.span_ns)
-                of_arm = Recordings(place, store, plan.arm.tracks, plan.arm.topics, span, plan.bags, work)
+                of_arm = Recordings(place, store, plan.arm.tracks, plan.arm.topics, span, plan.bags, work, early_ns=BEFORE_NS)
                 recordings[True] = stack.enter_context(of_arm)
             found = _built(plan, options, fps, recordings, folder)
     except (LakeError, BagDamaged, Rejected, ObjectRefused) as error:
@@ -116,16 +115,8 @@ def _built(
     plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Mapping[bool, Recordings], folder: Path
 ) -> dict[str, Any]:
     """``recordings`` are those of the robot, and with True those of the arm."""
-    if plan.missing:
-        raise LakeError(f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it')
-    if plan.arm is not None:
-        _check_clock(plan.arm, fps)
-    if plan.never_told and not options.allow_gaps:
-        raise LakeError(f'{plan.never_told}, and no more will come: --allow-gaps takes it')
-    if fps > whole_fps(plan.camera_hz):
-        slow = min((each for each in plan.streams if each.part is None), key=lambda each: each.recording.rate_hz)
-        raise LakeError(f'{slow.recording.topic} has {slow.recording.rate_hz:.3g} Hz in the {slow.recording.sink}, '
-                        f'less than {fps} frames a second')  # fmt: skip
+    if why := refusal(plan, options, fps):
+        raise LakeError(why)
     series = _read(plan, options, recordings)
     ticks = _ticks(plan, series, fps)
     streams = [_sampled(each, one, ticks, fps, options) for each, one in zip(plan.streams, series, strict=True)]
@@ -162,15 +153,6 @@ def _labels(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int
         for frame, names in zip(found, labels.column(rows, plan.labels), strict=True):
             frame.update(names)
     return found
-
-
-def _check_clock(arm: ArmPlan, fps: int) -> None:
-    """Raises LakeError where a value of the arm may belong to another tick."""
-    if arm.clock is None:
-        raise LakeError(arm.why)
-    if arm.clock.uncertainty_ns > SECOND // fps // 2:
-        raise LakeError(f"the offset of the arm's clock is known to {arm.clock.uncertainty_ns / 1e6:.1f} ms, "
-                        f'half a tick is {SECOND / fps / 2e6:.1f} ms')  # fmt: skip
 
 
 def _is_of_arm(stream: StreamPlan) -> bool:

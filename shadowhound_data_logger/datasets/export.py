@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from shadowhound_data_logger.datasets import plan as planning
@@ -71,7 +72,7 @@ class Exported:
     absent: list[str] = field(default_factory=list)
     """Of the folder of a task, what there is nothing of."""
     streams: dict[str, Mapping[str, str]] = field(default_factory=dict)
-    """Mission -> stream -> where it comes from, of a dry run."""
+    """Mission -> stream -> where it comes from, of a dry run: those that were not refused before their messages were read."""
 
 
 Say = Callable[[str], None]
@@ -97,8 +98,8 @@ def export(  # noqa: PLR0913 - the flags of the command
             waited_s, before = 0.0, dict[str, str]()
             while True:
                 missions = _new(made, planning.chosen(source, flags, findings))
-                look = folder / WORK / 'look'
-                plans = list(planning.planned(source, store, missions, options, action, look, findings))
+                with TemporaryDirectory(prefix='shadowhound-plan-') as look:
+                    plans = list(planning.planned(source, store, missions, options, action, Path(look), findings))
                 late = [each for each in plans if each.waits_for]
                 now = {each.mission.mission_id: each.waits_for for each in late}
                 waited_s, before = waited_s + LOOK_S if now == before else 0.0, now
@@ -110,10 +111,11 @@ def export(  # noqa: PLR0913 - the flags of the command
         result.waiting = {each.mission.mission_id: each.waits_for for each in plans if each not in ready}
         result.action = action = planning.settled_action(ready, action)
         ready = [_only(each, action) for each in ready]
-        result.fps = fps = fps or _auto_fps(ready)
+        result.fps = fps = fps or _auto_fps([each for each in ready if not planning.refusal(each, options, 0)])
         if is_dry:
-            result.streams = {each.mission.mission_id: _where(each) for each in ready}
-            result.refused = {each.mission.mission_id: f'nothing of {", ".join(each.missing)}' for each in ready if each.missing}
+            why = {each.mission.mission_id: planning.refusal(each, options, fps) for each in ready}
+            result.refused = {mission: reason for mission, reason in why.items() if reason}
+            result.streams = {each.mission.mission_id: _where(each) for each in ready if not why[each.mission.mission_id]}
             return result
         settings = {**options.told(), 'fps': fps, 'action': action}
         built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, cluster=cluster,
@@ -227,7 +229,7 @@ def _only(plan: EpisodePlan, action: str) -> EpisodePlan:
 
 def _auto_fps(plans: Sequence[EpisodePlan]) -> int:
     """Raises LakeError where no camera has a frame a second."""
-    rates = [each.camera_hz for each in plans if not each.missing and each.camera_hz]
+    rates = [each.camera_hz for each in plans if each.camera_hz]
     if not rates:
         return 1
     fps = whole_fps(min(rates))
@@ -239,7 +241,7 @@ def _auto_fps(plans: Sequence[EpisodePlan]) -> int:
 
 def _where(plan: EpisodePlan) -> dict[str, str]:
     return {
-        each.name: f'{each.recording.sink}: {each.recording.topic}, {each.recording.messages} messages, '
+        each.name: f'{each.recording.sink}: {each.recording.topic}, about {each.recording.messages} messages, '
         f'{each.recording.rate_hz:.3g} Hz' for each in plan.streams
     }  # fmt: skip
 
@@ -278,6 +280,7 @@ def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptio
     told = [settings, options.validation_label, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing,
             _where(plan),
             [(name, sorted(track.key.to_pylist())) for name, track in sorted(_tracks_of(plan).items())],
+            [[each.sha256 for each in bag.slices] for bag in plan.bags],
             plan.arm and (plan.arm.why, plan.arm.clock and plan.arm.clock.told())]  # fmt: skip
     whole = hashlib.sha256(json.dumps(told, default=str).encode())
     for column in (*plan.gaps.to_pydict().items(), *map(asdict, plan.labels)):

@@ -33,6 +33,7 @@ from shadowhound_data_logger.datasets.features import (
     camera_name,
 )
 from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, bags_of
+from shadowhound_data_logger.datasets.ticks import whole_fps
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -201,6 +202,29 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
             yield replace(made, labels=tuple(each for each in labelled if each.since_ns <= last and each.until_ns >= first))
 
 
+def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
+    """Why it can be no episode, as far as is known before its messages are read; empty where nothing speaks against it.
+
+    With ``fps`` 0, the rate of the frames is not settled yet.
+    """
+    if plan.missing:
+        return f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it'
+    if plan.arm is not None and plan.arm.clock is None:
+        return plan.arm.why
+    if plan.never_told and not options.allow_gaps:
+        return f'{plan.never_told}, and no more will come: --allow-gaps takes it'
+    if not fps:
+        return ''
+    if plan.arm is not None and plan.arm.clock is not None and plan.arm.clock.uncertainty_ns > SECOND // fps // 2:
+        return (f"the offset of the arm's clock is known to {plan.arm.clock.uncertainty_ns / 1e6:.1f} ms, "
+                f'half a tick is {SECOND / fps / 2e6:.1f} ms')  # fmt: skip
+    cameras = [each.recording for each in plan.streams if each.part is None]
+    slow = min(cameras, key=lambda each: each.rate_hz, default=None)
+    if slow is not None and fps > whole_fps(slow.rate_hz):
+        return f'{slow.topic} has {slow.rate_hz:.3g} Hz in the {slow.sink}, less than {fps} frames a second'
+    return ''
+
+
 def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:
     """``cmd_vel`` or ``odometry``: with ``auto`` the command topic where a mission has one."""
     if action != 'auto':
@@ -223,10 +247,11 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     used = col('sensor').is_in(sorted({*sensors, *RECORDED})) | col('type').is_in(sorted(DETECTIONS))
     with query.answering():
         found = rows.where(used & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
-    seen = _tracks([row for row in found if row['type'] in DETECTIONS])[0]
-    tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS])
-    bags = tuple(bags_of(store, mission.robot, since, until))
-    with Recordings(Place(source.settings), store, tracks, topics, (since, until), bags, work) as recordings:
+    seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
+    tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS], mission)
+    bags = tuple(bags_of(store, mission.robot, (mission.mission_id, mission.run_id), mission.begin_ns, until))
+    place = Place(source.settings)
+    with Recordings(place, store, tracks, topics, (since, until), bags, work, early_ns=BEFORE_NS) as recordings:
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
     streams, missing = [], []
     wanted: list[tuple[str, StatePart | None, str]] = [
@@ -270,7 +295,7 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
             mine = col('topic').is_in(wanted) & col('robot').is_in(owners) & col('t_start').not_null()
             found = rows.where(mine).select(*NEEDED, 'topic').to_pylist()
         told = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
-        return {sensor: _track_of(some) for sensor, some in told.items() if some}
+        return {sensor: _track_of(some, begin, end) for sensor, some in told.items() if some}
 
     place, wide = Place(source.settings), (since - NEAR_NS, until + NEAR_NS)
     pairs = [np.array(options.clock_pairs, np.int64).reshape(-1, 2)]
@@ -286,7 +311,8 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     begin, end = (int(each) for each in clock.other_ns(np.array([since, until])))
     arm = ArmPlan(tracks(begin, end, ARM_JOINTS, ARM_COMMANDS), topics, clock)
     streams = []
-    with Recordings(place, store, arm.tracks, topics, arm.span_ns(since, until), bags, work) as recordings:
+    span = arm.span_ns(since, until)
+    with Recordings(place, store, arm.tracks, topics, span, bags, work, early_ns=BEFORE_NS) as recordings:
         joints = recordings.best(ARM_JOINTS)
         commands = recordings.best(ARM_COMMANDS)
     if joints is None:
@@ -307,11 +333,19 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     return arm, streams
 
 
-def _track_of(rows: Sequence[Row]) -> Track:
-    """Of one machine, the one that has most: an arm may be recorded by its own and by the robot."""
-    owners = [row['robot'] for row in rows]
-    best = max(sorted(set(owners)), key=owners.count)
+def _track_of(rows: Sequence[Row], begin_ns: int, end_ns: int) -> Track:
+    """Of one machine, the one that has most in this time: an arm may be recorded by its own and by the robot."""
+    best = _most_frequent([row['robot'] for row in _within(rows, begin_ns, end_ns)] or [row['robot'] for row in rows])
     return Track.of(pa.Table.from_pylist([row for row in rows if row['robot'] == best], schema=narrow(NEEDED)))
+
+
+def _within(rows: Sequence[Row], begin_ns: int, end_ns: int) -> list[Row]:
+    """The objects that have messages of this time."""
+    return [row for row in rows if row['t_start_ns'] <= end_ns and (row['t_end_ns'] or row['t_start_ns']) >= begin_ns]
+
+
+def _most_frequent(values: Sequence[Any]) -> Any:
+    return max(sorted(set(values)), key=values.count)
 
 
 def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table,
@@ -337,14 +371,18 @@ def _about(stated: pa.Table, topics: pa.Array, since: int, until: int) -> pa.Tab
     return kept.sort_by([(name, 'ascending') for name in ('topic', 'sink', 'what', 'id')]).combine_chunks()
 
 
-def _tracks(rows: Sequence[Row]) -> tuple[dict[str, Track], dict[str, str]]:
-    """By sensor, of the topic and type that most objects are of: a sensor may have changed its topic."""
+def _tracks(rows: Sequence[Row], mission: ChosenMission) -> tuple[dict[str, Track], dict[str, str]]:
+    """By sensor, of the topic and type that most objects of the mission are of: a sensor may have changed its topic."""
     tracks, topics = {}, {}
     for sensor in sorted({row['sensor'] for row in rows}):
         ours = [row for row in rows if row['sensor'] == sensor]
-        kinds = [(row['topic'] or '', row['type'] or '') for row in ours]
-        best = max(sorted(set(kinds)), key=kinds.count)
-        mine = [row for row, kind in zip(ours, kinds, strict=True) if kind == best]
+        counted = _within(ours, mission.begin_ns, mission.end_ns) or ours
+        best = _most_frequent([_topic_and_type(row) for row in counted])
+        mine = [row for row in ours if _topic_and_type(row) == best]
         tracks[sensor] = Track.of(pa.Table.from_pylist(mine, schema=narrow(NEEDED)))
         topics[sensor] = best[0]
     return tracks, topics
+
+
+def _topic_and_type(row: Row) -> tuple[str, str]:
+    return row['topic'] or '', row['type'] or ''

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -49,10 +49,64 @@ KEEP_BYTES: Final = 16 << 20
 THREADS: Final = 8
 LEAST_SPAN_NS: Final = 2 * SECOND
 """Of a slice from which a rate is told."""
+AS_MUCH: Final = 0.5
+"""A recording competes with the one that covers most of a mission if it covers so much of what that one does."""
+NEARLY_ALL: Final = 0.9
+"""An event's bag is an excerpt, unless it has so much of a mission."""
+LEAST_ADDED_NS: Final = SECOND
+"""A second bag of a time is read for more than this: our recorder needs that long to notice that a mission has begun."""
+HOLE: Final = 10
+"""So many periods without an object are not covered."""
 AHEAD: Final = 16
 """Pictures that are fetched before they are needed."""
 _MESSAGE_TITLE: Final = re.compile(r'^MSG: ([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)\s*$', re.ASCII)
 _ODOMETRY: Final = 'nav_msgs/msg/Odometry'
+
+
+class Interval(NamedTuple):
+    """A time, both ends included, ns."""
+
+    first_ns: int
+    last_ns: int
+
+    @property
+    def length(self) -> int:
+        return max(0, self.last_ns - self.first_ns)
+
+    def within(self, other: Interval) -> Interval:
+        """What both have; its end is before its begin where that is nothing."""
+        return Interval(max(self.first_ns, other.first_ns), min(self.last_ns, other.last_ns))
+
+    def without(self, others: Sequence[Interval]) -> list[Interval]:
+        """What none of the others has."""
+        left = [self]
+        for other in others:
+            before = [Interval(one.first_ns, min(one.last_ns, other.first_ns - 1)) for one in left]
+            after = [Interval(max(one.first_ns, other.last_ns + 1), one.last_ns) for one in left]
+            left = before + after
+        return sorted({one for one in left if one.first_ns <= one.last_ns})
+
+
+@dataclass(frozen=True, slots=True)
+class _SlicePart:
+    """A slice of a bag, and of which times it is read."""
+
+    bag: Manifest
+    slice: SliceEntry
+    messages: int
+    """Of one topic, in all of it."""
+    whole: Interval
+    times: tuple[Interval, ...]
+
+    def covered(self, counted: Interval) -> int:
+        """How much of a time it is read for, ns."""
+        return sum(time.within(counted).length for time in self.times)
+
+    def share(self, counted: Interval) -> float:
+        """Which share of its messages is read in a time, if they are evenly spread."""
+        if self.whole.length:
+            return self.covered(counted) / self.whole.length
+        return float(any(counted.first_ns <= time.first_ns <= counted.last_ns for time in self.times))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +129,11 @@ class RecordedSensor:
     sink: str
     """``objects`` or ``bags``, as the gap journal names them."""
     messages: int
+    """In the time that counts. Estimated where only a part of an object or slice is of that time."""
     rate_hz: float
     """Of what was recorded, without its gaps; 0 where it is not known."""
+    covered: float
+    """Share of the time that counts in which it was recorded, 0 to 1."""
 
 
 @dataclass(slots=True)
@@ -115,14 +172,19 @@ class Recordings:
     Enter once; ``series`` any number of times, while it is entered; one thread.
     """
 
-    def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],
-                 span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path) -> None:  # fmt: skip
-        """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time that counts, both ends included."""
+    def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],  # noqa: PLR0913
+                 span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path, *, early_ns: int = 0) -> None:  # fmt: skip
+        """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time that is read, both ends included.
+
+        What was recorded in the first ``early_ns`` of it does not count when one recording is chosen over another. ``bags``
+        are in the order of preference (``bags_of``).
+        """
         self._place = place
         self._store = store
         self._tracks = tracks
         self._topics = topics
         self._span = span_ns
+        self._counted = Interval(span_ns[0] + early_ns, span_ns[1])
         self._bags = bags
         self._work = work
         self._stack = ExitStack()
@@ -135,9 +197,13 @@ class Recordings:
         self._stack.close()
 
     def best(self, sensor: str) -> RecordedSensor | None:
-        """Where most messages of a sensor are; None where there is none."""
+        """The one with most messages in the time that counts, of those that cover at least half as much of it as the fullest one.
+
+        None where none has a message in that time.
+        """
         found = [each for each in (self._in_objects(sensor), *self._in_bags(sensor)) if each is not None and each.messages]
-        return max(found, key=lambda each: each.messages, default=None)
+        enough = AS_MUCH * max((each.covered for each in found), default=0.0)
+        return max((each for each in found if each.covered >= enough), key=lambda each: each.messages, default=None)
 
     def series(self, recording: RecordedSensor, fields: Sequence[str] = ()) -> Series:
         """All messages of the time. Raises StoreError, LakeError, BagDamaged."""
@@ -156,7 +222,8 @@ class Recordings:
     def _in_objects(self, sensor: str) -> RecordedSensor | None:
         if sensor not in self._tracks:
             return None
-        track = self._within(sensor)
+        track = self._tracks[sensor]
+        track = track.only(track.within(*self._counted))
         if not len(track):
             return None
         several = track.count > 1
@@ -167,7 +234,18 @@ class Recordings:
         else:
             steps = np.diff(np.unique(track.start_ns))
             rate = 1e9 / float(np.median(steps)) if len(steps) else 0.0
-        return RecordedSensor(sensor, self._topics.get(sensor, ''), track.kind, OBJECTS, int(track.count.sum()), rate)
+        messages, covered = self._extent(track)
+        return RecordedSensor(sensor, self._topics.get(sensor, ''), track.kind, OBJECTS, messages, rate, covered)
+
+    def _extent(self, track: Track) -> tuple[int, float]:
+        """How many messages of these objects are in the time that counts, and the share of it from each to the one after it."""
+        first, last = self._counted
+        begin, end = track.start_ns.clip(first, last), track.end_ns.clip(first, last)
+        parts = np.where(track.end_ns > track.start_ns, (end - begin) / np.maximum(track.end_ns - track.start_ns, 1), 1.0)
+        steps = np.diff(begin)
+        usual = float(np.median(steps)) if len(steps) else float(end[0] - begin[0])
+        covered = np.minimum(steps, np.maximum(HOLE * usual, (end - begin)[:-1])).sum() + max(usual, end[-1] - begin[-1])
+        return max(1, round(float((track.count * parts).sum()))), min(1.0, float(covered) / max(last - first, 1))
 
     def _numbers(self, recording: RecordedSensor, track: Track, fields: Sequence[str]) -> Series:
         tables: list[decode.Table] = []
@@ -231,16 +309,17 @@ class Recordings:
     # -- bags ------------------------------------------------------------------------------------------------------
 
     def _in_bags(self, sensor: str) -> Iterator[RecordedSensor]:
-        for bag in self._bags:
-            for topic in bag.topics:
-                if not self._is_of(sensor, topic.topic, topic.type):
-                    continue
-                slices = [each for each in bag.slices if each.recorded.get(topic.topic) and self._overlaps(bag, each)]
-                count = sum(each.recorded[topic.topic] for each in slices)
+        topics = {(topic.topic, topic.type): None for bag in self._bags for topic in bag.topics}
+        for topic, kind in topics:
+            if self._is_of(sensor, topic, kind):
+                parts = self._parts(topic)
+                counts = [each.messages * each.share(self._counted) for each in parts]
                 # A slice's span is that of all its topics: of a short one it says little about one of them.
-                spans = [(each.recorded[topic.topic], each.t_end_ns - each.t_start_ns) for each in slices]
-                rates = [found / span * 1e9 for found, span in spans if span >= LEAST_SPAN_NS]
-                yield RecordedSensor(sensor, topic.topic, topic.type, BAGS, count, max(rates, default=0.0))
+                rates = [(each.bag, each.messages / each.whole.length * 1e9) for each in parts
+                         if each.share(self._counted) and each.whole.length >= LEAST_SPAN_NS]  # fmt: skip
+                rate = max((rate for bag, rate in rates if bag is rates[0][0]), default=0.0)
+                covered = sum(each.covered(self._counted) for each in parts) / max(self._counted.length, 1)
+                yield RecordedSensor(sensor, topic, kind, BAGS, round(sum(counts)), rate, min(1.0, covered))
 
     def _is_of(self, sensor: str, topic: str, kind: str) -> bool:
         known = self._topics.get(sensor)
@@ -250,9 +329,24 @@ class Recordings:
         names = zip(told.get('topics', ()), told.get('types', ()), strict=False)
         return any(kind == wanted and (topic == f'/{name}' or topic.endswith(f'/{name}')) for name, wanted in names)
 
-    def _overlaps(self, bag: Manifest, each: SliceEntry) -> bool:
-        step = _offset_of(bag)
-        return each.t_start_ns + step <= self._span[1] and each.t_end_ns + step >= self._span[0]
+    def _parts(self, topic: str) -> list[_SlicePart]:
+        """The slices with messages of a topic, and of which time each is read: two bags of one time have each message twice.
+
+        Of a later bag, what the bags before it leave open is taken, if that is more than a second of the time that counts.
+        """
+        found: list[_SlicePart] = []
+        for bag in self._bags:
+            step = _offset_of(bag)
+            covered = [time for each in found for time in each.times]
+            mine = []
+            for each in bag.slices:
+                whole = Interval(each.t_start_ns + step, each.t_end_ns + step)
+                if each.recorded.get(topic) and whole.first_ns <= self._span[1] and whole.last_ns >= self._span[0]:
+                    mine.append(_SlicePart(bag, each, each.recorded[topic], whole, tuple(whole.without(covered))))
+            added = sum(each.covered(self._counted) for each in mine)
+            if added > LEAST_ADDED_NS or (not found and any(each.share(self._counted) for each in mine)):
+                found += [each for each in mine if each.times]
+        return found
 
     def _from_bag(self, recording: RecordedSensor, fields: Sequence[str], *, is_picture: bool) -> Series:
         stamps: list[int] = []
@@ -262,10 +356,13 @@ class Recordings:
         files: list[SourceFile] = []
         names: tuple[str, ...] = ()
         bodies = self._stack.enter_context(tempfile.TemporaryFile(dir=self._work)) if is_picture else None  # noqa: SIM115
-        for bag, each in self._slices(recording.topic):
-            files.append(SourceFile(naming.BUCKET, each.key, each.sha256))
-            for message, types in self._messages(each, recording.topic):
-                stamp = _stamp(message, types) + _offset_of(bag)
+        for part in self._parts(recording.topic):
+            files.append(SourceFile(naming.BUCKET, part.slice.key, part.slice.sha256))
+            step = _offset_of(part.bag)
+            for message, types in self._messages(part.slice, recording.topic):
+                if not any(first <= message.log_ns + step <= last for first, last in part.times):
+                    continue
+                stamp = _stamp(message, types) + step
                 try:
                     if bodies is not None:
                         content, extension = _picture(message, types)
@@ -293,13 +390,6 @@ class Recordings:
 
         return _with_pictures(made, picture, order, stamped, self._span)
 
-    def _slices(self, topic: str) -> Iterator[tuple[Manifest, SliceEntry]]:
-        """Of the bag that has most of it: two bags of one time would have each message twice."""
-        counts = [sum(each.recorded.get(topic, 0) for each in bag.slices if self._overlaps(bag, each)) for bag in self._bags]
-        if any(counts):
-            bag = self._bags[int(np.argmax(counts))]
-            yield from ((bag, each) for each in bag.slices if each.recorded.get(topic) and self._overlaps(bag, each))
-
     def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
         source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
         wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic and not channel.repeated)
@@ -311,11 +401,15 @@ class Recordings:
             yield message, known[message.channel]
 
 
-def bags_of(store: ObjectStore, robot: str, begin_ns: int, end_ns: int) -> list[Manifest]:
-    """The bags of a robot that have messages of a time, and whose files are MCAP of ours, with the slices that the store has.
+def bags_of(store: ObjectStore, robot: str, mission: tuple[str, str], begin_ns: int, end_ns: int) -> list[Manifest]:
+    """The bags of a robot that have messages of a mission's time, with the slices that the store has, the preferred ones first.
 
-    The robot may keep the others until somebody asks for them. Raises StoreError.
+    ``mission`` is its id and its run's id. Its own bags are first, then those of no mission, then those of other missions, last
+    those of events, if they have nearly all of it; of each kind, the one with most of the mission first. The robot may keep
+    slices until they are requested. A bag without a manifest (of another recorder, or still growing) is not among them. Raises
+    StoreError.
     """
+    counted = Interval(begin_ns, end_ns)
     found = []
     for bag in find_bags(store, robot):
         if bag.is_archive:
@@ -329,9 +423,23 @@ def bags_of(store: ObjectStore, robot: str, begin_ns: int, end_ns: int) -> list[
         there = {file.name for file in bag.files}
         manifest = replace(manifest, slices=tuple(each for each in manifest.slices if each.file in there))
         step = _offset_of(manifest)
-        if any(each.t_start_ns + step <= end_ns and each.t_end_ns + step >= begin_ns for each in manifest.slices):
-            found.append(manifest)
-    return found
+        times = [Interval(each.t_start_ns + step, each.t_end_ns + step) for each in manifest.slices]
+        if any(first <= end_ns and last >= begin_ns for first, last in times):
+            covered = sum(each.within(counted).length for each in times)
+            if manifest.event is not None and covered < NEARLY_ALL * counted.length:
+                continue
+            found.append(((_rank(manifest, *mission), -covered, manifest.bag), manifest))
+    return [manifest for _, manifest in sorted(found, key=lambda each: each[0])]
+
+
+def _rank(bag: Manifest, mission_id: str, run_id: str) -> int:
+    """Lower is better."""
+    if bag.event is not None:
+        return 3
+    if bag.mission is None:
+        return 1
+    is_own = bag.mission.mission_id == mission_id or (bag.mission.mission_id is None and bag.mission.run_id == (run_id or ''))
+    return 0 if is_own else 2
 
 
 def _file(wanted: Object) -> SourceFile:

@@ -1,0 +1,309 @@
+"""Of which bag, or of which objects, an episode is made: of those of the mission's own time, its own bags first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner
+from datasets.recorded import TOPICS, House, Mission, cdr_of
+from lake.gap_parts import tell
+from lake.making import NOON_NS, add
+from lake.training import COMPRESSED, ODOMETRY
+
+from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, topics_of
+from shadowhound_data_logger.bags.naming import slice_file
+from shadowhound_data_logger.catalogue.gaps import complete
+from shadowhound_data_logger.cli import export as verb
+from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.datasets.export import Exported, export
+from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.lerobot import SOURCE_TABLE, Lerobot
+from shadowhound_data_logger.datasets.verify import verify
+from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.directory import DirectoryStore
+
+LATE_NS = 2_000_000
+"""From a message's stamp to its arrival."""
+EVENT = EventOf('fall', 30.0, 30.0, 10.0, ())
+
+
+class Yard(House):
+    """A store with missions whose objects have one picture in half a second, and with bags."""
+
+    def mission(self, name: str, begin_s: float, seconds: float = 4.0, **more: Any) -> Mission:
+        """Its objects are of its own time, and of a second before and after it."""
+        rates = {'camera_hz': 2.0, 'odom_hz': 4.0, **more}
+        made = self.record(Mission(name, begin_s=begin_s, seconds=seconds, sensors=('camera', 'odom'), **rates))
+        tell(self.settings, self.folder, *(
+            complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
+                     from_ns=made.begin_ns - 20 * SECOND, to_ns=made.end_ns + SECOND) for sensor in ('camera', 'odom')
+        ), name=f'bags-{name}')  # fmt: skip
+        return made
+
+    def bag(self, name: str, *times_s: tuple[float, float], hz: float = 10.0, mission: MissionOf | None = None,
+            event: EventOf | None = None, has_manifest: bool = True) -> str:  # fmt: skip
+        """One slice for each of these times, seconds after noon; the prefix of their keys."""
+        infos = []
+        for number, (first_s, last_s) in enumerate(times_s):
+            path = self.folder / slice_file(name, number)
+            writer = SliceWriter(path)
+            stamps = [NOON_NS + round((first_s + step / hz) * SECOND) for step in range(round((last_s - first_s) * hz) + 1)]
+            for sensor, kind in (('camera', COMPRESSED), ('odom', ODOMETRY)):
+                channel = Channel(TOPICS[sensor], kind, *describe(kind), '')
+                for sequence, stamp in enumerate(stamps):
+                    writer.write(channel, stamp + LATE_NS, stamp, sequence, cdr_of(self.drive._ros, sensor, stamp))
+            infos.append(writer.close())
+        prefix = f'thor/rosbags/{name}/'
+        entries = tuple(SliceEntry.of(info, prefix + info.path.name) for info in infos)
+        manifest = Manifest(name, 'thor', mission, COMPLETE, (), topics_of(infos), entries, event=event)
+        with closing(open_store(self.settings, UploadSettings())) as store:
+            for info in infos:
+                add(store, self.folder / 'tmp', prefix + info.path.name, info.path.read_bytes())
+            if has_manifest:
+                add(store, self.folder / 'tmp', f'{prefix}manifest.json', manifest.to_json())
+        return prefix
+
+    def export(self, name: str = 'set', **how: Any) -> Exported:
+        return export(self.folder / name, self.source, {'mission_type': 'patrol'}, ExportOptions(**how))
+
+    def sources(self, mission: str, stream: str = 'images.front', name: str = 'set') -> dict[str, list[int]]:
+        """Key -> the stamps of its messages in the episode."""
+        found: dict[str, set[int]] = {}
+        for row in pq.read_table(self.folder / name / SOURCE_TABLE).to_pylist():
+            if (row['episode_mission'], row['stream']) == (mission, stream):
+                found.setdefault(row['key'], set()).add(row['stamp_ns'])
+        return {key: sorted(stamps) for key, stamps in sorted(found.items())}
+
+
+@pytest.fixture
+def yard(tmp_path: Path) -> Yard:
+    return Yard(tmp_path)
+
+
+def of(mission: str) -> MissionOf:
+    return MissionOf('patrol', mission, f'run{mission}')
+
+
+def told(found: Exported, mission: str, stream: str = 'images.front') -> dict[str, Any]:
+    (mine,) = [each for each in found.added if each['mission_id'] == mission]
+    return dict(mine['streams'][stream])
+
+
+def test_two_missions_that_are_four_seconds_apart(yard: Yard) -> None:
+    """Each is made of its own bag, at that bag's rate, though the earlier one has far more messages."""
+    yard.mission('one', 0)
+    yard.mission('two', 8)
+    bags = {'one': yard.bag('b1', (0, 4), hz=40, mission=of('one')), 'two': yard.bag('b2', (8, 12), mission=of('two'))}
+    found = yard.export()
+    assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
+    for mission, prefix in bags.items():
+        assert list(yard.sources(mission)) == [f'{prefix}{prefix.split("/")[2]}_0.mcap']
+    assert told(found, 'two')['messages'] == 41
+    assert told(found, 'two')['rate_hz'] == pytest.approx(10, rel=0.05)
+    assert verify(yard.folder / 'set', DirectoryStore(yard.settings.directory), frames=None).wrong == []
+
+
+def test_the_own_bag_comes_before_one_of_the_same_time(yard: Yard) -> None:
+    """By the mission's id: a denser bag of no mission, of another one, and of an event in it are left alone."""
+    yard.mission('one', 20)
+    own = yard.bag('own', (20, 24), mission=of('one'))
+    yard.bag('always', (0, 40), hz=40)
+    yard.bag('another', (19, 25), hz=40, mission=of('zero'))
+    yard.bag('event', (0, 25), hz=40, mission=of('one'), event=EVENT)
+    assert told(yard.export(), 'one')['from'] == 'bags'
+    assert list(yard.sources('one')) == list(yard.sources('one', 'state.pose')) == [f'{own}own_0.mcap']
+
+
+def test_an_own_bag_without_the_missions_id(yard: Yard) -> None:
+    """While a mission is not known to MLflow its bag may have the id of the run alone."""
+    yard.mission('one', 20)
+    own = yard.bag('own', (20, 24), mission=MissionOf('patrol', None, 'runone'))
+    yard.bag('always', (0, 40), hz=40)
+    yard.export()
+    assert list(yard.sources('one')) == [f'{own}own_0.mcap']
+
+
+def test_a_bag_that_spans_several_missions(yard: Yard) -> None:
+    """Each is made of the slices of its own time, whoever's mission it was when the bag began."""
+    yard.mission('one', 3)
+    yard.mission('two', 13)
+    prefix = yard.bag('service', (0, 5), (5.1, 10), (10.1, 15), (15.1, 20), mission=of('one'))
+    found = yard.export()
+    assert (found.refused, found.fps) == ({}, 10)
+    for mission, slices in (('one', (0, 1)), ('two', (2, 3))):
+        assert list(yard.sources(mission)) == [f'{prefix}service_{number}.mcap' for number in slices]
+        assert told(found, mission)['from'] == 'bags'
+
+
+def test_a_mission_without_a_bag_next_to_one_with(yard: Yard) -> None:
+    """The other one's bag reaches a second into it, with more pictures than all of its objects: these are taken."""
+    yard.mission('one', 0)
+    yard.mission('two', 5)
+    yard.bag('b1', (0, 6), hz=40, mission=of('one'))
+    found = yard.export()
+    assert (told(found, 'one')['from'], told(found, 'two')['from']) == ('bags', 'objects')
+    assert found.refused == {}
+    assert all('/camera/' in key for key in yard.sources('two'))
+
+
+def test_an_excerpt_does_not_stand_for_a_mission(yard: Yard) -> None:
+    """An event's bag, and a part of the mission's own one that was requested, have more pictures of less of it."""
+    yard.mission('one', 20, 6)
+    yard.mission('two', 60, 6)
+    yard.bag('event', (18, 24), hz=40, mission=of('one'), event=EVENT)
+    yard.bag('part', (61, 63.5), hz=40, mission=of('two'))
+    found = yard.export()
+    assert {told(found, each)['from'] for each in ('one', 'two')} == {'objects'}
+    assert found.refused == {}
+
+
+def test_a_mission_that_was_recorded_in_two_bags(yard: Yard) -> None:
+    """The node was started again: the episode has the messages of both, and what no bag has in between is stale."""
+    yard.mission('one', 0, 8)
+    parts = [yard.bag('first', (0, 4), mission=of('one')), yard.bag('then', (5, 8), mission=of('one'))]
+    found = yard.export(max_stale=0.5)
+    assert found.refused == {}
+    assert list(yard.sources('one')) == [f'{parts[0]}first_0.mcap', f'{parts[1]}then_0.mcap']
+    assert told(found, 'one')['messages'] == 41 + 31
+    assert told(found, 'one')['longest_gap_s'] == pytest.approx(0.9, abs=0.06)
+
+
+def test_an_always_on_bag_has_the_beginning(yard: Yard) -> None:
+    """The mission's own bag begins two seconds late: before it the other one's messages are taken, and none twice."""
+    yard.mission('one', 10, 6)
+    yard.bag('always', (0, 13), hz=10)
+    own = yard.bag('own', (12, 16), mission=of('one'))
+    found = yard.export()
+    sources = yard.sources('one')
+    assert list(sources) == ['thor/rosbags/always/always_0.mcap', f'{own}own_0.mcap']
+    assert max(sources['thor/rosbags/always/always_0.mcap']) < min(sources[f'{own}own_0.mcap']) == NOON_NS + 12 * SECOND
+    stamps = np.array(sorted(stamp for some in sources.values() for stamp in some))
+    assert set(np.diff(stamps)) == {SECOND // 10}
+    assert told(found, 'one')['stale_share'] == 0
+
+
+def test_two_bags_of_no_mission_have_each_message_once(yard: Yard) -> None:
+    """Two recorders ran at the same time."""
+    yard.mission('one', 10)
+    yard.bag('this', (5, 20))
+    yard.bag('that', (6, 19))
+    found = yard.export()
+    assert list(yard.sources('one')) == ['thor/rosbags/that/that_0.mcap']
+    assert told(found, 'one')['messages'] == len(range(6 * 10, 14 * 10 + 1))
+
+
+@pytest.mark.parametrize('damage', [lambda _: None, lambda path: path.write_bytes(b'{"version": 1}')], ids=['none', 'damaged'])
+def test_a_bag_without_a_manifest_is_not_used(yard: Yard, damage: Callable[[Path], object]) -> None:
+    """Nothing says whose it is or what is in it: the objects are taken."""
+    yard.mission('one', 10)
+    prefix = yard.bag('foreign', (9, 15), hz=40, has_manifest=False)
+    damage(yard.settings.directory / 'sensor-data' / prefix / 'manifest.json')
+    found = yard.export()
+    assert (told(found, 'one')['from'], found.refused) == ('objects', {})
+
+
+def test_objects_from_before_a_mission_do_not_count(yard: Yard) -> None:
+    """A sensor had another topic, of which there are more objects in the hour before; the bag has more of the mission."""
+    old = [NOON_NS + round(step * SECOND / 2) for step in range(40)]
+    made = [yard.drive.one(COMPRESSED, [stamp], [cdr_of(yard.drive._ros, 'camera', stamp)], rate_hz=1000.0) for stamp in old]
+    yard.drive.store([replace(each, metadata={**each.metadata, 'topic': '/old'}) for each in made])
+    yard.mission('one', 30)
+    found = yard.export()
+    assert found.refused == {}
+    assert told(found, 'one')['topic'] == TOPICS['camera']
+
+
+def test_where_objects_have_more_of_the_mission(yard: Yard) -> None:
+    """Its own bag has less in the mission than the objects, and more in the ten seconds before it."""
+    yard.mission('one', 20, camera_hz=20.0, odom_hz=20.0)
+    yard.bag('own', (10, 19.5), (20, 24), hz=15, mission=of('one'))
+    found = yard.export()
+    assert told(found, 'one')['from'] == 'objects'
+    assert found.fps == 20
+
+
+# -- what would be exported ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Yard:
+    """A mission that can be exported; four that cannot, each for another reason; one that waits."""
+    made = Yard(tmp_path_factory.mktemp('mixed'))
+    made.mission('good', 0)
+    made.record(Mission('blind', begin_s=100, seconds=4, camera_hz=2, odom_hz=4, sensors=('camera', 'odom'), uncounted=('odom',)))
+    made.record(Mission('deaf', begin_s=200, seconds=4, camera_hz=2, odom_hz=4, sensors=('camera',)))
+    made.record(Mission('slow', begin_s=300, seconds=4, camera_hz=1, odom_hz=4, sensors=('camera', 'odom')))
+    made.record(Mission('late', begin_s=400, seconds=4, camera_hz=2, odom_hz=4, sensors=('camera', 'odom'), told_until_s=-3))
+    return made
+
+
+def test_a_dry_run_counts_what_would_be_exported(mixed: Yard) -> None:
+    """Who is refused for what is known without reading a message is refused in both, for the same reason, and counted once."""
+    dry = export(mixed.folder / 'dry', mixed.source, {'mission_type': 'patrol'}, ExportOptions(fps=2), is_dry=True)
+    real = mixed.export('real', fps=2)
+    assert list(dry.streams) == [each['mission_id'] for each in real.added] == ['good']
+    assert dry.refused == real.refused
+    assert sorted(dry.refused) == ['blind', 'deaf', 'slow']
+    assert (list(dry.waiting), list(real.waiting)) == (['late'], ['late'])
+    assert real.present == []
+    assert not (mixed.folder / 'dry').exists()
+
+
+def asked(yard: Yard, home: Path, *more: str) -> tuple[int, str]:
+    home.mkdir(exist_ok=True)
+    (home / 'store').symlink_to(yard.settings.directory) if not (home / 'store').exists() else None
+    runner = CliRunner(env={'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': None, 'COLUMNS': '200'})
+    arguments = ['lerobot', 'totals', '--to', str(home / 'totals'), '--mission-type', 'patrol', *more]
+    ran = runner.invoke(verb.export, arguments, standalone_mode=False, catch_exceptions=False)
+    return ran.return_value, ran.stdout
+
+
+@pytest.mark.parametrize(('more', 'total'), [
+    (('--fps', '2', '--dry-run'), '1 mission would be exported to'),
+    (('--fps', '2'), '1 episode added to'),
+    (('--fps', '2', '--mission', 'slow', '--dry-run'), '0 missions would be exported to'),
+    (('--fps', '2', '--mission', 'slow'), 'No mission was exported, 1 refused.'),
+])  # fmt: skip
+def test_the_totals_of_the_command(mixed: Yard, tmp_path: Path, more: Sequence[str], total: str) -> None:
+    """Refused ones are counted as such, and the exit code is 1, in a dry run and in a real one."""
+    code, output = asked(mixed, tmp_path / 'home', *more)
+    assert code == ExitCode.FINDING
+    assert total in output
+    if '--mission' not in more:
+        assert '3 refused, 1 waiting' in output
+        assert '0 in it already' in output
+
+
+def test_a_refused_mission_does_not_settle_the_rate(mixed: Yard) -> None:
+    """``--fps auto`` is the rate of the slowest camera of those that are exported."""
+    mixed.record(Mission('poor', begin_s=500, seconds=4, camera_hz=1, odom_hz=4, sensors=('camera', 'odom'), uncounted=('odom',)))
+    flags = {'where': "mission_id in ('good', 'poor')"}
+    found = export(mixed.folder / 'rate', mixed.source, flags, ExportOptions())
+    assert (found.fps, list(found.refused), Lerobot(mixed.folder / 'rate').mission_ids) == (2, ['poor'], ['good'])
+
+
+def test_spans_are_cut_out_of_each_other() -> None:
+    """What is left of a time has nothing of the others, and together with them it has all of it."""
+    from shadowhound_data_logger.datasets.series import Interval
+
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        first, *others = [Interval(*sorted(map(int, rng.integers(0, 30, 2)))) for _ in range(rng.integers(1, 6))]
+        left = first.without(others)
+        there = [step for one in left for step in range(one.first_ns, one.last_ns + 1)]
+        assert there == [step for step in range(first.first_ns, first.last_ns + 1)
+                         if not any(other.first_ns <= step <= other.last_ns for other in others)]  # fmt: skip
+        assert all(one.last_ns < other.first_ns for one, other in pairwise(left))
