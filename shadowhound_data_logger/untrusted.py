@@ -32,6 +32,8 @@ MOST_OBJECT_BYTES: Final = 64 << 20
 """Of an object that is decoded in memory: an archive is closed after 16 MiB of messages."""
 MOST_CHUNK_BYTES: Final = 128 << 20
 """Of a bag's chunk, packed and unpacked: rosbag2 makes them of 768 KB, or as large as their largest message."""
+PIECE_BYTES: Final = 4096
+"""Of damaged content: so much is lost where it cannot be unpacked."""
 MOST_PIXELS: Final = 1 << 25
 """Of a picture: 8K."""
 MOST_MEMBERS: Final = 20_000
@@ -175,6 +177,35 @@ def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes
     return found
 
 
+def partly_unpacked(compression: str, content: bytes, size: int) -> bytearray:
+    """What can still be unpacked of content that is torn or damaged: its beginning, of at most this size. Raises ValueError."""
+    check_size(size, MOST_CHUNK_BYTES)
+    if compression == 'zstd':
+        from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
+
+        reader: Any = ZstdDecompressor()
+        broken: tuple[type[Exception], ...] = (ZstdError, EOFError)
+    elif compression == 'lz4':
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped] # noqa: PLC0415
+
+        reader, broken = LZ4FrameDecompressor(), (RuntimeError, EOFError)
+    else:
+        raise ValueError(f'it is compressed with {compression!r}, which is not supported')
+    found = bytearray()
+    try:
+        for at in range(0, len(content), PIECE_BYTES):
+            piece = content[at : at + PIECE_BYTES]
+            while len(found) < size and not reader.eof:
+                more = reader.decompress(piece, min(size - len(found), MOST_SUMMARY_BYTES))
+                found += more
+                piece = b''
+                if reader.needs_input or not more:
+                    break
+    except broken:
+        pass
+    return found
+
+
 def _zstd(content: bytes, size: int) -> tuple[bytes, bool]:
     from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
 
@@ -190,7 +221,7 @@ def _zstd(content: bytes, size: int) -> tuple[bytes, bool]:
 
 
 def _lz4(content: bytes, size: int) -> tuple[bytes, bool]:
-    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped] # noqa: PLC0415
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
 
     reader = LZ4FrameDecompressor()
     return bytes(reader.decompress(content, size + 1)), bool(reader.eof)

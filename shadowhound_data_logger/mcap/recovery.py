@@ -1,10 +1,9 @@
-"""Repairs slices that were not closed, and tells what a whole slice holds.
+"""Completes slices that were not closed, in place, and reads what a complete slice holds.
 
 A slice whose writer was killed, or whose disk lost power, ends where it was last synced or somewhere after: with a torn
-chunk, zeros, anything. Every chunk with a valid CRC-32 is kept, up to the last one; the file is repaired in place, so that a
-large slice takes neither memory nor a second copy. Every step can be interrupted and repeated. Whatever the file claims,
-recovery takes the memory of one chunk, packed and unpacked, each at most ``MOST_CHUNK_BYTES``, and of the summary's content, at
-most ``MOST_SUMMARY_BYTES`` before Python's overhead.
+chunk, zeros, anything. ``salvage.py`` finds what is intact; here it becomes a complete file without a second copy, for which a
+full disk has no room. Every step can be interrupted and repeated. Whatever the file claims, this takes the memory of one chunk,
+packed and unpacked, and of the summary's content, at most ``MOST_SUMMARY_BYTES`` before Python's overhead.
 
 This repairs the bytes of a slice; ``bags/recovery.py`` decides about a bag, ``spool/recovery.py`` repairs a spool.
 """
@@ -14,58 +13,38 @@ from __future__ import annotations
 import logging
 import os
 import struct
-import zlib
-from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Metadata
+from mcap.records import Metadata
 
 from shadowhound_data_logger.durable_files import fingerprint, sync
-from shadowhound_data_logger.mcap.format import (
-    CHUNK,
-    MESSAGE,
-    MESSAGE_FIELDS,
-    RECORD,
-    ChannelTrack,
-    ChunkPacking,
-    Contents,
-    head,
-    record,
-    span,
-    text,
-)
+from shadowhound_data_logger.mcap import salvage
+from shadowhound_data_logger.mcap.format import RECORD, ChannelTrack, Contents, head, record, span, text
 from shadowhound_data_logger.mcap.index import UNREADABLE, Schemas, parsed, read_index
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
+from shadowhound_data_logger.mcap.salvage import PRIVATE, IntactChunk, IntactRecord, Piece, Salvage
 from shadowhound_data_logger.mcap.slice_info import Damage, SliceInfo
 from shadowhound_data_logger.mcap.writer import OPEN
-from shadowhound_data_logger.zstd import ZstdDecompressor, ZstdError
 
-MOST_CHUNK_BYTES: Final = 256 << 20
-MOST_SUMMARY_BYTES: Final = 64 << 20
-RETIRED: Final = 0x80
-"""Added to the first byte of a record that is damaged: what begins with 0x80 or more is skipped by every reader."""
-_DATA: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA})
 _ENDING: Final = text('rosbag2')
-"""What the metadata record begins with that follows the last chunk of a slice that was being closed; it is written anew."""
-_SUSPECT_BYTES: Final = 200
-"""In memory, with its repair."""
+"""The beginning of the metadata record that follows the last chunk of a slice that was being closed; it is written again."""
 _INDEX_HEAD: Final = 6
 _INDEX_ENTRY: Final = 16
 
 
 @dataclass(slots=True)
 class SliceScan:
-    """Finds what is whole in a file, and how it becomes a slice: write the repairs, cut it off at ``end``, append the ending."""
+    """What is intact in a slice, and how it becomes complete: write the repairs, cut it off at ``end``, append the ending."""
 
     contents: Contents = field(default_factory=Contents)
     end: int = 0
-    """Where the last whole record ends."""
+    """Where the last intact record ends."""
     repairs: list[tuple[int, bytes]] = field(default_factory=list)
     """(offset, content)."""
     tail_bytes: int = 0
@@ -77,181 +56,126 @@ class SliceScan:
         return Damage(self.tail_bytes, self.lost_chunks, self.lost_messages)
 
 
-class _Damaged(Exception):
-    """A record is not what its writer wrote."""
-
-
 def scan(file: int) -> SliceScan:
     """Scan an open file. Raises only OSError."""
     return _Scanner(file).run()
 
 
+@dataclass(slots=True)
+class _Suspects:
+    """Bytes since the last intact record. If another one follows, they become one record that readers skip."""
+
+    at: int
+    chunks: int = 0
+    messages: int = 0
+
+
 class _Scanner:
-    """One pass over one file. What is damaged is a suspect until something whole follows it; at the end it is the torn tail."""
+    """One pass over one file."""
 
     def __init__(self, file: int) -> None:
-        self._file = file
-        self._size = os.fstat(file).st_size
-        self._found = SliceScan()
+        self._salvage = Salvage(file)
+        self._found = SliceScan(end=len(head()))
         self._tracks = self._found.contents.tracks
         self._schemas = Schemas()
         self._held_bytes = 0
-        self._suspects: list[tuple[int, int]] = []
-        """(offset, opcode) of records since the last whole one."""
-        self._suspect_messages = 0
+        self._suspects: _Suspects | None = None
 
     def run(self) -> SliceScan:
-        at = self._found.end = self._header()
-        while at < self._size:
-            start = os.pread(self._file, RECORD.size, at)
-            op, length = RECORD.unpack(start) if len(start) == RECORD.size else (0, 0)
-            if op == Opcode.METADATA and _ENDING.startswith(os.pread(self._file, len(_ENDING), at + RECORD.size)):
+        found, size = self._found, self._salvage.size
+        if self._salvage.read(0, found.end) != head():
+            found.repairs.append((0, head()))
+        end = size
+        for piece in self._salvage.pieces():
+            if piece.at + piece.size <= found.end:
+                continue  # the header, or the message indexes of a chunk
+            if self._is_ending(piece) or self._held_bytes > salvage.MOST_SUMMARY_BYTES:
+                end = piece.at
                 break
-            after = at + RECORD.size + length
-            if after > self._size or op & ~RETIRED not in _DATA or self._held_bytes > MOST_SUMMARY_BYTES:
-                self._suspects.append((at, op))
-                at = self._size
-                break
-            at = self._record(op, at, length)
-        torn = self._suspects[0][0] if self._suspects else at
-        self._found.tail_bytes = max(at - torn, 0)
-        self._found.lost_messages += self._suspect_messages
-        return self._found
+            if piece.at < found.end or not self._accept(piece):
+                self._suspect(piece)
+        if self._held_bytes > salvage.MOST_SUMMARY_BYTES:
+            self._suspects, end = self._suspects or _Suspects(end), size
+        if self._suspects is not None:
+            found.tail_bytes = max(end - self._suspects.at, 0)
+            found.lost_messages += self._suspects.messages
+        return found
 
-    def _header(self) -> int:
-        """Where the records begin; a header that is damaged is written anew, for every slice has the same."""
-        wanted = head()
-        if os.pread(self._file, len(wanted), 0) != wanted:
-            self._found.repairs.append((0, wanted))
-        return len(wanted)
+    def _is_ending(self, piece: Piece) -> bool:
+        if not isinstance(piece, (IntactRecord, salvage.Damaged)) or piece.op not in {Opcode.METADATA, 0}:
+            return False
+        start = self._salvage.read(piece.at, RECORD.size + len(_ENDING))
+        return start[:1] == bytes([Opcode.METADATA]) and _ENDING.startswith(start[RECORD.size :])
 
-    def _record(self, op: int, at: int, length: int) -> int:
-        """Take in one record; where the next one begins."""
-        after = at + RECORD.size + length
-        try:
-            if op == Opcode.CHUNK:
-                after = self._chunk(at, length)
-            elif op in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                self._declare(op, at, length)
-            elif op == Opcode.METADATA:
-                self._metadata(at, length)
-            else:  # retired by a recovery before this one, or the index of a chunk that is not whole
-                self._suspect(op, at, length)
-                return after
-        except _Damaged:
-            self._suspect(op, at, length)
-            return after
-        self._accept(after)
-        return after
-
-    def _suspect(self, op: int, at: int, length: int) -> None:
-        self._suspects.append((at, op))
-        self._held_bytes += _SUSPECT_BYTES
-        if op & ~RETIRED == Opcode.MESSAGE_INDEX:
-            self._suspect_messages += max(length - _INDEX_HEAD, 0) // _INDEX_ENTRY
-
-    def _accept(self, after: int) -> None:
-        """All up to here stays: suspects in between are skipped from now on."""
-        found = self._found
-        found.repairs += [(at, bytes([op | RETIRED])) for at, op in self._suspects]
-        found.lost_chunks += sum(op & ~RETIRED == Opcode.CHUNK for _, op in self._suspects)
-        found.lost_messages += self._suspect_messages
+    def _accept(self, piece: Piece) -> bool:
+        """Whether a piece stays in the slice; suspects before it are skipped by readers from now on."""
+        found, suspects = self._found, self._suspects
+        if suspects is not None and piece.at - suspects.at < RECORD.size:
+            return False  # there is no room for a record
+        after = piece.at + piece.size
+        if isinstance(piece, IntactChunk) and piece.contents.messages and not piece.contents.declarations:
+            after = self._chunk(piece)
+        elif not isinstance(piece, IntactRecord) or not self._take(piece):
+            return False
+        if suspects is not None:
+            op = Opcode.CHUNK if suspects.chunks else 0
+            self._repair(suspects.at, RECORD.pack(PRIVATE | op, piece.at - suspects.at - RECORD.size))
+            found.lost_chunks += suspects.chunks
+            found.lost_messages += suspects.messages
+            self._suspects = None
         found.end = after
-        self._suspects, self._suspect_messages = [], 0
+        return True
 
-    def _declare(self, op: int, at: int, length: int) -> None:
-        """A schema or channel."""
-        if length > MOST_SUMMARY_BYTES:
-            raise _Damaged
-        content = self._read(at + RECORD.size, length)
+    def _suspect(self, piece: Piece) -> None:
+        if self._suspects is None:
+            self._suspects = _Suspects(max(piece.at, self._found.end))
+        if isinstance(piece, IntactChunk) or piece.op & ~PRIVATE == Opcode.CHUNK:
+            self._suspects.chunks += 1
+        elif piece.op == Opcode.MESSAGE_INDEX:
+            self._suspects.messages += (piece.size - RECORD.size - _INDEX_HEAD) // _INDEX_ENTRY
+
+    def _take(self, piece: IntactRecord) -> bool:
+        """Take in a schema, a channel or metadata."""
         contents = self._found.contents
-        known = contents.schemas if op == Opcode.SCHEMA else contents.declared
-        number, schema = int.from_bytes(content[:2], 'little'), int.from_bytes(content[2:4], 'little')
-        if number in known or (op == Opcode.CHANNEL and schema not in contents.schemas):
-            raise _Damaged
+        if piece.content is None:
+            return False
+        if piece.op == Opcode.METADATA:
+            contents.add_metadata(piece.at, piece.size, parsed(Metadata, piece.content).name)
+            self._held_bytes += len(contents.metadata[-1])
+            return True
+        if piece.op not in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            return False
+        known = contents.schemas if piece.op == Opcode.SCHEMA else contents.declared
+        number, schema = int.from_bytes(piece.content[:2], 'little'), int.from_bytes(piece.content[2:4], 'little')
+        if number in known or (piece.op == Opcode.CHANNEL and schema not in contents.schemas):
+            return False
         try:
-            self._schemas.add(op, content)
-        except UNREADABLE as error:
-            raise _Damaged from error
-        self._held_bytes += length
-        known[number] = record(op, content)
-        if op == Opcode.CHANNEL:
+            self._schemas.add(piece.op, piece.content)
+        except UNREADABLE:
+            return False
+        self._held_bytes += len(piece.content)
+        known[number] = record(piece.op, piece.content)
+        if piece.op == Opcode.CHANNEL:
             self._tracks[number] = ChannelTrack(number, self._schemas.channels[number])
+        return True
 
-    def _metadata(self, at: int, length: int) -> None:
-        if length > MOST_SUMMARY_BYTES:
-            raise _Damaged
-        try:
-            name = parsed(Metadata, self._read(at + RECORD.size, length)).name
-        except UNREADABLE as error:
-            raise _Damaged from error
-        self._found.contents.add_metadata(at, RECORD.size + length, name)
-        self._held_bytes += len(self._found.contents.metadata[-1])
-
-    def _chunk(self, at: int, length: int) -> int:
-        """A chunk with the message indexes behind it; where they end."""
-        if length > MOST_CHUNK_BYTES:
-            raise _Damaged
-        body = self._read(at + RECORD.size, length)
-        raw, packed = _unpack(body)
-        tracks = self._walk(raw)
-        if CHUNK.unpack_from(body)[:2] != (times := span(tracks)):
-            self._repair(at + RECORD.size, struct.pack('<QQ', *times))
-        after = at + RECORD.size + length
-        contents = self._found.contents
-        indexes = contents.chunk(at, packed, tracks)
-        self._held_bytes += len(contents.chunks[-1])
-        if os.pread(self._file, len(indexes), after) != indexes:
-            self._repair(after, indexes)
-        return after + len(indexes)
-
-    def _walk(self, raw: memoryview) -> list[ChannelTrack]:
-        """The tracks of a chunk's messages with their indexes, in the order in which the writer has them."""
-        indexes: dict[int, array[int]] = {}
-        at, end = 0, len(raw)
-        try:
-            while at < end:
-                op, length, number, _, log_ns, _ = MESSAGE.unpack_from(raw, at)
-                index = indexes.get(number)
-                if index is None:
-                    index = indexes[number] = array('Q')
-                index.append(log_ns)
-                index.append(at)
-                at += RECORD.size + length
-                if op != Opcode.MESSAGE or length < MESSAGE_FIELDS:
-                    raise _Damaged
-        except struct.error as error:
-            raise _Damaged from error
-        if at != end or not indexes or not indexes.keys() <= self._tracks.keys():
-            raise _Damaged
-        for number, index in indexes.items():
+    def _chunk(self, piece: IntactChunk) -> int:
+        """Take in a chunk, with the message indexes after it; where they end."""
+        for number, index in piece.contents.index.items():
             self._tracks[number].index = index
-        return [track for track in self._tracks.values() if track.index]
+        tracks = [track for track in self._tracks.values() if track.index]
+        contents, after = self._found.contents, piece.at + piece.size
+        header = RECORD.pack(Opcode.CHUNK, piece.size - RECORD.size) + struct.pack('<QQ', *span(tracks))
+        indexes = contents.chunk(piece.at, piece.packing, tracks)
+        self._held_bytes += len(contents.chunks[-1])
+        for at, content in ((piece.at, header), (after, indexes)):
+            if self._salvage.read(at, len(content)) != content:
+                self._repair(at, content)
+        return after + len(indexes)
 
     def _repair(self, at: int, content: bytes) -> None:
         self._held_bytes += len(content)
         self._found.repairs.append((at, content))
-
-    def _read(self, at: int, length: int) -> bytes:
-        body = os.pread(self._file, length, at)
-        if len(body) != length:
-            raise _Damaged
-        return body
-
-
-def _unpack(body: bytes) -> tuple[memoryview, ChunkPacking]:
-    """The records in a chunk, checked."""
-    try:
-        chunk = parsed(Chunk, body)
-        if chunk.uncompressed_size > MOST_CHUNK_BYTES or chunk.compression not in {'', 'zstd'}:
-            raise _Damaged
-        packed = ChunkPacking(chunk.compression, len(chunk.data), chunk.uncompressed_size)
-        raw = ZstdDecompressor().decompress(chunk.data, packed.size + 1) if chunk.compression else chunk.data
-    except (*UNREADABLE, ZstdError) as error:
-        raise _Damaged from error
-    if len(raw) != packed.size or zlib.crc32(raw) != chunk.uncompressed_crc:
-        raise _Damaged
-    return memoryview(raw), packed
 
 
 log = logging.getLogger(__name__)
@@ -260,10 +184,10 @@ _EVER = (0, 1 << 64)
 
 
 def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
-    """Turn ``<name>.mcap.open`` into ``<name>.mcap``; what had to be left out stands in its ``damage``.
+    """Turn ``<name>.mcap.open`` into ``<name>.mcap``; its ``damage`` is what could not be kept.
 
-    Never fails for what the file holds: of one with nothing whole in it an empty slice is left. Raises OSError when it cannot
-    be read or written, FileExistsError when a file has its final name already.
+    Never fails for what the file holds: one with nothing intact in it becomes an empty slice. Raises OSError if it cannot
+    be read or written, FileExistsError if a file has its final name already.
     """
     if not path.name.endswith(OPEN):
         raise ValueError(f'{path} is not an open slice')

@@ -109,13 +109,12 @@ def test_a_byte_that_flipped(tmp_path: Path, opened: bytes, data: st.DataObject)
 
 @pytest.mark.parametrize('op', [*range(0x12), 0x7F])
 def test_a_chunk_that_is_called_something_else(tmp_path: Path, opened: bytes, op: int) -> None:
-    """What is lost is told, whatever the first byte of a record was turned into."""
+    """It is found by its fields and its checksum, whatever the first byte of its record was turned into."""
     at = [place for place in range(len(opened)) if opened[place : place + 9] == opened[opened.index(b'\x06') :][:9]][2]
     content = bytearray(opened)
     content[at] = op
     info = recovered(tmp_path, bytes(content))
-    assert info.damage is not None
-    assert (info.messages == COUNT) == (op == 0x06) == (info.damage == Damage(0, 0, 0))
+    assert (info.messages, info.damage) == (COUNT, Damage(0, 0, 0))
 
 
 def test_a_broken_chunk_in_the_middle(tmp_path: Path, opened: bytes) -> None:
@@ -164,7 +163,7 @@ class Killed(BaseException):
     """What no handler may catch."""
 
 
-@pytest.mark.parametrize('after', range(7))
+@pytest.mark.parametrize('after', range(5))
 def test_killed_while_recovering(tmp_path: Path, opened: bytes, after: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Recovery that was cut short at any step, also within a write, is done again with the same result."""
     marked = WRITTEN[A_CHUNK + 1].cdr

@@ -1,0 +1,473 @@
+"""Finds what is intact in an MCAP file, whatever happened to it: torn anywhere, bits flipped, bytes lost or added.
+
+One pass in the order of the file. A chunk is intact if its CRC-32 matches (or has none, and its records are complete); a record
+outside of chunks is intact if its fields are consistent and another record follows it. After damage, the next intact record is
+searched for. Whatever the file claims, this takes the memory of one chunk, packed and unpacked, ``MOST_CHUNK_BYTES`` each, and of
+its schemas and channels, at most ``MOST_SUMMARY_BYTES``; the search reads each byte a few times at most.
+
+``recovery.py`` completes an open slice of ours in place, ``repair.py`` copies any file: both use this.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from array import array
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, Header, Metadata, Schema
+
+from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, RECORD, ChunkPacking
+from shadowhound_data_logger.mcap.index import UNREADABLE, parsed
+from shadowhound_data_logger.untrusted import partly_unpacked, unpacked
+
+MOST_CHUNK_BYTES: Final = 128 << 20
+"""Packed and unpacked; larger chunks are not read by this package (``untrusted.py``)."""
+MOST_SUMMARY_BYTES: Final = 64 << 20
+PRIVATE: Final = 0x80
+"""Opcodes from here on are private: readers skip them. ``recovery.py`` adds it to the opcode of a damaged record."""
+BLOCK_BYTES: Final = 1 << 20
+SEARCHES: Final = 4
+"""How often the search for intact records may read the file, on average."""
+_LEAST: Final[Mapping[int, int]] = {
+    Opcode.HEADER: 8, Opcode.FOOTER: 20, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: 22, Opcode.CHUNK: 40,
+    Opcode.MESSAGE_INDEX: 6, Opcode.CHUNK_INDEX: 56, Opcode.ATTACHMENT: 36, Opcode.ATTACHMENT_INDEX: 48, Opcode.STATISTICS: 46,
+    Opcode.METADATA: 8, Opcode.METADATA_INDEX: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4,
+}  # fmt: skip
+"""Bytes of a record's content, at least."""
+_SUMMARY: Final = frozenset({
+    Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET, Opcode.FOOTER,
+})  # fmt: skip
+"""What may follow the end of the data."""
+_START: Final = re.compile(rb'(?=[\x02-\x07\x09\x0c\x0f].{5}\x00{3})', re.DOTALL)
+"""Of a record that the search may find: one with content of its own, shorter than a terabyte."""
+_CHUNK_FIELDS: Final = 40
+_INDEX_HEAD: Final = 6
+_INDEX_ENTRY: Final = 16
+_DECLARED: Final[Mapping[int, type[Schema | Channel]]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+
+
+@dataclass(frozen=True, slots=True)
+class IntactRecord:
+    """An intact record outside of chunks, or an unknown one. ``size`` is that of the whole record."""
+
+    at: int
+    size: int
+    op: int
+    content: bytes | None
+    """None if it is large or of no interest here: then it is only copied."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkContents:
+    """The records in a chunk."""
+
+    raw: memoryview
+    index: dict[int, array[int]]
+    """Of each channel with messages, in the order of the first ones: log time, offset, ..."""
+    declarations: tuple[tuple[int, bytes], ...]
+    """Opcode and content of its schemas and channels."""
+    lost: int = 0
+    """Messages of channels that are not declared anywhere: they are not in ``raw`` and ``index``."""
+
+    @property
+    def messages(self) -> int:
+        return sum(len(entries) for entries in self.index.values()) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class IntactChunk:
+    """A chunk that can be kept as it is. ``size`` is that of its record."""
+
+    at: int
+    size: int
+    packing: ChunkPacking
+    times: tuple[int, int]
+    """As the chunk itself gives them; not verified by anything."""
+    contents: ChunkContents
+
+
+@dataclass(frozen=True, slots=True)
+class Damaged:
+    """Bytes that are not, or not completely, what a writer wrote."""
+
+    at: int
+    size: int
+    op: int
+    """Of the record that begins there; 0 if unknown."""
+    what: str
+    is_torn: bool = False
+    """Whether a record begins there that would end after the end of the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Salvaged:
+    """What could be read of a damaged chunk."""
+
+    what: str
+    contents: ChunkContents | None
+    is_verified: bool
+    """Whether nothing contradicts the contents: false where a checksum does not match."""
+    is_complete: bool
+    """Whether it is known that these are all messages of the chunk, but for the ones that are counted as lost."""
+    times: tuple[int, int] | None
+    """As the chunk itself gives them, if its header can be read."""
+
+
+Piece = IntactRecord | IntactChunk | Damaged
+
+
+@dataclass(slots=True)
+class Declarations:
+    """The schemas and channels of a file, by id: contents of their records."""
+
+    schemas: dict[int, bytes] = field(default_factory=dict)
+    channels: dict[int, bytes] = field(default_factory=dict)
+    size: int = 0
+
+    def add(self, op: int, content: bytes) -> None:
+        """Keeps the first one of an id. The content was parsed before."""
+        known = self.schemas if op == Opcode.SCHEMA else self.channels
+        number = int.from_bytes(content[:2], 'little')
+        if number not in known:
+            known[number] = content
+            self.size += len(content)
+
+    def has_schema_of(self, channel: bytes) -> bool:
+        number = int.from_bytes(channel[2:4], 'little')
+        return not number or number in self.schemas
+
+
+class Salvage:
+    """The pieces of a file, in order; together they cover it up to its end.
+
+    New with an open file; ``pieces`` once.
+    """
+
+    def __init__(self, file: int, told: Callable[[int], None] = lambda _: None) -> None:
+        """``told`` is called with the number of bytes that were passed."""
+        self._file = file
+        self.size = os.fstat(file).st_size
+        self.hints = Declarations()
+        """Of the summary, where the end of the file is intact: some may be damaged in the data."""
+        self.known = Declarations()
+        """Found in the data so far."""
+        self._told = told
+        self._left = SEARCHES * self.size + (16 << 20)
+        """Bytes that the search may still read."""
+
+    def pieces(self) -> Iterator[Piece]:
+        """Raises only OSError. Ends after the record that ends the data, or at the end of the file."""
+        self._read_hints()
+        at = 0
+        while at < self.size:
+            piece: Piece | None = self._first() if not at else self._piece(at)
+            if piece is None or (isinstance(piece, IntactRecord) and self._is_doubtful(piece)):
+                piece = self._damaged(at)
+            elif isinstance(piece, IntactRecord) and piece.op in _DECLARED and piece.content is not None:
+                self.known.add(piece.op, piece.content)
+            elif isinstance(piece, IntactChunk):
+                for op, content in piece.contents.declarations:
+                    self.known.add(op, content)
+            if self.known.size > MOST_SUMMARY_BYTES:
+                piece = Damaged(at, self.size - at, 0, f'its schemas and channels have more than {MOST_SUMMARY_BYTES:,} bytes')
+            yield piece
+            self._told(piece.size)
+            at = piece.at + piece.size
+            if isinstance(piece, IntactRecord) and piece.op == Opcode.DATA_END:
+                return
+
+    def read(self, at: int, length: int) -> bytes:
+        return os.pread(self._file, length, at)
+
+    # -- one piece -------------------------------------------------------------------------------------------------
+
+    def _first(self) -> IntactRecord | None:
+        """The magic bytes with the header."""
+        at = len(MAGIC)
+        op, length = self._head(at)
+        if self.read(0, at) != MAGIC or op != Opcode.HEADER or not self._fits(at, op, length) or length > BLOCK_BYTES:
+            return None
+        content = self.read(at + RECORD.size, length)
+        if not _can_parse(Header, content):
+            return None
+        return IntactRecord(0, at + RECORD.size + length, op, content)
+
+    def _piece(self, at: int) -> IntactRecord | IntactChunk | None:
+        """The intact piece that begins there; None if there is none."""
+        op, length = self._head(at)
+        fits = self._fits(at, op, length)
+        if op == Opcode.CHUNK and fits and length <= MOST_CHUNK_BYTES and (chunk := self._chunk(at, length)):
+            return chunk
+        if op not in _LEAST and (chunk := self._misnamed_chunk(at)):
+            return chunk
+        if fits and op != Opcode.CHUNK and (record := self._record(at, op, length)):
+            return record
+        return self._misnamed_chunk(at)
+
+    def _record(self, at: int, op: int, length: int) -> IntactRecord | None:
+        size, start = RECORD.size + length, at + RECORD.size
+        content: bytes | None = None
+        if op == Opcode.ATTACHMENT:
+            is_intact = self._is_attachment(at, length)
+        elif op == Opcode.DATA_END:
+            next_op, next_length = self._head(at + size)
+            is_intact = length == _LEAST[op] and next_op in _SUMMARY and self._fits(at + size, next_op, next_length)
+            content = self.read(start, length)
+        elif op == Opcode.FOOTER:
+            is_intact = length == _LEAST[op] and self.read(at + size, len(MAGIC)) == MAGIC
+        elif op == Opcode.MESSAGE:
+            is_intact = length <= MOST_CHUNK_BYTES and self._knows(int.from_bytes(self.read(start, 2), 'little'))
+            content = self.read(start, length) if is_intact else None
+        elif op == Opcode.MESSAGE_INDEX:
+            entries = int.from_bytes(self.read(start + 2, 4), 'little')
+            is_intact = entries + _INDEX_HEAD == length and not entries % _INDEX_ENTRY
+        elif op in _DECLARED or op == Opcode.METADATA:
+            content = self.read(start, length) if length <= MOST_SUMMARY_BYTES else None
+            is_intact = content is not None and _can_parse(_DECLARED.get(op, Metadata), content)
+        else:
+            is_intact = op > Opcode.DATA_END
+        return IntactRecord(at, size, op, content) if is_intact else None
+
+    def _is_attachment(self, at: int, length: int) -> bool:
+        """Whether the lengths in it add up, and its CRC-32 matches if it has one."""
+        start, end = at + RECORD.size, at + RECORD.size + length
+        place = start + 16
+        for _ in range(2):  # name and media type
+            place += 4 + int.from_bytes(self.read(place, 4), 'little')
+            if place + 8 > end:
+                return False
+        place += 8 + int.from_bytes(self.read(place, 8), 'little')
+        if place + 4 != end:
+            return False
+        told = int.from_bytes(self.read(place, 4), 'little')
+        return not told or self._crc(start, place) == told
+
+    def _crc(self, start: int, end: int) -> int:
+        found = 0
+        while start < end and (block := self.read(start, min(BLOCK_BYTES, end - start))):
+            found = zlib.crc32(block, found)
+            start += len(block)
+        return found
+
+    def _chunk(self, at: int, length: int) -> IntactChunk | None:
+        try:
+            chunk = parsed(Chunk, self.read(at + RECORD.size, length))
+            packing = ChunkPacking(chunk.compression, len(chunk.data), chunk.uncompressed_size)
+            raw = unpacked(chunk.compression, chunk.data, packing.size) if chunk.compression else chunk.data
+        except (*UNREADABLE, ValueError):
+            return None
+        if len(raw) != packing.size or (chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc):
+            return None
+        contents, end = self._walk(memoryview(raw))
+        if end != len(raw) or contents.lost:
+            return None
+        return IntactChunk(at, RECORD.size + length, packing, (chunk.message_start_time, chunk.message_end_time), contents)
+
+    def _misnamed_chunk(self, at: int) -> IntactChunk | None:
+        """A chunk whose opcode or length is damaged: its own fields give its length, and its CRC-32 confirms it."""
+        head = self.read(at + RECORD.size, _CHUNK_FIELDS + 4)
+        if len(head) < _CHUNK_FIELDS:
+            return None
+        name_length = int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
+        if name_length not in {0, 3, 4} or not int.from_bytes(head[CHUNK.size - 4 : CHUNK.size], 'little'):
+            return None
+        place = CHUNK.size + 4 + name_length
+        length = place + 8 + int.from_bytes(head[place : place + 8], 'little')
+        if length > MOST_CHUNK_BYTES or at + RECORD.size + length > self.size or not self._spend(length):
+            return None
+        return self._chunk(at, length)
+
+    def _walk(self, raw: memoryview) -> tuple[ChunkContents, int]:
+        """The records in a chunk, and where the first incomplete one begins. Messages of unknown channels are removed."""
+        index: dict[int, array[int]] = {}
+        declared = Declarations()
+        declarations: list[tuple[int, bytes]] = []
+        parts: list[memoryview] = []
+        at, start, removed, lost, end = 0, 0, 0, 0, len(raw)
+        while at + RECORD.size <= end:
+            op, length = RECORD.unpack_from(raw, at)
+            after = at + RECORD.size + length
+            if after > end or length < _LEAST.get(op, 0) or not op:
+                break
+            if op == Opcode.MESSAGE:
+                number, _, log_ns = struct.unpack_from('<HIQ', raw, at + RECORD.size)
+                if number not in index and not self._knows(number, declared):
+                    parts.append(raw[start:at])
+                    removed, start, lost = removed + after - at, after, lost + 1
+                else:
+                    index.setdefault(number, array('Q')).extend((log_ns, at - removed))
+            elif op in _DECLARED:
+                content = bytes(raw[at + RECORD.size : after])
+                if not _can_parse(_DECLARED[op], content):
+                    break
+                declared.add(op, content)
+                declarations.append((op, content))
+            at = after
+        kept = raw[start:at]
+        if parts:
+            kept = memoryview(b''.join([*parts, kept]))
+        return ChunkContents(kept, index, tuple(declarations), lost), at
+
+    # -- damage ----------------------------------------------------------------------------------------------------
+
+    def _is_doubtful(self, record: IntactRecord) -> bool:
+        """Whether a record has nothing but its own length to confirm it, and what follows is not a record."""
+        if record.op != Opcode.MESSAGE and record.op <= Opcode.DATA_END:
+            return False
+        after = record.at + record.size
+        if self._is_record(after):
+            return False
+        found = self._search(record.at + 1)
+        return found < self.size and found != after
+
+    def _damaged(self, at: int) -> Damaged:
+        op, length = self._head(at)
+        fits = self._fits(at, op, length)
+        if not at:
+            end = self._search(1)
+            return Damaged(0, end, 0, 'the beginning of the file is missing')
+        end = at + RECORD.size + length
+        if not fits or (end < self.size and not self._is_strong(end)):
+            end = self._search(at + 1)
+        is_torn = end == self.size and not fits and bool(op)
+        if op == Opcode.CHUNK:
+            return Damaged(at, end - at, op, 'a chunk', is_torn)
+        return Damaged(at, end - at, op if fits else 0, _name(op, is_torn=is_torn), is_torn)
+
+    def salvaged(self, damaged: Damaged) -> Salvaged:
+        """What can be read of a chunk that is torn, or contradicts itself."""
+        start, is_torn = damaged.at + RECORD.size, damaged.is_torn
+        head = self.read(start, min(damaged.size - RECORD.size, _CHUNK_FIELDS + 256))
+        what = 'a chunk that is torn' if is_torn else 'a chunk whose header is damaged'
+        if len(head) < _CHUNK_FIELDS:
+            return Salvaged(what, None, False, False, None)
+        start_ns, end_ns, size, crc = CHUNK.unpack_from(head)
+        times = (start_ns, end_ns) if start_ns <= end_ns else None
+        place = CHUNK.size + 4 + int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
+        if place + 8 > len(head) or size > MOST_CHUNK_BYTES:
+            return Salvaged(what, None, False, False, times)
+        name = head[CHUNK.size + 4 : place].decode(errors='replace')
+        packed = min(int.from_bytes(head[place : place + 8], 'little'), damaged.size - RECORD.size - place - 8, MOST_CHUNK_BYTES)
+        data = self.read(start + place + 8, packed)
+        if is_torn:
+            try:
+                raw = partly_unpacked(name, data, size) if name else data
+            except ValueError as error:
+                return Salvaged(f'a chunk: {error}', None, False, False, times)
+            return Salvaged(what, self._walk(memoryview(raw))[0], True, False, times)
+        return self._contradictory(name, data, size, crc, times)
+
+    def _contradictory(self, name: str, data: bytes, size: int, crc: int, times: tuple[int, int] | None) -> Salvaged:
+        """A chunk that is all there: its checksum says which of its fields are wrong."""
+        best, what = None, f'a chunk that is compressed with {name[:20]!r}, which is not supported'
+        for compression in dict.fromkeys((name, 'zstd', 'lz4', '')):
+            if compression not in {'zstd', 'lz4', ''}:
+                continue
+            raw = partly_unpacked(compression, data, MOST_CHUNK_BYTES if crc else size) if compression else data
+            contents, end = self._walk(memoryview(raw))
+            if crc and zlib.crc32(raw) == crc:
+                what = f'{contents.lost} messages of unknown channels' if contents.lost else 'wrong fields of a chunk'
+                return Salvaged(what, contents, True, end == len(raw), times)
+            if compression == name:
+                is_whole = not crc and len(raw) == size and end == size
+                what = 'a chunk whose checksum does not match' if crc else 'a chunk with records that are not complete'
+                what = f'{contents.lost} messages of unknown channels' if is_whole and contents.lost else what
+                best = Salvaged(what, contents, is_whole, is_whole, times)
+        return best or Salvaged(what, None, False, False, times)
+
+    def _search(self, start: int) -> int:
+        """Where the next intact piece begins; the end of the file if there is none, or it would take too long to find it."""
+        while start < self.size and self._spend(BLOCK_BYTES // 16):
+            block = self.read(start, BLOCK_BYTES + RECORD.size)
+            for match in _START.finditer(block, 0, min(BLOCK_BYTES, len(block)) + RECORD.size):
+                at = start + match.start()
+                if match.start() < BLOCK_BYTES and self._is_strong(at):
+                    return at
+                if self._left <= 0:
+                    return self.size
+            self._spend(len(block))
+            start += BLOCK_BYTES
+        return self.size
+
+    def _is_strong(self, at: int) -> bool:
+        """Whether a record found by the search is surely one: verified by its checksum, or followed by another."""
+        op, length = self._head(at)
+        if not self._fits(at, op, length) or not self._spend(min(length, MOST_CHUNK_BYTES)):
+            return False
+        piece = self._piece(at)
+        if piece is None:
+            return False
+        after = at + piece.size
+        if isinstance(piece, IntactChunk) and self.read(at + RECORD.size + 24, 4) != bytes(4):
+            return True
+        if after >= self.size:
+            return op != Opcode.MESSAGE_INDEX if isinstance(piece, IntactRecord) else bool(piece.contents.messages)
+        return op == Opcode.FOOTER or self._is_record(after)
+
+    def _is_record(self, at: int) -> bool:
+        """Whether a record seems to begin there; also one that is torn, at the end of the file."""
+        if at + RECORD.size > self.size:
+            return True
+        op, length = self._head(at)
+        if self._fits(at, op, length):
+            return True
+        return op in {Opcode.CHUNK, Opcode.MESSAGE} and _LEAST[op] <= length <= MOST_CHUNK_BYTES
+
+    # -- helpers ---------------------------------------------------------------------------------------------------
+
+    def _head(self, at: int) -> tuple[int, int]:
+        start = self.read(at, RECORD.size)
+        return RECORD.unpack(start) if len(start) == RECORD.size else (0, 0)
+
+    def _fits(self, at: int, op: int, length: int) -> bool:
+        return bool(op) and length >= _LEAST.get(op, 0) and at + RECORD.size + length <= self.size
+
+    def _knows(self, channel: int, more: Declarations | None = None) -> bool:
+        """Whether a channel is declared, with its schema."""
+        every = [self.known, self.hints] if more is None else [more, self.known, self.hints]
+        content = next((each.channels[channel] for each in every if channel in each.channels), None)
+        return content is not None and any(each.has_schema_of(content) for each in every)
+
+    def _spend(self, count: int) -> bool:
+        self._left -= count
+        return self._left > 0
+
+    def _read_hints(self) -> None:
+        """The schemas and channels of the summary, as far as there is one."""
+        tail = self.read(max(self.size - RECORD.size - 20 - len(MAGIC), 0), RECORD.size + 20 + len(MAGIC))
+        if not tail.endswith(MAGIC) or tail[:9] != RECORD.pack(Opcode.FOOTER, 20):
+            return
+        at = parsed(Footer, tail[9:29]).summary_start
+        while len(MAGIC) <= at < self.size and self.hints.size < MOST_SUMMARY_BYTES:
+            op, length = self._head(at)
+            if op not in _SUMMARY or not self._fits(at, op, length) or op == Opcode.FOOTER or length > MOST_SUMMARY_BYTES:
+                return
+            if op in _DECLARED:
+                content = self.read(at + RECORD.size, length)
+                if not _can_parse(_DECLARED[op], content):
+                    return
+                self.hints.add(op, content)
+            at += RECORD.size + length
+
+
+def _can_parse(kind: type[Schema | Channel | Metadata | Header], content: bytes) -> bool:
+    try:
+        parsed(kind, content)
+    except UNREADABLE:
+        return False
+    return True
+
+
+def _name(op: int, *, is_torn: bool) -> str:
+    try:
+        name = Opcode(op).name.lower().replace('_', ' ')
+    except ValueError:
+        return 'bytes that are not a record'
+    return f'a record that is torn ({name})' if is_torn else f'a record with wrong content ({name})'
