@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import subprocess
 import sys
+import sysconfig
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -23,18 +25,44 @@ MOST_LOG_BYTES: Final = 1 << 20
 _let_go: list[subprocess.Popen[bytes]] = []
 """Those that go on without their logger; looked at now and then, so that none stays a zombie."""
 PACKAGE: Final = str(Path(__file__).resolve().parents[2])
+UNUSABLE: Final = 78
+"""The exit code (EX_CONFIG) of an interpreter that cannot import the sender."""
+NICE: Final = 5
+PROGRAM: Final = f"""\
+import os, sys
+if sys.path[:1] == ['']:
+    del sys.path[0]
+os.nice({NICE})
+try:
+    from shadowhound_data_logger.missions.replay import main
+except ImportError as error:
+    print(error, file=sys.stderr)
+    sys.exit({UNUSABLE})
+sys.exit(main())
+"""
+"""The sender. The working directory, which is the agent's, is not searched for modules: one called ``queue.py`` would replace
+Python's own."""
+_PYTHON: Final = re.compile(r'(?:python|pypy)(\d+(?:\.\d+)?)?[a-z]*')
+"""Names of interpreters, and their version."""
+REMEDY: Final = 'send them with `shadowhound-data missions resume`, from a Python that has this package'
 
 
 class Replayer:
     """Starts and wakes the process that sends missions.
 
     Life: New; start once; wake and look any number; let_go once. Not thread-safe but for ``wake``.
+
+    It runs in the agent's working directory as that was at the beginning, so that relative paths in the environment
+    (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) mean to it what they mean to the agent.
     """
 
     def __init__(self, home: Path, experiment: str, environ: Mapping[str, str]) -> None:
         self._home = home
         self._experiment = experiment
-        self._environ = dict(environ)
+        self._python = interpreter()
+        self._environ = {**environ, 'PYTHONPATH': os.pathsep.join(_import_path(environ, self._python))}
+        self._folder = _working_directory()
+        self._is_usable = True
         self._process: subprocess.Popen[bytes] | None = None
         self._pause_s = AGAIN_S
         self._next_s = 0.0
@@ -43,17 +71,18 @@ class Replayer:
         """Returns at once. A machine that cannot start it now has another chance at ``look``."""
         _let_go[:] = [process for process in _let_go if process.poll() is None]
         folder = self._home / MISSIONS
-        command = [sys.executable, '-m', 'shadowhound_data_logger.missions.replay',
-                   '--home', str(self._home), '--experiment', self._experiment]  # fmt: skip
-        path = os.pathsep.join(filter(None, (self._environ.get('PYTHONPATH'), PACKAGE)))
+        if self._python is None:
+            self._do_without(f'this program has no Python interpreter to start (sys.executable is {sys.executable!r})')
+            return
+        command = [self._python, '-c', PROGRAM, '--home', str(self._home), '--experiment', self._experiment]
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with os.fdopen(os.open(folder / 'replay.log', os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), 'ab') as output:
                 if output.tell() > MOST_LOG_BYTES:
                     output.truncate(0)
                 self._process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=output, stderr=output, env={**self._environ, 'PYTHONPATH': path},
-                    cwd=folder, start_new_session=True,
+                    command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=self._environ,
+                    cwd=self._folder if self._folder and self._folder.is_dir() else folder, start_new_session=True,
                 )  # fmt: skip
         except OSError as error:
             log.warning('missions are not sent: the sender cannot be started: %s', error)
@@ -70,7 +99,9 @@ class Replayer:
 
     def look(self) -> None:
         """Start it again when it ended by itself, with a pause that doubles."""
-        if self._process is None or self._process.poll() is not None:
+        if self._is_usable and self._process is not None and self._process.poll() == UNUSABLE:
+            self._do_without(f'{self._python} cannot import it: see {self._home / MISSIONS / "replay.log"}')
+        if self._is_usable and (self._process is None or self._process.poll() is not None):
             if self._process is not None and self._next_s == 0.0:
                 log.warning("the missions' sender ended with %s; restarting it", self._process.returncode)
             if self._next_s == 0.0:
@@ -93,7 +124,49 @@ class Replayer:
         if self._process is not None:
             self._process.returncode, self._process = 0, None
 
+    def _do_without(self, reason: str) -> None:
+        """Say once that nothing is sent."""
+        self._is_usable = False
+        log.warning('missions are journaled in %s but not sent: %s; %s', self._home / MISSIONS, reason, REMEDY)
+
     def _close_pipe(self) -> None:
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):
                 self._process.stdin.close()
+
+
+def interpreter() -> str | None:
+    """The path of the Python that runs this program, or of the one that is installed where its library is.
+
+    In a program that embeds Python or is frozen, ``sys.executable`` is None, empty or that program, which must not be started a
+    second time: only a file that is called like an interpreter is taken. None where there is no such file.
+    """
+    version = f'{sys.version_info.major}.{sys.version_info.minor}'
+    is_frozen = bool(getattr(sys, 'frozen', False))
+    own = () if is_frozen else (sys.executable, getattr(sys, '_base_executable', None))
+    prefixes = (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)
+    folders = dict.fromkeys([*(os.path.join(prefix, 'bin') for prefix in prefixes), sysconfig.get_config_var('BINDIR') or ''])  # noqa: PTH118
+    installed = (os.path.join(folder, f'python{version}{sys.abiflags}') for folder in folders if folder)  # noqa: PTH118
+    return next((path for path in (*own, *installed) if _is_python(path, version)), None)
+
+
+def _is_python(path: object, version: str) -> bool:
+    if not isinstance(path, str) or not os.path.isabs(path) or not os.path.isfile(path) or not os.access(path, os.X_OK):  # noqa: PTH113, PTH117
+        return False
+    name = _PYTHON.fullmatch(Path(path).resolve().name)
+    return name is not None and name[1] in {None, version, version.partition('.')[0]}
+
+
+def _import_path(environ: Mapping[str, str], python: str | None) -> list[str]:
+    """The agent's PYTHONPATH and where this package is; the agent's packages as well if the interpreter is another one."""
+    given = [os.path.abspath(entry) for entry in environ.get('PYTHONPATH', '').split(os.pathsep) if entry]  # noqa: PTH100
+    packages = [entry for entry in sys.path if Path(entry).name in {'site-packages', 'dist-packages'}]
+    return list(dict.fromkeys([*given, PACKAGE, *(packages if python != sys.executable else ())]))
+
+
+def _working_directory() -> Path | None:
+    """None if it was deleted."""
+    try:
+        return Path.cwd()
+    except OSError:
+        return None

@@ -65,7 +65,7 @@ class Drawing:
 
     def _start(self, folder: MissionFolder, title: str) -> None:
         command = [sys.executable, '-m', PROGRAM, str(folder.path), title]
-        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=folder.path)  # where no module is found
         self._folder, self._end_s = folder, self._monotonic() + DEADLINE_S
 
 

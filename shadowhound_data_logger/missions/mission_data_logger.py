@@ -12,8 +12,9 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import SystemClock
@@ -41,8 +42,9 @@ class MissionDataLogger:
     """Logs the missions of one agent. Life: New; any number of missions, one at a time; close once, or never.
 
     The constructor starts the process that sends (it takes seconds to load MLflow, and a mission's start should not wait for
-    that) and the thread ``missions``, which syncs journals. All methods may be called from any thread. ``_lock`` guards the
-    active mission. Raises SettingError for a robot's name that cannot be in a key or a home of nobody's, and nothing else, ever.
+    that) and the thread ``missions``, which syncs journals. In a program without a Python interpreter (embedded or frozen)
+    missions are only journaled, with one warning. All methods may be called from any thread. ``_lock`` guards the active mission.
+    Raises SettingError for an invalid argument or variable, such as a robot name that cannot be in a key, and nothing else.
     """
 
     def __init__(
@@ -55,19 +57,22 @@ class MissionDataLogger:
         Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
         journals: another logger of the same home sends them.
         """
-        environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': tracking_uri} if tracking_uri else {})
-        self.robot = _robot(robot or environ.get('SHADOWHOUND_ROBOT') or 'thor')
-        self.home = home_of({'SHADOWHOUND_HOME': os.fspath(home)} if home else environ)
+        uri = _text('tracking_uri', tracking_uri)
+        environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': uri} if uri else {})
+        self.robot = _robot(_text('robot', robot) or environ.get('SHADOWHOUND_ROBOT') or 'thor')
+        self.home = _home(environ | ({'SHADOWHOUND_HOME': given} if (given := _text('home', home)) else {}))
+        experiment = _text('experiment', experiment) or f'{self.robot}_missions'
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
-        self._start_timeout_s = start_timeout_s
-        self._beginning = Beginning(self.home, self.robot, frame_artifact_every_s, SystemClock.of_this_machine())
+        self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)
+        every_s = _seconds('frame_artifact_every_s', frame_artifact_every_s)
+        self._beginning = Beginning(self.home, self.robot, every_s, SystemClock.of_this_machine())
         self._lock = threading.RLock()
         self._mission: Mission | None = None
         self._ended: list[Mission] = []
         self._newest: MissionFolder | None = None
         self._warned: set[str] = set()
         self._wake = threading.Event()
-        self._replayer = Replayer(self.home, experiment or f'{self.robot}_missions', self._environ) if replay else None
+        self._replayer = Replayer(self.home, experiment, self._environ) if replay else None
         self._worker = Worker('missions', self._step)
         self._closed = False
         _alive.add(self)
@@ -249,6 +254,30 @@ def _after_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_after_fork)
+
+
+def _text(name: str, value: object) -> str:
+    """A text or path as it was given, empty for None. Raises SettingError."""
+    try:
+        found = os.fspath(value) if value is not None else ''  # type: ignore[call-overload]
+    except TypeError as error:
+        raise SettingError(name, value, 'a text') from error
+    if not isinstance(found, str) or '\0' in found:
+        raise SettingError(name, type(value).__name__, 'a text without null characters')  # it may have a password
+    return found
+
+
+def _seconds(name: str, value: object) -> float:
+    if not isinstance(value, (int, float)) or not value >= 0.0:
+        raise SettingError(name, value, 'a number of seconds, 0 or more')
+    return float(value)
+
+
+def _home(environ: Mapping[str, str]) -> Path:
+    try:
+        return home_of(environ)
+    except OSError as error:  # a relative path in a working directory that was deleted
+        raise SettingError('home', environ.get('SHADOWHOUND_HOME', ''), 'an absolute path') from error
 
 
 def _robot(name: str) -> str:

@@ -85,7 +85,6 @@ WAITING: Final = 'replay.waiting'
 """Beside the missions: locked, shared, by those that wait for an agent that lives."""
 KEEP_S: Final = 30 * 86_400.0
 """How long a mission that has arrived stays on the robot; looked at when a sender starts."""
-NICE: Final = 5
 SLICE_S: Final = 0.5
 TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store'
 
@@ -335,7 +334,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
-    os.nice(NICE)
     logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
     parent = Parent(sys.stdin.fileno())
     folder: Path = options.home / MISSIONS

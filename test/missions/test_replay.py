@@ -276,7 +276,7 @@ def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path:
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sender that dies is replaced after a pause, it is not a zombie meanwhile, and none is left after its logger."""
     monkeypatch.setattr('shadowhound_data_logger.missions.child.AGAIN_S', 0.1)
-    monkeypatch.setattr('shadowhound_data_logger.missions.child.sys.executable', '/bin/false')
+    monkeypatch.setattr('shadowhound_data_logger.missions.child.interpreter', lambda: '/bin/false')
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
     try:
         first = logger._replayer._process  # type: ignore[union-attr]
