@@ -207,7 +207,7 @@ class BagSettings:
         'service', 'When: service (from bag start to bag stop), mission (in every mission as well) or always.', choices=RECORDS
     )
     topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
-    regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*" is all that are not hidden.')
+    regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
     exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
     slice_s: float = _setting(
         60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
@@ -225,7 +225,7 @@ class EventSettings:
     """The last seconds of some topics, in memory, of which an event makes a bag; off while no topic is named."""
 
     topics: tuple[str, ...] = _setting(('',), 'Topics to keep; with neither topics nor a regex, there are no events.')
-    regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*" is all that are not hidden.')
+    regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
     exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
     pre_s: float = _setting(30.0, 'Seconds to keep from before a trigger.', low=0.0, high=3600.0, live=True)
     post_s: float = _setting(

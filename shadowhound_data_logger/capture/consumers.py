@@ -60,12 +60,14 @@ class TopicChoice:
         return self._named | {topic for topic in graph if self._matches(topic)}
 
     def _matches(self, topic: str) -> bool:
-        """As rosbag2: any part of the name has to match; hidden topics (a part begins with ``_``) are left out.
+        """As rosbag2: any part of the name must match, and hidden topics (a part begins with ``_``) are left out.
 
-        So are names that are not valid in ROS, which another DDS program may well have: nobody can subscribe to them in ROS.
+        They are not left out if the expression itself has a ``/_``, as ``/_service_event$`` and ``/_action/`` have. Names that
+        are not valid in ROS, which other DDS programs may use, always are: nothing in ROS can subscribe to them.
         """
         assert self._regex is not None
-        if '/_' in topic or not _FULL_NAME.fullmatch(topic) or len(topic) > MAX_NAME or not self._regex.search(topic):
+        is_hidden = '/_' in topic and '/_' not in self._regex.pattern
+        if is_hidden or not _FULL_NAME.fullmatch(topic) or len(topic) > MAX_NAME or not self._regex.search(topic):
             return False
         return self._exclude is None or not self._exclude.search(topic)
 

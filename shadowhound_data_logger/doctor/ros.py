@@ -187,7 +187,7 @@ def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: floa
         yield error(
             'ros.types',
             f'{one.topic} cannot be received: {one.unavailable}',
-            'its message package is not here',
+            'only topics whose type is installed here can be received',
             TYPES_REMEDY.format(package=one.type.partition('/')[0]),
         )
         return

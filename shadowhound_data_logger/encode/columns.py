@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from rosbags.interfaces import Nodetype
 
+from shadowhound_data_logger.encode.cdr import ENCAPSULATION_BYTES
 from shadowhound_data_logger.encode.statistics import MOST_DEPTH, MOST_ELEMENTS, MOST_FIELDS, covers, packed_parts
-from shadowhound_data_logger.encode.types import ENCAPSULATION_BYTES, PLACEHOLDER, SIZES, MessageTypes
+from shadowhound_data_logger.encode.types import PLACEHOLDER, SIZES, MessageTypes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,9 +1,15 @@
-"""Where definitions of messages are found, and what readers that know nothing of the robot are told: rosbag2's form of them.
+"""Where definitions of messages are found, and the text that describes a type to readers without ROS, in rosbag2's form.
 
-They come from the ``share/`` folders of the sourced workspaces, as rosbag2 takes them (rosbag2_cpp,
+They come from the ``share/`` folders of the sourced workspaces, where rosbag2 takes them from (rosbag2_cpp,
 local_message_definition_source.cpp): the ``.msg`` text, then that of every type it uses, or the same of the ``.idl``
-where one of them has no ``.msg``. The hash (REP-2016) is in the ``.json`` that rosidl installs since Iron; Humble knows none.
-Where nothing is sourced, the type store of ``rosbags`` knows the common types.
+if one of them has no ``.msg``, without its ``#include`` lines: every section follows anyway, and ``rosbags`` cannot open a bag
+that has such a line. The hash (REP-2016) is in the ``.json`` that rosidl installs since Iron; Humble has none.
+If nothing is sourced, the type store of ``rosbags`` knows the common types.
+
+The messages of a service's event topic and of an action's topics have types too, such as ``std_srvs/srv/Trigger_Event`` and
+``nav2_msgs/action/NavigateToPose_FeedbackMessage``. They have no file of their own: rosidl derives them from the service or
+action (rosidl_parser/definition.py), and so does this module, from its ``.idl``. rosbag2 stores the ``.srv`` text instead, from
+which readers cannot decode an event (ros2/rosbag2, issue 2365).
 """
 
 from __future__ import annotations
@@ -12,7 +18,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -20,33 +26,92 @@ from typing import Final
 log = logging.getLogger(__name__)
 
 SEPARATOR: Final = '=' * 80
-_TYPE: Final = re.compile(r'([A-Za-z0-9_]+)/(?:msg/)?([A-Za-z0-9_]+)')
+_TYPE: Final = re.compile(r'([A-Za-z0-9_]+)/(?:(msg|srv|action)/)?([A-Za-z0-9_]+)', re.ASCII)
 _MSG_FIELD: Final = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+')
 _IDL_INCLUDE: Final = re.compile(r'(?:^|\n)#include\s+["<]([a-zA-Z0-9_/]+)\.idl[">]')
+_IDL_LINE: Final = re.compile(r'^#include\b.*\n', re.MULTILINE)
 _PRIMITIVES: Final = frozenset({
     'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64', 'uint64',
     'string', 'wstring',
 })  # fmt: skip
 
 
-def find(prefixes: Iterable[str | Path], type_name: str, extension: str = 'msg') -> Path:
-    """The file that defines a type, of the first workspace that has it. Raises FileNotFoundError.
+_UUID: Final = 'unique_identifier_msgs/msg/UUID', 'goal_id'
+_Fields = tuple[tuple[str, str], ...]
 
-    ``prefixes`` are the entries of AMENT_PREFIX_PATH, in their order; empty ones are none.
+
+def _event(of: str) -> _Fields:
+    """The fields of the events of a service."""
+    info = 'service_msgs/msg/ServiceEventInfo', 'info'
+    return info, (f'sequence<{of}_Request, 1>', 'request'), (f'sequence<{of}_Response, 1>', 'response')
+
+
+_DERIVED: Final[Mapping[str, Mapping[str, _Fields]]] = {
+    'msg': {},
+    'srv': {'Event': _event('{0}')},
+    'action': {
+        'FeedbackMessage': (_UUID, ('{0}_Feedback', 'feedback')),
+        'SendGoal_Request': (_UUID, ('{0}_Goal', 'goal')),
+        'SendGoal_Response': (('boolean', 'accepted'), ('builtin_interfaces/msg/Time', 'stamp')),
+        'SendGoal_Event': _event('{0}_SendGoal'),
+        'GetResult_Request': (_UUID,),
+        'GetResult_Response': (('int8', 'status'), ('{0}_Result', 'result')),
+        'GetResult_Event': _event('{0}_GetResult'),
+    },
+}
+"""Kind of interface -> end of a type's name -> its fields, with ``{0}`` for the service or action."""
+
+
+def read_definition(prefixes: Iterable[str | Path], type_name: str, extension: str) -> str:
+    """The text that defines a type, from the first workspace that has it. Raises FileNotFoundError.
+
+    ``prefixes`` are the entries of AMENT_PREFIX_PATH, in their order; empty ones are ignored. ``extension`` is ``msg``, or
+    ``idl``, which also defines the parts of services and actions: theirs is the text of the whole service or action, and of what
+    rosidl derives from it.
     """
+    package, kind, name, part = _split(type_name)
+    if kind != 'msg' and extension == 'msg':
+        raise FileNotFoundError(f'{type_name} is part of a service or an action')
+    text = _find(prefixes, type_name, extension).read_text(encoding='utf-8', errors='replace')
+    derived = _DERIVED[kind]
+    if part not in derived:
+        return text
+    service = part.rpartition('_')[0]
+    parts = [each for each in derived if each.rpartition('_')[0] == service] if service else [part]
+    includes, structs = [], []
+    for each in parts:
+        lines = [(of.format(f'{package}/{kind}/{name}'), field) for of, field in derived[each]]
+        includes += [of for of, _ in lines if '/msg/' in of]
+        fields = ''.join(f'      {of.replace("/", "::")} {field};\n' for of, field in lines)
+        structs.append(f'    struct {name}_{each} {{\n{fields}    }};\n')
+    head = ''.join(f'#include "{of}.idl"\n' for of in dict.fromkeys(includes))
+    return f'{head}{text}\nmodule {package} {{\n  module {kind} {{\n{"".join(structs)}  }};\n}};\n'
+
+
+def _split(type_name: str) -> tuple[str, str, str, str]:
+    """Package, kind, name and part of a type: ``std_srvs/srv/Trigger_Event`` is Event of Trigger. Raises FileNotFoundError."""
     named = _TYPE.fullmatch(type_name)
-    if named is not None:
-        for prefix in prefixes:
-            path = Path(prefix, 'share', named[1], 'msg', f'{named[2]}.{extension}')
-            if str(prefix) and path.is_file():
-                return path
+    if named is None:
+        raise FileNotFoundError(f'{type_name!r} is not a type')
+    package, kind, name = named[1], named[2] or 'msg', named[3]
+    if kind == 'msg':
+        return package, kind, name, ''
+    return package, kind, *name.partition('_')[::2]
+
+
+def _find(prefixes: Iterable[str | Path], type_name: str, extension: str) -> Path:
+    package, kind, name, _ = _split(type_name)
+    for prefix in prefixes:
+        path = Path(prefix, 'share', package, kind, f'{name}.{extension}')
+        if str(prefix) and path.is_file():
+            return path
     raise FileNotFoundError(f'{type_name} has no .{extension}')
 
 
 def describe(type_name: str) -> tuple[str, str, str]:
-    """(encoding, definition, type hash) of a message type such as ``sensor_msgs/msg/Imu``.
+    """(encoding, definition, type hash) of the type of a topic such as ``sensor_msgs/msg/Imu``.
 
-    The encoding is ``ros2msg`` or ``ros2idl``; all three are empty where nothing is known. Reads files: once for each type.
+    The encoding is ``ros2msg`` or ``ros2idl``; all three are empty if the type is unknown. Reads files, once for each type.
     """
     return _describe(type_name, os.environ.get('AMENT_PREFIX_PATH', ''))
 
@@ -63,23 +128,30 @@ def _describe(type_name: str, prefixes: str) -> tuple[str, str, str]:
         except FileNotFoundError:
             continue
         return encoding, definition, _hash(places, type_name)
-    return _from_rosbags(f'{named[1]}/msg/{named[2]}')
+    return _from_rosbags(f'{named[1]}/msg/{named[3]}') if named[2] in (None, 'msg') else ('', '', '')
 
 
 def _collected(prefixes: Sequence[str], type_name: str, extension: str) -> str:
-    """The text of a type and of all that it uses. Raises FileNotFoundError where one of them has none."""
+    """The text of a type and of all that it uses. Raises FileNotFoundError if one of them has none."""
     seen: set[str] = set()
 
     def collect(name: str) -> str:
-        text = find(prefixes, name, extension).read_text(encoding='utf-8', errors='replace')
-        package = name.partition('/')[0]
-        for used in sorted(_used(text, package, extension) - seen):
-            if used not in seen:  # by one before it in this very loop
-                seen.add(used)
-                text += f'\n{_title(used, extension)}{collect(used)}'
+        text = read_definition(prefixes, name, extension)
+        used = _used(text, name.partition('/')[0], extension) - seen
+        if extension == 'idl':
+            text = without_includes(text)
+        for each in sorted(used):
+            if each not in seen:  # added by one before it in this loop
+                seen.add(each)
+                text += f'\n{_title(each, extension)}{collect(each)}'
         return text
 
     return (_title(type_name, extension) if extension == 'idl' else '') + collect(type_name)
+
+
+def without_includes(idl: str) -> str:
+    """The text of an ``.idl`` as ``rosbags`` parses it."""
+    return _IDL_LINE.sub('', idl)
 
 
 def _title(name: str, extension: str) -> str:
@@ -95,7 +167,7 @@ def _used(text: str, package: str, extension: str) -> set[str]:
 
 def _hash(prefixes: Sequence[str], type_name: str) -> str:
     try:
-        content = json.loads(find(prefixes, type_name, 'json').read_bytes())
+        content = json.loads(_find(prefixes, type_name, 'json').read_bytes())
         hashes = {one['type_name']: str(one['hash_string']) for one in content['type_hashes']}
     except (OSError, ValueError, LookupError, TypeError) as error:
         log.debug('%s has no type hash: %s', type_name, error)

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from shadowhound_data_logger.config import SensorSettings
-from shadowhound_data_logger.encode.types import ENCAPSULATION_BYTES, MessageTypes
+from shadowhound_data_logger.encode.cdr import ENCAPSULATION_BYTES
+from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Batch, Sample
 

@@ -1,4 +1,4 @@
-"""Message definitions by ROS type name, and what they make of CDR bytes, in pure Python (``rosbags``).
+"""Message definitions by ROS type name, and what they make of CDR bytes, in pure Python (``rosbags``, then ``cdr``).
 
 Owns the definitions. Whatever the bytes are, only Rejected leaves this module, and no length in them makes it allocate.
 """
@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.encode.definitions import find
+from shadowhound_data_logger.encode.cdr import ENCAPSULATION_BYTES, read_message
+from shadowhound_data_logger.encode.definitions import read_definition, without_includes
 from shadowhound_data_logger.errors import Rejected
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ MAX_UNKNOWN: Final = 1000
 PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
 """The field that rosidl puts into a message without any; it carries nothing."""
 
-_TYPE_NAME = re.compile(r'[A-Za-z]\w*/msg/[A-Za-z]\w*', re.ASCII)
+_TYPE_NAME = re.compile(r'[A-Za-z]\w*/(?:msg|srv|action)/[A-Za-z]\w*', re.ASCII)
 _WHOLE: Final = {'int8': 'b', 'uint8': 'B', 'byte': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q'}
 SIZES: Final = {
     **{name: struct.calcsize(code) for name, code in _WHOLE.items()}, 'uint64': 8, 'float32': 4, 'float64': 8, 'bool': 1,
@@ -43,16 +44,13 @@ _STAMP_LE: Final = struct.Struct('<iI')
 _STAMP_BE: Final = struct.Struct('>iI')
 _LENGTH_LE: Final = struct.Struct('<I')
 _LENGTH_BE: Final = struct.Struct('>I')
-ENCAPSULATION_BYTES: Final = 4
-"""Before the message in CDR; the second byte tells the endianness. A std_msgs/msg/Header that comes first follows at once:
-its stamp (8 bytes), then the length of its frame_id with the NUL (4), then that."""
 
 
 def header_stamp_ns(cdr: bytes | memoryview) -> int:
     """``header.stamp`` in ns of a message whose first field is a std_msgs/msg/Header; 0 where the bytes are too few."""
     if len(cdr) < ENCAPSULATION_BYTES + _STAMP_LE.size:
         return 0
-    sec, nanosec = (_STAMP_LE if cdr[1] else _STAMP_BE).unpack_from(cdr, ENCAPSULATION_BYTES)
+    sec, nanosec = (_STAMP_LE if cdr[1] & 1 else _STAMP_BE).unpack_from(cdr, ENCAPSULATION_BYTES)
     return int(sec) * SECOND + int(nanosec)
 
 
@@ -61,8 +59,8 @@ def header_frame_id(cdr: bytes) -> str:
     start = ENCAPSULATION_BYTES + _STAMP_LE.size + _LENGTH_LE.size
     if len(cdr) < start:
         return ''
-    (length,) = (_LENGTH_LE if cdr[1] else _LENGTH_BE).unpack_from(cdr, start - _LENGTH_LE.size)
-    return cdr[start : start + length - 1].decode('utf-8', 'replace') if 0 < length <= len(cdr) - start else ''
+    (length,) = (_LENGTH_LE if cdr[1] & 1 else _LENGTH_BE).unpack_from(cdr, start - _LENGTH_LE.size)
+    return cdr[start : start + length].removesuffix(b'\0').decode('utf-8', 'replace') if length <= len(cdr) - start else ''
 
 
 class CounterField(NamedTuple):
@@ -78,8 +76,8 @@ class CounterField(NamedTuple):
         return 1 << 8 * self.little.size
 
     def read(self, cdr: bytes) -> int:
-        """The number; 0 where the bytes are too few."""
-        if len(cdr) < self.offset + self.little.size:
+        """The number; 0 if the bytes are too few, or not aligned as CDR is."""
+        if len(cdr) < self.offset + self.little.size or cdr[1] > 1:
             return 0
         (value,) = (self.little if cdr[1] else self.big).unpack_from(cdr, self.offset)
         return int(value)
@@ -89,8 +87,9 @@ class MessageTypes:
     """Finds message definitions by type name (``sensor_msgs/msg/Imu``), read when first asked for, then kept.
 
     Looked for in ``<prefix>/share/<package>/msg/<Name>.msg`` of each prefix (the entries of AMENT_PREFIX_PATH, in their
-    order), else among the standard messages that ``rosbags`` ships. What was not found once stays unknown for the life
-    of the object. Thread-safe: ``_lock`` guards every change, readers see only what is complete.
+    order), then in its ``.idl``, then among the standard messages that ``rosbags`` ships. The messages of services and actions
+    are types too (``std_srvs/srv/Trigger_Event``). What was not found once stays unknown for the life of the object.
+    Thread-safe: ``_lock`` guards every change, readers see only what is complete.
     """
 
     def __init__(self, prefixes: Iterable[str | Path] = ()) -> None:
@@ -98,24 +97,20 @@ class MessageTypes:
         self._store = Typestore()
         self._known: dict[str, Fielddefs] = {}
         self._unknown: dict[str, str] = {}
+        self._uncompiled: set[str] = set()
         self._lock = Lock()
 
     def deserialize(self, type_name: str, cdr: bytes | memoryview) -> Any:
         """The message as a ``rosbags`` dataclass: numbers, str, lists, numpy arrays that may be views of ``cdr``.
 
         Text that is not UTF-8 is kept with U+FFFD in place of the bad bytes, as rclpy does.
-        Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, lengths that lie, no CDR at all).
+        Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, wrong lengths, no CDR at all).
         """
         self.fields(type_name)
-        try:
-            try:
+        if type_name not in self._uncompiled:
+            with suppress(SerdeError):
                 return self._store.deserialize_cdr(cdr, type_name)
-            except SerdeError as error:
-                if not isinstance(error.__cause__, UnicodeDecodeError):
-                    raise
-                return self._store.deserialize_cdr(_LenientText(cdr), type_name)
-        except SerdeError as error:
-            raise Rejected('malformed', str(error)) from error
+        return read_message(self._store, type_name, cdr)
 
     def fields(self, type_name: str) -> Fielddefs:
         """The fields in order, as (name in the definition, ``rosbags`` description). Raises Rejected: ``unknown_type``."""
@@ -181,7 +176,7 @@ class MessageTypes:
                 definitions: Typesdict = {}
                 self._collect(type_name, definitions, ())
                 self._store.register(definitions)
-                self._store.get_msgdef(type_name)  # compiled here, under the lock, with all that is nested in it
+                self._compile(type_name)
             except (LookupError, TypesysError, OSError, UnicodeDecodeError) as error:
                 if len(self._unknown) >= MAX_UNKNOWN:
                     self._unknown.clear()
@@ -189,6 +184,13 @@ class MessageTypes:
                 raise Rejected('unknown_type', self._unknown[type_name]) from error
             self._known[type_name] = self._store.fielddefs[type_name][1]
             return self._known[type_name]
+
+    def _compile(self, type_name: str) -> None:
+        """Under the lock, with all that is nested in it; ``rosbags`` has no code for a ``wstring``."""
+        try:
+            self._store.get_msgdef(type_name)
+        except KeyError:
+            self._uncompiled.add(type_name)
 
     def _collect(self, type_name: str, definitions: Typesdict, within: tuple[str, ...]) -> None:
         """Add the definition of a type and of all it is made of. Raises LookupError with a sentence."""
@@ -207,7 +209,12 @@ class MessageTypes:
         if not _TYPE_NAME.fullmatch(type_name):
             raise LookupError(f'{type_name!r} is not a message type')
         with suppress(FileNotFoundError):
-            return get_types_from_msg(find(self._prefixes, type_name).read_text(encoding='utf-8'), type_name)
+            found = get_types_from_msg(read_definition(self._prefixes, type_name, 'msg'), type_name)
+            if not any((nested_type(description) or '').endswith('/wstring') for _, description in found[type_name][1]):
+                return found
+        with suppress(FileNotFoundError, KeyError):  # ``rosbags`` knows a wstring only there
+            found = get_types_from_idl(without_includes(read_definition(self._prefixes, type_name, 'idl')))
+            return {type_name: found[type_name]}
         if type_name not in self._shipped.fielddefs:
             raise LookupError(f'no definition of {type_name}: is its package installed and sourced?')
         return {type_name: self._shipped.fielddefs[type_name]}
@@ -223,17 +230,3 @@ def nested_type(description: FieldDesc) -> str | None:
     if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         return nested_type(description[1][0])
     return description[1] if description[0] == Nodetype.NAME else None
-
-
-class _LenientText(bytes):
-    """CDR whose slices decode to text whatever they hold: ``rosbags`` decodes ``bytes(cdr[start:end])``."""
-
-    def __getitem__(self, where: Any) -> Any:
-        part = super().__getitem__(where)
-        return _LenientText(part) if isinstance(part, bytes) else part
-
-    def __bytes__(self) -> bytes:
-        return self
-
-    def decode(self, encoding: str = 'utf-8', errors: str = 'replace') -> str:
-        return super().decode(encoding, 'replace' if errors == 'strict' else errors)

@@ -16,6 +16,7 @@ from importlib import import_module, metadata
 from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from itertools import islice
+from types import ModuleType
 from typing import Any, Final, TypeVar
 from uuid import uuid4
 
@@ -79,8 +80,11 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
         pass
 
 
-_TYPE: Final = re.compile(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', re.ASCII)
-"""https://design.ros2.org/articles/interface_definition.html"""
+_TYPE: Final = re.compile(
+    r'([a-z][a-z0-9_]*)/(?:(msg)/([A-Z][A-Za-z0-9]*)|(srv|action)/([A-Z][A-Za-z0-9]*)_([A-Z][A-Za-z_]*))', re.ASCII
+)
+"""https://design.ros2.org/articles/interface_definition.html; of services and actions the parts that are messages."""
+_KINDS: Final = {'msg': 'messages', 'srv': 'services', 'action': 'actions'}
 MAX_PUBLISHERS: Final = 1000
 """Senders that a subscription knows by name at once."""
 UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'})
@@ -88,7 +92,7 @@ UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_A
 
 
 class TypeUnavailable(LookupError):
-    """The message package of a type is not installed here."""
+    """Messages of a type cannot be received here; the text is the reason, a sentence without its period."""
 
 
 class SubscriptionRefused(RuntimeError):
@@ -96,44 +100,57 @@ class SubscriptionRefused(RuntimeError):
 
 
 def message_class(type_name: str) -> type:
-    """The rclpy class of ``package/msg/Name``; raises TypeUnavailable.
+    """The rclpy class of ``package/msg/Name``, ``package/srv/Name_Event`` or ``package/action/Name_FeedbackMessage``.
 
-    The name may be any neighbour's in the network: a package is imported only where it has messages, because to import one
-    runs what is in it.
+    Raises TypeUnavailable. The name may come from any machine in the network: a package is imported only if it has interfaces of
+    this kind, because importing runs what is in it.
     """
     match = _TYPE.fullmatch(type_name)
     if match is None:
-        raise TypeUnavailable(f'{type_name}: this is not a name of a message')
-    package, name = match.groups()
-    if not _has_messages(package):
-        raise TypeUnavailable(f'{type_name}: no package {package} with messages')
+        raise TypeUnavailable(f'{type_name} is not the name of a message type')
+    package, kind = match[1], match[2] or match[4]
+    if not _is_installed(package, kind):
+        text = f'its message package is not installed here ({type_name}: no package {package} with {_KINDS[kind]})'
+        raise TypeUnavailable(text)
     try:
-        found: type = getattr(import_module(f'{package}.msg'), name)
+        module = import_module(f'{package}.{kind}')
+        found: type = getattr(module, match[3]) if match[3] else _part(module, match[5], match[6])
         check_for_type_support(found)
-    except (ImportError, AttributeError, ValueError, TypeError, NoTypeSupportImportedException) as error:
-        raise TypeUnavailable(f'{type_name}: {error}') from error
     except UnsupportedTypeSupport as error:  # no ImportError, though it is about one
         text = f'{type_name}: a library of {package} does not load: is its workspace sourced, and built for this Python?'
         raise TypeUnavailable(text) from error
+    except AttributeError as error:
+        raise TypeUnavailable(f'the package {package} that is installed here has no {type_name}') from error
+    except (ImportError, ValueError, TypeError, NoTypeSupportImportedException) as error:
+        raise TypeUnavailable(f'{type_name}: {error}') from error
     return found
 
 
-def _has_messages(package: str) -> bool:
-    """Looked up without running anything."""
+def _part(module: ModuleType, name: str, part: str) -> type:
+    """The class of a message of a service or an action: a name of the module, or inside the class (all of Humble's actions)."""
+    found: type | None = getattr(module, f'{name}_{part}', None)
+    if found is None:
+        interface = getattr(module, name)
+        found = getattr(getattr(interface, 'Impl', interface), part)
+    return found
+
+
+def _is_installed(package: str, kind: str) -> bool:
+    """Whether a package has interfaces of this kind; looked up without running anything."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):
         return False
-    return spec is not None and PathFinder.find_spec(f'{package}.msg', spec.submodule_search_locations or ()) is not None
+    return spec is not None and PathFinder.find_spec(f'{package}.{kind}', spec.submodule_search_locations or ()) is not None
 
 
 @lru_cache
 def unavailable(type_name: str) -> str:
-    """Why messages of ``package/msg/Name`` cannot be received here; empty where they can."""
+    """Why messages of a type cannot be received here; empty if they can."""
     try:
         message_class(type_name)
     except TypeUnavailable as error:
-        return f'its message package is not installed here ({error})'
+        return str(error)
     return ''
 
 
@@ -155,7 +172,7 @@ class Reader:
     """A live subscription. Created, drained and closed by one thread alone: a take after a destroy raises."""
 
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
-        """Raises TypeUnavailable when the message package is missing, SubscriptionRefused when the middleware does not do it."""
+        """Raises TypeUnavailable if the type is not installed, SubscriptionRefused if the middleware does not accept it."""
         self.plan = plan
         self.drained_s: float | None = None
         """When its owner drained it last, by the monotonic clock."""

@@ -143,10 +143,11 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
 @pytest.mark.parametrize(('named', 'regex', 'exclude', 'wanted'), [
     ((), '', '', SENSORS), (('/x',), '', '', ('/x',)), ((), '.*', '', ('/imu', '/odom', '/camera/image_raw', '/rosout')),
     ((), '.*', 'raw|rosout', ('/imu', '/odom')), (('/x', '/rosout'), 'im', 'raw|rosout', ('/x', '/rosout', '/imu')),
-    ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()),
+    ((), '^/imu$', '', ('/imu',)), ((), 'nothing', '', ()), ((), '/_hidden$', '', ('/_hidden',)),
+    ((), '.*|/_', 'imu|odom|raw|rosout', ('/_hidden', '/a/_hidden/b')),
 ])  # fmt: skip
 def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
-    """Those that are named, those of which a part matches and that are not excluded or hidden; else what the sensors take."""
+    """Those that are named, or match and are neither excluded nor hidden (unless the regex has /_); otherwise the sensors'."""
     choice = TopicChoice(BagSettings(regex=regex, exclude=exclude), named)
     assert choice.asks_graph is bool(regex)
     assert choice.wanted(SENSORS, GRAPH) == set(wanted)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.encode.types import MessageTypes
 
 LINE = '=' * 80
 HAS_ROS = any(Path(one, 'share/sensor_msgs/msg/Imu.msg').is_file() for one in os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
@@ -23,6 +25,14 @@ def workspace(folder: Path, files: dict[str, str]) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(content)
     return str(folder)
+
+
+def parsed(idl: str) -> Any:
+    """As `rosbags` parses the definitions of a bag (rosbags/highlevel/anyreader.py)."""
+    found: dict[str, Any] = {}
+    for section in idl.split(f'{LINE}\n')[1:]:
+        found.update(get_types_from_idl(section.partition('\n')[2]))
+    return found
 
 
 def test_every_type_it_uses_follows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,16 +53,18 @@ def test_every_type_it_uses_follows(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_idl_where_there_is_no_msg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package with .idl alone is described by that, its own title above it as well."""
-    cage = '#include "zoo/msg/Animal.idl"\nmodule zoo { module msg { struct Cage { zoo::msg::Animal animal; }; }; };\n'
+    """A package with .idl alone is described by that, its own title above it as well, in a form that `rosbags` parses."""
+    include = '#include "zoo/msg/Animal.idl"\n'
+    cage = 'module zoo { module msg { struct Cage { zoo::msg::Animal animal; }; }; };\n'
     animal = 'module zoo { module msg { struct Animal { long legs; }; }; };\n'
-    files = {'zoo/Cage.idl': cage, 'zoo/Animal.idl': animal, 'zoo/Cage.msg': 'Animal animal\n'}
+    files = {'zoo/Cage.idl': include + cage, 'zoo/Animal.idl': animal, 'zoo/Cage.msg': 'Animal animal\n'}
     monkeypatch.setenv('AMENT_PREFIX_PATH', workspace(tmp_path, files))
     encoding, definition, _ = describe('zoo/msg/Cage')
     assert (encoding, definition) == (
         'ros2idl', f'{LINE}\nIDL: zoo/msg/Cage\n{cage}\n{LINE}\nIDL: zoo/msg/Animal\n{animal}',
     )  # fmt: skip
-    assert 'zoo/msg/Animal' in get_types_from_idl(animal)
+    assert parsed(definition).keys() == {'zoo/msg/Cage', 'zoo/msg/Animal'}
+    assert MessageTypes([tmp_path]).deserialize('zoo/msg/Cage', b'\0\1\0\0\4\0\0\0').animal.legs == 4
 
 
 def test_the_hash_is_the_installed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,3 +123,43 @@ def test_another_parser_comes_to_the_same_type(name: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(definition, name))
     assert type_hash in {store.hash_rihs01(name), ''}  # Humble has none
+
+
+DERIVED = [
+    'std_srvs/srv/Trigger_Event', 'std_srvs/srv/Empty_Event', 'std_srvs/srv/Trigger_Response', 'action_msgs/srv/CancelGoal_Event',
+    'rcl_interfaces/srv/SetParameters_Event', 'test_msgs/srv/Arrays_Event',
+    *(f'test_msgs/action/{name}_{part}' for name in ('Fibonacci', 'NestedMessage') for part in (
+        'FeedbackMessage', 'SendGoal_Event', 'GetResult_Event', 'SendGoal_Request', 'SendGoal_Response', 'GetResult_Request',
+        'GetResult_Response', 'Goal', 'Result', 'Feedback')),
+]  # fmt: skip
+
+
+@pytest.mark.skipif(not HAS_ROS, reason='no messages are installed')
+@pytest.mark.parametrize('name', DERIVED)
+def test_parts_of_services_and_actions(name: str) -> None:
+    """The definition of an event or a feedback message gives the type hash that rosidl computed for it."""
+    encoding, definition, type_hash = describe(name)
+    if not encoding:
+        pytest.skip('its package, or service_msgs, is not installed')
+    store = get_typestore(Stores.EMPTY)
+    store.register(parsed(definition))
+    assert encoding == 'ros2idl'
+    assert type_hash in {store.hash_rihs01(name), ''}  # Humble has none
+
+
+def test_an_action_where_there_are_no_service_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Humble, which has no service_msgs, feedback is defined, and events are not."""
+    wash = 'module zoo { module action { struct Wash_Feedback { long wet; }; }; };\n'
+    uuid = 'module unique_identifier_msgs { module msg { struct UUID { octet uuid[16]; }; }; };\n'
+    for path, text in {'zoo/action/Wash.idl': wash, 'unique_identifier_msgs/msg/UUID.idl': uuid}.items():
+        file = tmp_path / 'share' / path
+        file.parent.mkdir(parents=True)
+        file.write_text(text)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    encoding, definition, _ = describe('zoo/action/Wash_FeedbackMessage')
+    assert encoding == 'ros2idl'
+    assert 'zoo/action/Wash_FeedbackMessage' in parsed(definition)
+    assert describe('zoo/action/Wash_SendGoal_Event') == ('', '', '')
+    assert describe('zoo/action/Other_FeedbackMessage') == ('', '', '')
+    feedback = MessageTypes([tmp_path]).deserialize('zoo/action/Wash_FeedbackMessage', b'\0\1\0\0' + bytes(range(20)))
+    assert feedback.feedback.wet == 0x13121110

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.ros.reader import TypeUnavailable, message_class
+from shadowhound_data_logger.ros.reader import TypeUnavailable, message_class, unavailable
 
 BROKEN = """
 class Meta(type):
@@ -56,9 +57,42 @@ def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch:
         'os.path/msg/X',
         '/msg/X',
         'std_msgs/msg/__doc__',
+        'std_srvs/srv/Trigger',
+        'std_srvs/msg/Trigger_Event',
+        'std_msgs/srv/Trigger_Event',
+        'std_srvs/srv/NoSuchName_Event',
+        'no_such_package/action/X_FeedbackMessage',
+        'os/action/X_FeedbackMessage',
+        'std_srvs/idl/Trigger_Event',
     ],
 )
 def test_a_type_that_is_none(name: str) -> None:
     """Each is told as the package that is missing, whatever the import raised."""
     with pytest.raises(TypeUnavailable, match=name):
         message_class(name)
+
+
+@pytest.mark.parametrize(('name', 'why'), [
+    ('nav2_none/action/Go_FeedbackMessage', 'its message package is not installed here .*no package nav2_none with actions'),
+    ('std_msgs/srv/Trigger_Event', 'no package std_msgs with services'),
+    ('std_srvs/srv/NoSuchName_Event', 'the package std_srvs that is installed here has no std_srvs/srv/NoSuchName_Event'),
+    ('std_msgs/msg/NoSuchName', 'the package std_msgs that is installed here has no std_msgs/msg/NoSuchName'),
+    ('std_srvs/srv/Trigger', 'is not the name of a message type'),
+])  # fmt: skip
+def test_the_reason_is_true(name: str, why: str) -> None:
+    """A type that is missing in an installed package is not reported as a missing package."""
+    assert re.search(why, unavailable(name))
+
+
+@pytest.mark.parametrize('name', [
+    'std_srvs/srv/Trigger_Event', 'std_srvs/srv/Trigger_Request', 'action_msgs/msg/GoalStatusArray',
+    'action_msgs/srv/CancelGoal_Event', 'test_msgs/action/Fibonacci_FeedbackMessage', 'test_msgs/action/Fibonacci_SendGoal_Event',
+    'test_msgs/action/NestedMessage_GetResult_Event',
+])  # fmt: skip
+def test_parts_of_services_and_actions(name: str) -> None:
+    """Messages of services and actions can be received where their package is installed."""
+    pytest.importorskip(name.partition('/')[0])
+    if name.endswith('_Event'):
+        pytest.importorskip('service_msgs', reason='Humble has no service events')
+    assert message_class(name).__name__ == name.rpartition('/')[2]
+    assert not unavailable(name)
