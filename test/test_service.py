@@ -54,6 +54,13 @@ def test_what_it_starts_is_there(service: dict[str, str]) -> None:
     assert all((UNIT.parent / name).is_file() for name in named)
 
 
+def test_the_smoke_run_of_policies_can_make_its_sandbox() -> None:
+    """Namespaces are not restricted, and mounts are allowed, in the unit that runs policies for the first time."""
+    service = section(UNIT.with_name('shadowhound-policy.service'))
+    assert 'RestrictNamespaces' not in service
+    assert '@mount' in service['SystemCallFilter'].split()
+
+
 def test_the_smoke_run_of_policies_has_a_place_to_work() -> None:
     """``ProtectSystem=strict`` leaves nothing to write in but home and /data."""
     text = UNIT.with_name('shadowhound-policy.service').read_text(encoding='utf-8')

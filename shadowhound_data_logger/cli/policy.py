@@ -32,6 +32,7 @@ from shadowhound_data_logger.options import GIBI
 from shadowhound_data_logger.policies import packing, running, signing
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.registry import CANARY, CHAMPION, MlflowRegistry
+from shadowhound_data_logger.policies.smoke import ISOLATIONS, SANDBOX, is_enough
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync, SyncResult
 
 JITTER: Final = 0.2
@@ -146,6 +147,12 @@ def revoke(*, keys: tuple[str, ...], key: Path) -> ExitCode:
 # -- on the robot --------------------------------------------------------------------------------------------------------------
 
 
+_isolation = click.option(
+    '--isolation', envvar='SHADOWHOUND_POLICY_ISOLATION', type=click.Choice(ISOLATIONS), default=SANDBOX, show_default=True,
+    help='The least that a smoke run has to be in; limits: it may run with the rights of this user.',
+)  # fmt: skip
+
+
 def _follows(verb: _Verb) -> _Verb:
     """The options of what a robot follows."""
     for option in reversed((
@@ -157,6 +164,7 @@ def _follows(verb: _Verb) -> _Verb:
         click.option('--max-gib', type=click.FloatRange(0.001), default=8.0, show_default=True, help='Most disk for policies.'),
         click.option('--min-free-gib', type=click.FloatRange(0.0), default=2.0, show_default=True, help='Disk to leave free.'),
         click.option('--keep', type=click.IntRange(2), default=3, show_default=True, help='Versions to keep on the disk.'),
+        _isolation,
         click.option('--now', is_flag=True, help='Activate also while a mission is active.'),
     )):  # fmt: skip
         verb = option(verb)
@@ -206,15 +214,16 @@ def list_(*, as_json: bool) -> ExitCode:
     """List the versions on this robot."""
     folder = _policies()
     state, now = folder.state(), folder.current()
-    rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': state.bad.get(name, '')}
+    rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': state.bad.get(name, ''),
+             'isolation': state.verified.get(name)}
             for name in folder.installed()]  # fmt: skip
     if as_json:
         print_json(rows)
     else:
-        table = plain_table('', ('policy', '', 'why not'), ('policy', '', 'why not'))
+        table = plain_table('', ('policy', '', 'tried in', 'why not'), ('policy', '', 'tried in', 'why not'))
         for row in rows:
             marks = [word for word in ('active', 'pinned') if row[word]]
-            table.add_row(str(row['policy']), ' '.join(marks), str(row['why_not']))
+            table.add_row(str(row['policy']), ' '.join(marks), str(row['isolation'] or '-'), str(row['why_not']))
         print_page(table)
     return ExitCode.FINE
 
@@ -232,7 +241,8 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
         manifest, why = folder.check(found, folder.state()), ''
     except PolicyRefused as error:
         manifest, why = None, f'{error.reason}: {error.what}'
-    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions / found), 'refused': why}
+    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions / found), 'refused': why,
+            'isolation': folder.state().verified.get(found)}  # fmt: skip
     if manifest is not None:
         told |= {'serial': manifest.serial, 'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
                  'inputs': [spec.name for spec in manifest.inputs], 'outputs': [spec.name for spec in manifest.outputs],
@@ -250,10 +260,15 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
 @policy.command(epilog=examples('policy use go2_patrol@7'))
 @click.argument('name')
 @click.option('--now', is_flag=True, help='Also while a mission is active.')
-def use(*, name: str, now: bool) -> ExitCode:
+@_isolation
+def use(*, name: str, now: bool, isolation: str) -> ExitCode:
     """Activate a version that is on this robot, and pin it."""
     folder = _policies()
     found = folder.find(name)
+    tried = folder.state().verified.get(found, 'no isolation that is known')
+    if not is_enough(tried, isolation):
+        raise PolicyError(f'the smoke run of {found} was in {tried}, required is {isolation}',
+                          remedy='policy sync tries it again; or allow less: --isolation limits')  # fmt: skip
     if not now and not _no_mission()():
         raise PolicyError('a mission is active', remedy='wait for its end, or add --now')
     folder.use(found)

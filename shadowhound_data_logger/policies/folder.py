@@ -54,8 +54,9 @@ class PolicyState:
     """Ids that were active before, the newest last."""
     serials: dict[str, int] = field(default_factory=dict)
     """Policy name -> the greatest serial that was active here."""
-    verified: list[str] = field(default_factory=list)
-    """Ids of all versions that passed every check here, also of those that are gone from the disk."""
+    verified: dict[str, str] = field(default_factory=dict)
+    """Id -> the isolation of its smoke run, of all versions that passed every check here, also of those that are gone from the
+    disk."""
     bad: dict[str, str] = field(default_factory=dict)
     """Id -> why it was taken out; such a version comes back by ``use`` alone."""
     revoked: list[str] = field(default_factory=list)
@@ -157,8 +158,8 @@ class PolicyFolder:
             yield state
             self._write(state)
 
-    def install(self, name: str) -> None:
-        """Make a version of what is in ``incoming`` and was verified."""
+    def install(self, name: str, isolation: str) -> None:
+        """Make a version of what is in ``incoming`` and was verified, with a smoke run in this isolation."""
         place = self.incoming / name
         for parent, _, files in os.walk(place):
             for file in files:
@@ -166,10 +167,16 @@ class PolicyFolder:
                 durable_files.sync(path)
                 path.chmod(0o400)
             durable_files.sync(Path(parent))
-        with self.changing() as state:
-            state.verified = [*(each for each in state.verified if each != name), name][-MOST_REMEMBERED:]
+        self.note_tried(name, isolation)
         os.replace(place, self.versions / name)
         durable_files.sync(self.versions)
+
+    def note_tried(self, name: str, isolation: str) -> None:
+        """A smoke run of this version in this isolation went well."""
+        with self.changing() as state:
+            state.verified.pop(name, None)
+            state.verified[name] = isolation
+            state.verified = dict([*state.verified.items()][-MOST_REMEMBERED:])
 
     def activate(self, name: str) -> str | None:
         """Make this version the active one, unless another one was pinned meanwhile; its id. Raises PolicyRefused, OSError."""
@@ -306,7 +313,7 @@ def _state(told: Mapping[str, Any]) -> PolicyState:
     if told['format'] != 1:
         raise ValueError('it is of another version of this package')
     state = PolicyState(**{name: told[name] for name in PolicyState.__slots__})
-    kinds: dict[str, Any] = {'history': list, 'serials': dict, 'verified': list, 'bad': dict, 'revoked': list, 'revocations': int}
+    kinds: dict[str, Any] = {'history': list, 'serials': dict, 'verified': dict, 'bad': dict, 'revoked': list, 'revocations': int}
     if any(not isinstance(getattr(state, name), kind) for name, kind in kinds.items()):
         raise ValueError('its fields have other types')
     return state

@@ -1,8 +1,10 @@
 """One run of a policy before it may run: a child process with limits, a sample with the output that has to come out.
 
-The child has no environment of ours but the path of Python's packages, no network where the system lets it leave that, and
-limits of memory and time. It can start no process and no thread, and write no file. What it says is read with a bound, and its
-process group ends with it.
+The child runs in a sandbox of bubblewrap: of the machine's files it sees the version that it tries, the system's libraries and
+Python's packages, all read-only; it has no network, and sees no other process. Besides, it has no environment of ours but the
+path of Python's packages, limits of memory and time, can start no process and no thread, and write no file. Where the machine
+cannot make a sandbox, only these limits are in force, and a policy is run only where the operator allows that (``LIMITS``).
+What the child says is read with a bound, and its process group ends with it.
 """
 
 from __future__ import annotations
@@ -12,17 +14,20 @@ import json
 import os
 import resource
 import select
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.keys import printable
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, SmokeSample, parse_manifest
 from shadowhound_data_logger.untrusted import from_json
 
@@ -36,19 +41,48 @@ RUNS_S: Final = 5.0
 """No further run begins after that."""
 LEAST_RUNS: Final = 20
 MOST_ARRAY_BYTES: Final = 1 << 28
-_NEW_USER, _NEW_NET = 0x10000000, 0x40000000
+SANDBOX, LIMITS = 'sandbox', 'limits'
+ISOLATIONS: Final = (SANDBOX, LIMITS)
+"""How a policy is run for the first time, the strongest first. With ``LIMITS`` it has the rights of this process' user."""
+_SYSTEM: Final = ('/usr', '/bin', '/lib', '/lib32', '/lib64', '/etc/ld.so.cache', '/etc/alternatives', '/proc/cpuinfo',
+                  '/sys/devices/system/cpu')  # fmt: skip
+"""What every program may read. Without the rest of /proc, which no hardened unit and no container lets anybody mount."""
+_DEVICES: Final = ('/dev/null', '/dev/urandom')
+_PROBE_S: Final = 10.0
+_REMEDY: Final = 'sudo apt install bubblewrap  # docs/policies.md, The smoke run; or allow less: --isolation limits'
 _PDEATHSIG, _NO_NEW_PRIVS = 1, 38
 _REASONS: Final = frozenset({'nan', 'output', 'slow', 'inputs', 'pickle', 'runtime', 'memory'})
 
 
-def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_S) -> float:
-    """The p99 of a step on this machine, ms.
+@dataclass(frozen=True, slots=True)
+class SmokeRun:
+    """What a smoke run that succeeded says."""
+
+    p99_ms: float
+    """Of a step on this machine."""
+    isolation: str
+    """Which of ``ISOLATIONS`` was in force."""
+
+
+def is_enough(isolation: str | None, required: str) -> bool:
+    """Whether a smoke run in this isolation, None for none, is all that is required."""
+    return isolation in ISOLATIONS[: ISOLATIONS.index(required) + 1]
+
+
+def run_smoke(folder: Path, manifest: PolicyManifest, isolation: str = SANDBOX, *, limit_s: float = SMOKE_S) -> SmokeRun:
+    """Run a policy for the first time, in a sandbox where this machine allows it.
+
+    ``isolation`` is the least that has to be in force: with less nothing is run.
 
     Raises PolicyRefused: ``nan`` ``output`` ``slow`` ``inputs`` ``pickle`` ``memory`` ``time`` or ``smoke`` (it crashed), and
-    PolicyError where this machine has no onnxruntime.
+    PolicyError where this machine has no onnxruntime, or no sandbox while one is required.
     """
+    folder = folder.absolute()
     with tempfile.TemporaryDirectory(prefix='shadowhound-policy-') as empty:
-        command = [sys.executable, '-B', '-m', __name__, str(folder.absolute())]  # it may write no file, such as one of bytecode
+        sandbox, problem = open_sandbox(folder, empty)
+        if problem and isolation != LIMITS:
+            raise PolicyError(f'{manifest.id} is not run: this machine lets nobody make a sandbox ({problem})', remedy=_REMEDY)
+        command = [*sandbox, sys.executable, '-B', '-m', __name__, str(folder)]  # it may write no file, such as one of bytecode
         told, code = _ran(command, environ_of(empty), empty, limit_s)
     if code is None:
         raise PolicyRefused('time', f'the smoke run of {manifest.id} took more than {limit_s:g} s')
@@ -56,7 +90,7 @@ def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_
         answer = from_json(told, MOST_ANSWER_BYTES)
         reason, text, p99_ms = str(answer['reason']), str(answer['text'])[:300], float(answer['p99_ms'])
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        what = f'signal {-code}' if code < 0 else f'exit code {code}'
+        what = f'signal {-code % 128}' if code < 0 or code > 128 else f'exit code {code}'
         raise PolicyRefused('smoke', f'the smoke run of {manifest.id} ended with {what}') from error
     if reason == 'runtime':
         raise PolicyError(f'a policy cannot be run here: {text}', remedy="pip install 'shadowhound_data_logger[policies]'")
@@ -65,7 +99,41 @@ def run_smoke(folder: Path, manifest: PolicyManifest, *, limit_s: float = SMOKE_
     if not p99_ms <= manifest.p99_ms:
         text = f'{manifest.id} takes {p99_ms:.1f} ms (p99) on this machine, allowed are {manifest.p99_ms:g} ms'
         raise PolicyRefused('slow', text)
-    return p99_ms
+    return SmokeRun(p99_ms, LIMITS if problem else SANDBOX)
+
+
+def open_sandbox(folder: Path, empty: str) -> tuple[list[str], str]:
+    """The command that runs another one in a sandbox, which sees this folder and works in the empty one.
+
+    Without one, nothing and why not.
+    """
+    program = shutil.which('bwrap')
+    if program is None:
+        return [], 'bubblewrap is not installed'
+    command = [program, '--unshare-all', '--die-with-parent', '--cap-drop', 'ALL']
+    for path in _SYSTEM:
+        command += ['--ro-bind-try', path, path]
+    for path in (*_packages(), str(folder)):
+        command += ['--ro-bind', path, path]
+    for path in _DEVICES:
+        command += ['--dev-bind-try', path, path]
+    command += ['--dir', empty, '--chdir', empty, '--remount-ro', '/']
+    try:
+        probe = subprocess.run([*command, 'true'], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                               env=environ_of(empty), timeout=_PROBE_S, check=False)  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return [], f'bwrap: {error}'
+    if probe.returncode:
+        return [], printable(probe.stderr.decode(errors='replace').strip())[-200:] or f'bwrap: exit code {probe.returncode}'
+    return command, ''
+
+
+def _packages() -> Iterator[str]:
+    """Where Python and its packages are; no folder that has the user's home, or that of the data logger, in it."""
+    secret = [Path.home(), Path(os.environ.get('SHADOWHOUND_HOME') or Path.home()).absolute()]
+    for path in dict.fromkeys(str(Path(path).absolute()) for path in (sys.base_prefix, sys.prefix, *sys.path) if path):
+        if Path(path).exists() and not any(home.is_relative_to(path) for home in secret) and path != '/usr':
+            yield path
 
 
 def environ_of(folder: str) -> dict[str, str]:
@@ -178,14 +246,12 @@ def _p99_ms(session: Any, names: list[str], inputs: dict[str, Any]) -> float:
 
 
 def _confine() -> None:
-    """What the system lets us leave: network, privileges, memory, files; and this process ends with its parent."""
+    """Limits of privileges, memory and files; and this process ends with its parent."""
     libc = ctypes.CDLL(None)
     parent = os.getppid()
     libc.prctl(_PDEATHSIG, 9, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(1)
-    if libc.unshare(_NEW_NET):
-        libc.unshare(_NEW_USER | _NEW_NET)  # refused in many containers: then it has the network of its parent
     libc.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0)
     for what, most in ((resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_FSIZE, 0), (resource.RLIMIT_CORE, 0),
                        (resource.RLIMIT_NPROC, 0), (resource.RLIMIT_CPU, int(SMOKE_S)),

@@ -31,7 +31,7 @@ from shadowhound_data_logger.policies.manifest import (
 )
 from shadowhound_data_logger.policies.packing import revocation_key
 from shadowhound_data_logger.policies.registry import BUCKET, PolicyRegistry, RegisteredVersion, choose, folder_of
-from shadowhound_data_logger.policies.smoke import run_smoke
+from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, is_enough, run_smoke
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
@@ -62,6 +62,8 @@ class PolicySettings:
     min_free_bytes: int = 2 * GIBI
     keep: int = 3
     """Versions on the disk."""
+    isolation: str = SANDBOX
+    """The least that a smoke run has to be in (``smoke.ISOLATIONS``): a version that was run in less is not activated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,7 @@ class PolicySync:
                 if state.pin != self.folder.current():
                     if not self.may_activate():
                         return SyncResult(state.pin, self.folder.current(), 'waiting')
+                    self._ensure_tried(state.pin)
                     self.folder.activate(state.pin)
                 return SyncResult(state.pin, self.folder.current(), 'pinned')
             chosen = choose(self.registry, self.settings.name, self.settings.robot)
@@ -146,11 +149,13 @@ class PolicySync:
         p99_ms, traffic = None, _Traffic(self.settings.max_mbps, self.pause, self.monotonic)
         if known:
             name = known[0]
+            self._ensure_tried(name)
         else:
             manifest = self._fetch(wanted, prefix, traffic)
             name = manifest.id
-            p99_ms = self._try(manifest)
-            self.folder.install(name)
+            run = self._try(manifest)
+            p99_ms = run.p99_ms
+            self.folder.install(name, run.isolation)
         if not self.may_activate():
             return SyncResult(name, self.folder.current(), 'waiting', p99_ms, traffic.fetched_bytes, traffic.begun_anew)
         if pinned := self.folder.activate(name):
@@ -235,9 +240,17 @@ class PolicySync:
                 reason = 'damaged' if error.data.get('reason') == 'damaged' else 'missing'
                 raise PolicyRefused(reason, f'{error.what}: {error.data.get("why", "")}') from error
 
-    def _try(self, manifest: PolicyManifest) -> float:
+    def _ensure_tried(self, name: str) -> None:
+        """Try a version again that is here, where its smoke run was in less isolation than is required now."""
+        state = self.folder.state()
+        if not is_enough(state.verified.get(name), self.settings.isolation):
+            manifest = self.folder.check(name, state)
+            run = run_smoke(self.folder.versions / name, manifest, self.settings.isolation)
+            self.folder.note_tried(name, run.isolation)
+
+    def _try(self, manifest: PolicyManifest) -> SmokeRun:
         try:
-            return run_smoke(self.folder.incoming / manifest.id, manifest)
+            return run_smoke(self.folder.incoming / manifest.id, manifest, self.settings.isolation)
         except PolicyRefused:
             shutil.rmtree(self.folder.incoming / manifest.id)
             raise

@@ -29,14 +29,14 @@ from shadowhound_data_logger.policies import active, packing, signing, smoke, sy
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, parse_manifest
-from shadowhound_data_logger.policies.smoke import run_smoke
+from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, run_smoke
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
     """Its smoke runs go well; those that are about them have their own tests."""
-    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     scene = Scene(tmp_path)
     assert isinstance(scene.store, DirectoryStore)
     yield scene
@@ -432,9 +432,9 @@ def test_a_pin_holds_though_another_version_was_on_its_way(second: Scene, monkey
     """Who pins within a download finds that version active after it, and not for one look the other one."""
     first = str(second.folder.current())
 
-    def pins(*_: object) -> float:
+    def pins(*_: object) -> SmokeRun:
         second.folder.pin() if verb == 'pin' else second.folder.use(first)
-        return 1.0
+        return SmokeRun(1.0, SANDBOX)
 
     monkeypatch.setattr(sync, 'run_smoke', pins)
     result = second.robot.run()
@@ -447,7 +447,7 @@ def test_a_pin_holds_though_another_version_was_on_its_way(second: Scene, monkey
 def test_what_is_there_is_not_fetched_again(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without the runtime of the smoke run downloads a version once, not at each look."""
 
-    def without_runtime(*_: object) -> float:
+    def without_runtime(*_: object) -> SmokeRun:
         raise PolicyError('no runtime')
 
     fetched: list[str] = []
@@ -657,7 +657,7 @@ def test_the_smoke_run(tmp_path: Path, reason: str, change: dict[str, Any]) -> N
     (packed / MANIFEST).write_text(json.dumps(told))
     manifest = parse_manifest((packed / MANIFEST).read_bytes())
     if not reason:
-        assert run_smoke(packed, manifest) > 0.0
+        assert run_smoke(packed, manifest).p99_ms > 0.0
         return
     with pytest.raises(PolicyRefused) as raised:
         run_smoke(packed, manifest)
@@ -724,7 +724,7 @@ def test_the_smoke_run_of_an_ordinary_user(tmp_path: Path) -> None:
     """The runtime needs no process and no thread, of which a user other than root may have none there."""
     packed, _ = Spark(tmp_path).packed(1)
     rights = '=-all,+dac_override,+dac_read_search'  # to read Python's own files, wherever they are
-    program = 'from shadowhound_data_logger.policies import smoke; smoke._NEW_USER = smoke._NEW_NET = 0; smoke.main()'
+    program = 'from shadowhound_data_logger.policies import smoke; smoke.main()'
     command = ['setpriv', '--reuid=65534', '--clear-groups', f'--inh-caps{rights}', f'--ambient-caps{rights}',
                f'--bounding-set{rights}', sys.executable, '-B', '-c', program, str(packed)]  # fmt: skip
     environ = smoke.environ_of(str(tmp_path))
@@ -779,4 +779,4 @@ def test_the_smoke_run_takes_no_package_from_the_current_folder(tmp_path: Path, 
     (tmp_path / 'here' / 'onnxruntime.py').write_text("raise RuntimeError('from here')")
     monkeypatch.chdir(tmp_path / 'here')
     monkeypatch.setattr(sys, 'path', ['', *sys.path])
-    assert run_smoke(packed, manifest) > 0.0
+    assert run_smoke(packed, manifest).p99_ms > 0.0

@@ -19,6 +19,7 @@ from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.errors import PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.policies import sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -132,7 +133,7 @@ def test_a_link_that_is_cut_and_one_that_is_capped(
     seaweed: Tower, spark: Spark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twenty cuts cost at most a twentieth of the bytes; under a cap of 40 Mbit/s it is no faster."""
-    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     size = sum(path.stat().st_size for path in (spark.folder / 'packed_1').rglob('*') if path.is_file())
     with closing(CuttingFront(urlsplit(seaweed.endpoint_url).port or 0, size // (CUTS + 1))) as front:
         follow(seaweed, spark, tmp_path / 'cut', 1, front.port)
@@ -178,7 +179,7 @@ def test_a_cap_is_kept_and_made_use_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: float, line: float, piece: int, stands_s: float
 ) -> None:
     """No faster than the cap and at most a tenth slower, where the line carries more; also where that is hardly more."""
-    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     scene = Scene(tmp_path)
     scene.publish(1, linear(extra=100_000))
     scene.robot.store = store = Line(tmp_path / 'store', line, piece, stands_s)
@@ -215,7 +216,7 @@ def test_a_store_that_lies_costs_a_bounded_transfer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, breaks: bool, error: type[Exception]
 ) -> None:
     """One that sends something else, and whenever it was found out breaks off before the second time."""
-    monkeypatch.setattr(sync, 'run_smoke', lambda *_: 1.0)
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     scene = Scene(tmp_path)
     scene.publish(1, linear(extra=2_500))
     scene.robot.store = store = Liar(tmp_path / 'store')
