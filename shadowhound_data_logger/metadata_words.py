@@ -66,5 +66,5 @@ MESSAGES: Final = 'messages'
 EVENT: Final = 'event'
 CUT_OF: Final = 'cut_of'
 """Of a bag that was cut out of kept slices for a request: the bag that those are of."""
-# A recording that was imported: the SHA-256 of the file that it came from.
+# A recording that was imported: the identity of the episode (datasets/imports.py).
 IMPORTED_FROM: Final = 'imported_from'

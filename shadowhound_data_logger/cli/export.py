@@ -304,7 +304,8 @@ _times = click.option('--times', type=click.Path(path_type=Path), metavar='FILE'
 def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degrees: bool, as_json: bool) -> ExitCode:
     """Store a LeRobotDataset (v2.1, v3.0) of an arm.
 
-    Joints and actions; its videos stay where they are.
+    Joints and actions; its videos stay where they are. Again, when it has grown, it adds the new episodes. Exit code 1 when an
+    episode is refused: its content changed, or the store has another recording of its time.
     """
     with _exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
@@ -323,7 +324,8 @@ def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None,
                        as_json: bool) -> ExitCode:  # fmt: skip
     """Store HDF5 demonstrations (ACT, ALOHA) of an arm.
 
-    The n-th file is episode n, from 0. Joints and actions; pictures stay where they are.
+    The n-th file is episode n, from 0. Joints and actions; pictures stay where they are. Again, with more files, it adds the new
+    episodes. Exit code 1 when an episode is refused: its content changed, or the store has another recording of its time.
     """
     with _exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
@@ -339,11 +341,15 @@ def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool)
         found = library.bring(demonstrations, arm, store)
     if is_json:
         print_json(asdict(found))
-    else:
-        there = f', {number(found.present)} were there already' if found.present else ''
-        print_lines(plain(f'{counted(found.episodes, "episode")} of {arm} with {number(found.samples)} samples: '
-                          f'{counted(found.objects, "object")} stored{there}.'))  # fmt: skip
-    return ExitCode.FINE
+        return exit_code(finding=found.refused)
+    lines = [plain(f'  {episode} is refused: {why}', 'red') for episode, why in list(found.refused.items())[:SHOWN]]
+    lines += [plain(f'  imported before, and not in this data set: {episode}', 'yellow') for episode in found.absent[:SHOWN]]
+    rest = f', {number(len(found.refused))} refused' if found.refused else ''
+    rest += f', {number(len(found.absent))} imported before are not in it' if found.absent else ''
+    lines.append(plain(f'{counted(found.episodes, "new episode")} of {arm} with {number(found.samples)} samples, '
+                       f'{number(found.unchanged)} in the store already{rest}.'))  # fmt: skip
+    print_lines(*lines)
+    return exit_code(finding=found.refused)
 
 
 def _proof(found: Proved, place: str) -> Iterator[Text]:

@@ -2,7 +2,10 @@
 
 LeRobotDataset v2.1 and v3.0 (https://github.com/huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx) and HDF5 as ACT and
 ALOHA write it (https://github.com/tonyzhaozh/aloha, record_episodes.py). Joints and commands become objects of the arm, each
-with the SHA-256 of the file that they came from; pictures stay where they are.
+with the identity of its episode in its key and metadata; pictures stay where they are.
+
+The identity is the SHA-256 of what is imported of an episode (``identity_of``), not of a file: LeRobot v3 has many episodes in
+one file, and writes that again when the data set grows.
 """
 
 from __future__ import annotations
@@ -10,10 +13,13 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import re
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from bisect import bisect_left, insort
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,10 +30,9 @@ import pyarrow.parquet as pq
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, utc
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, iso, utc
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS, JOINT_STATE
 from shadowhound_data_logger.datasets.lerobot import matrix
-from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import ForeignObject, LakeError, SettingError
 from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.lake.bucket import put_part
@@ -40,6 +45,11 @@ if TYPE_CHECKING:
 
 AS_RECORDED: Final = 'lerobot/joints'
 """Positions in whatever they were recorded in: LeRobot writes down no unit."""
+GRID_S: Final = 1e-4
+"""By which lerobot lets a time differ from its frame's (``tolerance_s``)."""
+DIGITS: Final = 16
+"""Digits of an identity in a key."""
+MS: Final = 1_000_000
 PART: Final = 3000
 """Samples of an object."""
 COLUMNS: Final = ('episode', 'begin_ns')
@@ -58,19 +68,54 @@ class Demonstration:
     """(samples, joints)."""
     commands: NDArray[np.float64] | None
     type: str
-    source: str
-    sha256: str
-    """Of the file."""
+    number: int
+    """In its data set."""
+    identity: str
+    """``identity_of`` what was recorded."""
+
+    @property
+    def begin_ns(self) -> int:
+        return int(self.stamps_ns[0])
+
+    @property
+    def name(self) -> str:
+        return f'episode {self.number} ({iso(self.begin_ns)})'
 
 
 @dataclass(slots=True)
 class Imported:
-    """What was brought in; what was there already is counted apart."""
+    """What an import did."""
 
     episodes: int = 0
+    """That are new."""
+    unchanged: int = 0
+    """Episodes that were there already."""
     samples: int = 0
+    """Of the new episodes."""
     objects: int = 0
+    """That are new."""
     present: int = 0
+    """Objects that were there already."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Episode -> why."""
+    absent: list[str] = field(default_factory=list)
+    """Episodes of this arm that were imported before and are not in this data set; they stay in the store."""
+
+
+def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: NDArray[Any], commands: NDArray[Any] | None,
+                unit: str) -> str:  # fmt: skip
+    """SHA-256 in hex of an episode as it was recorded: joints, unit, the time of each sample since the first, all numbers.
+
+    The numbers are hashed as float64, little endian, row by row, before units are converted. So it does not depend on the file
+    that they are in, on the number of the episode, or on the width of a column that holds the same values.
+    """
+    told = {'names': list(names), 'unit': unit, 'samples': len(positions), 'has_commands': commands is not None}
+    whole = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    whole.update(np.ascontiguousarray(stamps_ns - stamps_ns[0], '<i8').tobytes())
+    for values in (each for each in (positions, commands) if each is not None):
+        numbers = np.ascontiguousarray(values, '<f8') + 0.0  # -0.0 is 0.0
+        whole.update(np.where(np.isnan(numbers), np.nan, numbers).tobytes())
+    return whole.hexdigest()
 
 
 def times_of(path: Path) -> dict[int, int]:
@@ -92,30 +137,34 @@ def of_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> I
     """
     info = _info(folder)
     features = info['features']
-    names = tuple(_joint(name) for name in _names(features['observation.state']))
-    wanted = ['episode_index', 'timestamp', 'observation.state']
+    names, fps = tuple(_joint(name) for name in _names(features['observation.state'])), float(info['fps'])
+    wanted = ['episode_index', 'frame_index', 'timestamp', 'observation.state']
     wanted += [name for name in ('action', 'shadowhound.stamp_ns') if name in features]
     has_action = 'action' in features and features['action']['shape'] == features['observation.state']['shape']
-    count = 0
+    parts: list[dict[str, NDArray[Any]]] = []
     for path in sorted((folder / 'data').rglob('*.parquet')):
         try:
             table = pq.read_table(path, columns=wanted)
-            columns = {name: matrix(table[name]) for name in wanted}
+            parts.append({name: matrix(table[name]) for name in wanted})
         except (pa.ArrowException, OSError, ValueError) as error:
             raise LakeError(f'{path} is no data of a LeRobotDataset: {error}') from error
-        sha256 = fingerprint(path)[1]
-        for number in np.unique(columns['episode_index']):
-            rows = columns['episode_index'][:, 0] == number
-            stamps = _stamps(int(number), {name: values[rows] for name, values in columns.items()}, times)
-            values = [columns[name][rows].astype(np.float64) for name in ('observation.state', 'action')[: 1 + has_action]]
-            if any(each.shape[1] != len(names) for each in values):
-                raise LakeError(f'{path} has not the {len(names)} joints that {INFO} says')
-            values = [np.deg2rad(each) for each in values] if is_degrees else values
-            count += 1
-            kind, source = JOINT_STATE if is_degrees else AS_RECORDED, path.relative_to(folder).as_posix()
-            yield Demonstration(stamps, names, values[0], values[1] if has_action else None, kind, source, sha256)
-    if not count:
+        if any(parts[-1][name].shape[1] != len(names) for name in ('observation.state', 'action')[: 1 + has_action]):
+            raise LakeError(f'{path} has not the {len(names)} joints that {INFO} says')
+    if not sum(len(part['episode_index']) for part in parts):
         raise LakeError(f'{folder} has no episode', remedy='name the folder of a LeRobotDataset')
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+    order = np.lexsort((columns['frame_index'][:, 0], columns['episode_index'][:, 0]))
+    numbers, begins = np.unique(columns['episode_index'][order, 0], return_index=True)
+    for number, rows in zip(map(int, numbers), np.split(order, begins[1:]), strict=True):
+        mine = {name: values[rows] for name, values in columns.items()}
+        if len(np.unique(mine['frame_index'])) != len(rows):
+            raise LakeError(f'episode {number} of {folder} has a frame twice', remedy='remove old files from data/')
+        stamps = _stamps(number, mine, times, fps)
+        values = [mine[name].astype(np.float64) for name in ('observation.state', 'action')[: 1 + has_action]]
+        kind = JOINT_STATE if is_degrees else AS_RECORDED
+        identity = identity_of(stamps, names, values[0], values[1] if has_action else None, 'degrees' if is_degrees else kind)
+        values = [np.deg2rad(each) for each in values] if is_degrees else values
+        yield Demonstration(stamps, names, values[0], values[1] if has_action else None, kind, number, identity)
 
 
 def _info(folder: Path) -> dict[str, Any]:
@@ -123,8 +172,9 @@ def _info(folder: Path) -> dict[str, Any]:
         info = dict(json.loads((folder / INFO).read_bytes()))
         version = str(info['codebase_version'])
         state = info['features']['observation.state']
-        if version not in {'v2.1', 'v3.0'} or len(state['shape']) != 1:
-            raise LakeError(f'{folder} is a data set of version {version}', remedy='v2.1 and v3.0 can be imported')
+        if version not in {'v2.1', 'v3.0'} or len(state['shape']) != 1 or not float(info['fps']) > 0:
+            raise LakeError(f'{folder} is a data set of version {version} with {info["fps"]} frames a second',
+                            remedy='v2.1 and v3.0 can be imported')  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise LakeError(f'{folder} is no LeRobotDataset: {error}', remedy=f'it has {INFO} with observation.state') from error
     return info
@@ -142,7 +192,8 @@ def _joint(name: str) -> str:
     return name.removesuffix('.pos').removeprefix('main_').removeprefix('arm_')
 
 
-def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int, int]) -> NDArray[np.int64]:
+def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int, int], fps: float) -> NDArray[np.int64]:
+    """LeRobot counts frames at an even rate, and its times are rounded to float32: where they agree, the frames are exact."""
     if number not in times:
         if 'shadowhound.stamp_ns' in columns:
             return columns['shadowhound.stamp_ns'][:, 0].astype(np.int64)
@@ -151,6 +202,9 @@ def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int
     seconds = columns['timestamp'][:, 0].astype(np.float64)
     if not np.isfinite(seconds).all() or np.abs(seconds).max(initial=0) > 1e6:
         raise LakeError(f'episode {number} has times that make no sense')
+    frames = columns['frame_index'][:, 0]
+    if (np.abs(seconds - frames / fps) <= GRID_S).all():
+        seconds = frames / fps
     return times[number] + np.rint(seconds * SECOND).astype(np.int64)
 
 
@@ -177,59 +231,154 @@ def of_hdf5(
         if len(names) != width:
             raise LakeError(f'{path} has {width} joints, not {len(names)}', remedy='--joints names them in their order')
         stamps = times[number] + np.rint(np.arange(len(positions)) * (SECOND / fps)).astype(np.int64)
-        yield Demonstration(stamps, names, positions, commands, JOINT_STATE, path.name, fingerprint(path)[1])
+        identity = identity_of(stamps, names, positions, commands, JOINT_STATE)
+        yield Demonstration(stamps, names, positions, commands, JOINT_STATE, number, identity)
 
 
-def bring(demonstrations: Iterator[Demonstration], arm: str, store: ObjectStore) -> Imported:
-    """Store them as what the arm recorded, and tell the catalogue. Again, it changes nothing. Raises LakeError, StoreError."""
-    found = Imported()
-    for each in demonstrations:
+def bring(demonstrations: Iterable[Demonstration], arm: str, store: ObjectStore) -> Imported:
+    """Store the new ones as what the arm recorded, and tell the catalogue; nothing that is in the store is changed.
+
+    An episode is refused if the store has another recording of its time, or its recording with another time. Raises LakeError,
+    StoreError.
+    """
+    every, found, stored = list(demonstrations), Imported(), _Stored(store, arm)
+    wanted = {each.begin_ns // MS: each.identity[:DIGITS] for each in every}
+    for each in every:
+        if why := stored.conflict(each, wanted):
+            found.refused[each.name] = why
+            continue
+        is_new = not stored.has(each)
         rows: list[schema.Row] = []
         for sensor, values in ((ARM_JOINTS, each.positions), (ARM_COMMANDS, each.commands)):
-            if values is None:
-                continue
-            for begin in range(0, len(values), PART):
-                some = slice(begin, begin + PART)
-                rows.append(_store(each, sensor, arm, store, (each.stamps_ns[some], values[some]), found))
-        name = f'{utc(int(each.stamps_ns[0])):%Y%m%dT%H%M%S}_import_{each.sha256[:12]}'
+            if values is not None:
+                pieces = range(-(-len(values) // PART))
+                rows += [stored.put(each, sensor, number, values, found) for number in pieces]
+        name = f'{utc(each.begin_ns):%Y%m%dT%H%M%S}_import_{each.identity[:DIGITS]}'
         for date in sorted({schema.date_of(row) for row in rows}):
             mine = [row for row in rows if schema.date_of(row) == date]
             put_part(store, schema.OBJECTS.part_key(arm, date, name), arm, parts.encode(mine), len(mine))
-        found.episodes += 1
-        found.samples += len(each.positions)
+        stored.add(each)
+        found.episodes += is_new
+        found.unchanged += not is_new
+        found.samples += len(each.positions) if is_new else 0
+    found.absent = stored.others(wanted)
     return found
 
 
-def _store(each: Demonstration, sensor: str, arm: str, store: ObjectStore, some: tuple[NDArray[np.int64], NDArray[np.float64]],
-           found: Imported) -> schema.Row:  # fmt: skip
-    stamps, values = some
-    names = list(each.names)
-    samples = [
-        {'stamp_ns': int(stamp), 'name': names, 'position': numbers} for stamp, numbers in zip(stamps, values, strict=True)
-    ]
-    body = orjson.dumps(
-        {'samples': samples, 'imported_from': each.source, 'sha256': each.sha256}, option=orjson.OPT_SERIALIZE_NUMPY
-    )
-    named = ARM_TOPICS[sensor]
-    key = dated(f'{arm}/{named}/{{date}}/{{time}}_{{ms}}_{named}.json', int(stamps[0]))
-    sha256 = hashlib.sha256(body).hexdigest()
-    metadata = {
-        words.ROBOT: arm, words.SENSOR: named, words.TOPIC: f'/{arm}/{named}', words.TYPE: each.type, words.SHA256: sha256,
-        words.T_START_NS: str(stamps[0]), words.T_END_NS: str(stamps[-1]), words.COUNT: str(len(stamps)),
-        words.IMPORTED_FROM: each.sha256,
-    }  # fmt: skip
-    with tempfile.TemporaryDirectory(prefix='shadowhound-import-') as folder:
-        path = Path(folder, 'body.json')
-        path.write_bytes(body)
-        item = SpooledObject(
-            id=0, bucket=schema.BUCKET, key=key, path=path, size=len(body), sha256=sha256, content_type='application/json',
-            metadata=metadata, priority=5, created_ns=time.time_ns(),
-        )  # fmt: skip
-        try:
-            is_new = store.put(item) is Put.CREATED
-        except ForeignObject as error:
-            raise LakeError(f'{schema.BUCKET}/{key} is there, and is another recording of that time',
-                            remedy='name another arm, or right times') from error  # fmt: skip
-    found.objects += is_new
-    found.present += not is_new
-    return schema.row_of(schema.BUCKET, key, len(body), 'application/json', metadata)
+class _Stored:
+    """The episodes of an arm that were imported, by the keys of their objects. One thread."""
+
+    def __init__(self, store: ObjectStore, arm: str) -> None:
+        """Raises StoreError."""
+        self._store, self._arm = store, arm
+        self._keys: set[str] = set()
+        self._pieces: list[tuple[int, str, str]] = []
+        """(begin in ms, identity, key) of the objects with joints, in this order."""
+        self._begins: dict[str, set[int]] = {}
+        """Identity -> the begins, in ms, of the episodes that have it."""
+        for sensor in (ARM_JOINTS, ARM_COMMANDS):
+            named = ARM_TOPICS[sensor]
+            name = rf'(\d{{8}}/\d{{6}}_\d{{3}})_{named}_([0-9a-f]{{{DIGITS}}})_(\d+)\.json'
+            pattern = re.compile(rf'{re.escape(arm)}/{named}/{name}', re.ASCII)
+            for info in store.list(schema.BUCKET, f'{arm}/{named}/'):
+                if (told := pattern.fullmatch(info.key)) is None:
+                    continue  # recorded by the arm's own machine
+                self._keys.add(info.key)
+                if sensor == ARM_JOINTS:
+                    self._add(_ms_of(told[1]), told[2], info.key, int(told[3]))
+
+    def has(self, each: Demonstration) -> bool:
+        return each.begin_ns // MS in self._begins.get(each.identity[:DIGITS], ())
+
+    def add(self, each: Demonstration) -> None:
+        """It is there now."""
+        if not self.has(each):
+            for number, stamp in enumerate(each.stamps_ns[::PART].tolist()):
+                self._add(stamp // MS, each.identity[:DIGITS], self._key(each, ARM_JOINTS, number), number)
+
+    def conflict(self, each: Demonstration, wanted: Mapping[int, str]) -> str:
+        """Why it cannot be stored; empty where it can. ``wanted`` are begin, in ms, and identity of all that are imported."""
+        if self.has(each):
+            return ''
+        mine = each.identity[:DIGITS]
+        for begin in sorted(self._begins.get(mine, ())):
+            if wanted.get(begin) != mine:
+                return f'its recording was imported with the begin {iso(begin * MS)}: it has another number or time now'
+        if (other := self._overlapping(each)) is None:
+            return ''
+        begin, identity = other
+        if begin == each.begin_ns // MS:
+            return f'it changed: the recording with this begin was imported as {identity}, and is {mine} now'
+        return f'the recording that was imported with the begin {iso(begin * MS)} is of the same time'
+
+    def others(self, wanted: Mapping[int, str]) -> list[str]:
+        """The episodes with other begins than these."""
+        every = sorted((begin, identity) for identity, begins in self._begins.items() for begin in begins)
+        return [f'{iso(begin * MS)} {identity}' for begin, identity in every if begin not in wanted]
+
+    def put(self, each: Demonstration, sensor: str, number: int, values: NDArray[np.float64], found: Imported) -> schema.Row:
+        """Store the samples from ``number`` times ``PART`` on, if they are not there; the row. Raises LakeError, StoreError."""
+        key = self._key(each, sensor, number)
+        held = self._store.head(schema.BUCKET, key) if key in self._keys else None
+        if held is not None:
+            if held.metadata.get(words.IMPORTED_FROM) != each.identity:
+                raise LakeError(f'{schema.BUCKET}/{key} is not of {each.name}', remedy='import it as another --arm')
+            found.present += 1
+            return schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
+        some = slice(number * PART, (number + 1) * PART)
+        stamps, values = each.stamps_ns[some], values[some]
+        names = list(each.names)
+        samples = [
+            {'stamp_ns': int(stamp), 'name': names, 'position': numbers} for stamp, numbers in zip(stamps, values, strict=True)
+        ]
+        body = orjson.dumps({'samples': samples, 'imported_from': each.identity}, option=orjson.OPT_SERIALIZE_NUMPY)
+        named = ARM_TOPICS[sensor]
+        sha256 = hashlib.sha256(body).hexdigest()
+        metadata = {
+            words.ROBOT: self._arm, words.SENSOR: named, words.TOPIC: f'/{self._arm}/{named}', words.TYPE: each.type,
+            words.SHA256: sha256, words.T_START_NS: str(stamps[0]), words.T_END_NS: str(stamps[-1]),
+            words.COUNT: str(len(stamps)), words.IMPORTED_FROM: each.identity,
+        }  # fmt: skip
+        with tempfile.TemporaryDirectory(prefix='shadowhound-import-') as folder:
+            path = Path(folder, 'body.json')
+            path.write_bytes(body)
+            item = SpooledObject(
+                id=0, bucket=schema.BUCKET, key=key, path=path, size=len(body), sha256=sha256, content_type='application/json',
+                metadata=metadata, priority=5, created_ns=time.time_ns(),
+            )  # fmt: skip
+            try:
+                is_new = self._store.put(item) is Put.CREATED
+            except ForeignObject as error:
+                raise LakeError(f'{schema.BUCKET}/{key} is there, and is another recording of that time',
+                                remedy='import it as another --arm, or with other --times') from error  # fmt: skip
+        found.objects += is_new
+        found.present += not is_new
+        return schema.row_of(schema.BUCKET, key, len(body), 'application/json', metadata)
+
+    def _key(self, each: Demonstration, sensor: str, number: int) -> str:
+        named = ARM_TOPICS[sensor]
+        pattern = f'{self._arm}/{named}/{{date}}/{{time}}_{{ms}}_{named}_{each.identity[:DIGITS]}_{number}.json'
+        return dated(pattern, int(each.stamps_ns[number * PART]))
+
+    def _add(self, begin_ms: int, identity: str, key: str, number: int) -> None:
+        insort(self._pieces, (begin_ms, identity, key))
+        if number == 0:
+            self._begins.setdefault(identity, set()).add(begin_ms)
+
+    def _overlapping(self, each: Demonstration) -> tuple[int, str] | None:
+        """Begin in ms and identity of an object of the same time."""
+        place = bisect_left(self._pieces, (each.begin_ns // MS,))
+        if place < len(self._pieces) and self._pieces[place][0] <= int(each.stamps_ns[-1]) // MS:
+            return self._pieces[place][:2]
+        if place:
+            begin, identity, key = self._pieces[place - 1]
+            held = self._store.head(schema.BUCKET, key)
+            if held is not None and int(held.metadata.get(words.T_END_NS, 0)) >= each.begin_ns:
+                return begin, identity
+        return None
+
+
+def _ms_of(text: str) -> int:
+    """Of ``YYYYMMDD/HHMMSS_mmm`` in a key, ms since 1970."""
+    seconds, _, ms = text.rpartition('_')
+    return int(datetime.strptime(f'{seconds}+0000', '%Y%m%d/%H%M%S%z').timestamp()) * 1000 + int(ms)

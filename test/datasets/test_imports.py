@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from click.testing import CliRunner
 from datasets.recorded import House, Mission
 from datasets.test_arm import CLOCK, LEKIWI
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.cli.export import export as command
+from shadowhound_data_logger.clock import SECOND, iso
 from shadowhound_data_logger.config import UploadSettings
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
-from shadowhound_data_logger.datasets.imports import bring, of_hdf5, of_lerobot, times_of
+from shadowhound_data_logger.datasets.imports import Imported, bring, identity_of, of_hdf5, of_lerobot, times_of
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.errors import LakeError, SettingError
@@ -45,28 +49,36 @@ def positions(number: int) -> np.ndarray[Any, Any]:
     return np.array([so_arm.positions(begin_ns(number) + frame * SECOND // FPS) for frame in range(4 * FPS)])
 
 
-def lerobot_set(folder: Path, version: str) -> Path:
-    """As lerobot lays it out: v2.1 a file an episode, v3.0 all in one. In degrees."""
+def lerobot_set(folder: Path, version: str, numbers: Sequence[int] = (0, 1), *, fps: int = FPS, dtype: Any = np.float32,
+                change: Callable[[list[np.ndarray[Any, Any]]], object] = lambda _: None, files: int = 1) -> Path:  # fmt: skip
+    """As lerobot lays it out: v2.1 a file an episode, v3.0 all in a file, or in several. In degrees.
+
+    ``numbers`` are the recordings that are its episodes; ``change`` gets their positions.
+    """
     names: Any = [f'{name}.pos' for name in so_arm.JOINTS]
     names = names if version == 'v3.0' else {'motors': [f'main_{each}' for each in so_arm.JOINTS]}
     vector = {'dtype': 'float32', 'shape': [6], 'names': names}
-    info = {'codebase_version': version, 'fps': FPS, 'features': {'observation.state': vector, 'action': vector}}
+    info = {'codebase_version': version, 'fps': fps, 'features': {'observation.state': vector, 'action': vector}}
     (folder / 'meta').mkdir(parents=True)
     (folder / 'data/chunk-000').mkdir(parents=True)
     (folder / 'meta/info.json').write_text(json.dumps(info))
+    states = [np.rad2deg(positions(number)).astype(np.float32).astype(dtype) for number in numbers]
+    change(states)
     tables = []
-    for number in range(2):
-        state = np.rad2deg(positions(number)).astype(np.float32)
+    for episode, state in enumerate(states):
         column = pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 6)
         tables.append(pa.table({
-            'observation.state': column, 'action': column, 'timestamp': (np.arange(len(state)) / FPS).astype(np.float32),
-            'frame_index': np.arange(len(state)), 'episode_index': np.full(len(state), number),
+            'observation.state': column, 'action': column, 'timestamp': (np.arange(len(state)) / fps).astype(dtype),
+            'frame_index': np.arange(len(state)), 'episode_index': np.full(len(state), episode),
         }))  # fmt: skip
     if version == 'v3.0':
-        pq.write_table(pa.concat_tables(tables), folder / 'data/chunk-000/file-000.parquet')
+        whole = pa.concat_tables(tables)
+        for number in range(files):  # also where an episode is in two of them
+            begin, end = (len(whole) * each // files for each in (number, number + 1))
+            pq.write_table(whole.slice(begin, end - begin), folder / f'data/chunk-000/file-{number:03d}.parquet')
     else:
-        for number, table in enumerate(tables):
-            pq.write_table(table, folder / f'data/chunk-000/episode_{number:06d}.parquet')
+        for episode, table in enumerate(tables):
+            pq.write_table(table, folder / f'data/chunk-000/episode_{episode:06d}.parquet')
     return folder
 
 
@@ -156,3 +168,217 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
     times.write_text('episode,begin_ns\n0,soon\n')
     with pytest.raises(SettingError, match='--times'):
         times_of(times)
+
+
+# -- again -----------------------------------------------------------------------------------------------------------------
+
+
+class Shelf:
+    """A store, and the data sets of an arm that are imported into it one after the other."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.settings = House(folder / 'house').settings
+        self.settings.directory.mkdir(parents=True)
+        self.store = open_store(self.settings, UploadSettings())
+        self._count = 0
+
+    def set(self, version: str = 'v3.0', numbers: Sequence[int] = (0, 1), **how: Any) -> Path:
+        self._count += 1
+        return lerobot_set(self.folder / f'theirs{self._count}', version, numbers, **how)
+
+    def bring(self, folder: Path, begins: Sequence[int] | None = None, *, is_degrees: bool = True) -> Imported:
+        """``begins`` are the recordings with whose begins its episodes are imported."""
+        times = {episode: begin_ns(number) for episode, number in enumerate(range(9) if begins is None else begins)}
+        return bring(of_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
+
+    def contents(self) -> dict[str, bytes]:
+        root = self.settings.directory / 'sensor-data/arm'
+        return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob('*') if path.is_file()}
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Shelf:
+    return Shelf(tmp_path)
+
+
+def counts(found: Imported) -> tuple[int, int, int, int]:
+    return found.episodes, found.unchanged, len(found.refused), len(found.absent)
+
+
+@pytest.mark.parametrize('version', ['v2.1', 'v3.0'])
+def test_a_data_set_that_has_grown(shelf: Shelf, version: str) -> None:
+    """Its shared file was written again: the new episode is added, and what is in the store stays as it is."""
+    assert counts(shelf.bring(shelf.set(version))) == (2, 0, 0, 0)
+    before = shelf.contents()
+    found = shelf.bring(shelf.set(version, (0, 1, 2)))
+    assert counts(found) == (1, 2, 0, 0)
+    assert (found.objects, found.present, found.samples) == (2, 4, 4 * FPS)
+    after = shelf.contents()
+    assert after == {**after, **before}
+    assert sum('joint' in key for key in after) == sum('joint' in key for key in before) + 2
+    assert counts(shelf.bring(shelf.set(version, (0, 1, 2)))) == (0, 3, 0, 0)
+    assert shelf.contents() == after
+
+
+@pytest.mark.parametrize(('version', 'how'), [('v2.1', {}), ('v3.0', {'files': 3}), ('v3.0', {'dtype': np.float64})])
+def test_the_layout_is_no_part_of_an_episode(shelf: Shelf, version: str, how: dict[str, Any]) -> None:
+    """Whatever files the episodes are in, also one episode in two of them, and however wide the columns are."""
+    assert counts(shelf.bring(shelf.set())) == (2, 0, 0, 0)
+    assert counts(shelf.bring(shelf.set(version, **how))) == (0, 2, 0, 0)
+
+
+def test_rows_in_another_order(shelf: Shelf) -> None:
+    """Frames are in the order of their numbers, not of their rows."""
+    shelf.bring(shelf.set())
+    folder = shelf.set()
+    path = folder / 'data/chunk-000/file-000.parquet'
+    table = pq.read_table(path)
+    pq.write_table(table.take(np.random.default_rng(3).permutation(len(table))), path, row_group_size=17)
+    assert counts(shelf.bring(folder)) == (0, 2, 0, 0)
+
+
+def test_an_episode_that_changed_is_refused(shelf: Shelf) -> None:
+    """By one number: it is named, the others are imported, and the store keeps what it has."""
+    shelf.bring(shelf.set())
+    before = shelf.contents()
+
+    def change(states: list[np.ndarray[Any, Any]]) -> None:
+        states[1][77, 3] = np.nextafter(states[1][77, 3], np.float32(1e9))
+
+    found = shelf.bring(shelf.set(numbers=(0, 1, 2), change=change))
+    assert counts(found) == (1, 1, 1, 0)
+    ((name, why),) = found.refused.items()
+    assert name == f'episode 1 ({iso(begin_ns(1))})'
+    assert why.startswith('it changed: the recording with this begin was imported as ')
+    assert {key: body for key, body in shelf.contents().items() if key in before} == before
+
+
+@pytest.mark.parametrize('how', [
+    {'fps': 15}, {'change': lambda states: states.__setitem__(1, states[1][:-1])},
+    {'change': lambda states: states.__setitem__(1, states[1][1:])},
+], ids=['fps', 'cut at its end', 'cut at its begin'])  # fmt: skip
+def test_other_times_are_another_recording(shelf: Shelf, how: dict[str, Any]) -> None:
+    """The same numbers at another rate, or fewer of them."""
+    shelf.bring(shelf.set())
+    found = shelf.bring(shelf.set(**how))
+    assert (found.episodes, f'episode 1 ({iso(begin_ns(1))})' in found.refused) == (0, True)
+
+
+def test_another_unit_is_another_recording(shelf: Shelf) -> None:
+    shelf.bring(shelf.set())
+    assert counts(shelf.bring(shelf.set(), is_degrees=False)) == (0, 0, 2, 0)
+
+
+def test_episodes_that_are_not_there_any_more_are_reported(shelf: Shelf) -> None:
+    """They stay in the store. One that was removed from the middle: the others have other numbers, and are the same."""
+    shelf.bring(shelf.set(numbers=(0, 1, 2)))
+    before = shelf.contents()
+    found = shelf.bring(shelf.set(numbers=(0, 2)), begins=(0, 2))
+    assert counts(found) == (0, 2, 0, 1)
+    assert found.absent[0].startswith(iso(begin_ns(1) // 1_000_000 * 1_000_000))
+    assert shelf.contents() == before
+
+
+def test_episodes_in_another_order(shelf: Shelf) -> None:
+    """With their own begins they are the same; with those of the old numbers they are refused, and nothing is stored twice."""
+    shelf.bring(shelf.set(numbers=(0, 1, 2)))
+    before = shelf.contents()
+    assert counts(shelf.bring(shelf.set(numbers=(2, 0, 1)), begins=(2, 0, 1))) == (0, 3, 0, 0)
+    found = shelf.bring(shelf.set(numbers=(2, 0, 1)))
+    assert counts(found) == (0, 0, 3, 0)
+    assert all('it has another number or time now' in why for why in found.refused.values())
+    assert shelf.contents() == before
+
+
+def test_a_data_set_of_two(shelf: Shelf) -> None:
+    """Merged: what was imported of either one is there already."""
+    shelf.bring(shelf.set(numbers=(0, 1)), begins=(0, 1))
+    shelf.bring(shelf.set(numbers=(2,)), begins=(2,))
+    assert counts(shelf.bring(shelf.set(numbers=(2, 0, 1, 3)), begins=(2, 0, 1, 3))) == (1, 3, 0, 0)
+
+
+@pytest.mark.parametrize('shift_s', [-1.5, 1.5, 3.9])
+def test_two_recordings_of_one_time(shelf: Shelf, shift_s: float) -> None:
+    """An arm has one at a time: another one is refused, also in the same data set, and one after it is taken."""
+    shelf.bring(shelf.set(numbers=(0,)))
+    other = shelf.set(numbers=(3, 4))
+    times = {0: begin_ns(0) + round(shift_s * SECOND), 1: begin_ns(0) + 4 * SECOND}
+    found = bring(of_lerobot(other, times, is_degrees=True), 'arm', shelf.store)
+    assert list(found.refused) == [f'episode 0 ({iso(times[0])})']
+    assert found.episodes == 1
+    double = bring(of_lerobot(other, {0: begin_ns(7), 1: begin_ns(7)}, is_degrees=True), 'other', shelf.store)
+    assert counts(double) == (1, 0, 1, 0)
+
+
+def test_an_import_that_was_killed(shelf: Shelf) -> None:
+    """Of the second episode there are the joints alone, not the commands and not the rows of the catalogue."""
+    folder = shelf.set()
+    shelf.bring(folder)
+    whole = shelf.contents()
+    gone = sorted(key for key in whole if 'joint_commands' in key or '_catalog' in key)
+    for key in gone[1::2]:
+        (shelf.settings.directory / 'sensor-data/arm' / key).unlink()
+    shelf.bring(folder)
+    assert shelf.contents() == whole
+
+
+def test_a_long_episode(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is in several objects, and one episode still."""
+    monkeypatch.setattr('shadowhound_data_logger.datasets.imports.PART', 50)
+    found = shelf.bring(shelf.set())
+    assert (found.episodes, found.objects) == (2, 12)
+    again = shelf.bring(shelf.set(numbers=(0, 1, 2)))
+    assert (again.episodes, again.objects, again.present, again.absent) == (1, 6, 12, [])
+
+
+def test_numbers_that_are_equal_have_one_identity() -> None:
+    """0 and -0, any NaN, any order of bytes in memory; and not: joints of other names, commands or none."""
+    stamps = np.arange(3, dtype=np.int64)
+    values = np.array([[0.0, 1.0], [2.0, np.nan], [4.0, 5.0]])
+    one = identity_of(stamps, ('a', 'b'), values, None, 'rad')
+    other_nan = values.copy()
+    other_nan.view(np.uint64)[1, 1] |= 1
+    rounded = values.astype(np.float32)
+    for same in (np.where(values == 0, -0.0, values), other_nan, np.asfortranarray(values), values.astype('>f8'), rounded):
+        assert identity_of(stamps + 10**18, ('a', 'b'), same, None, 'rad') == one
+    others = [
+        (stamps, ('b', 'a'), values, None, 'rad'), (stamps, ('a', 'b'), values, values, 'rad'),
+        (stamps * 2, ('a', 'b'), values, None, 'rad'), (stamps, ('a', 'b'), values, None, 'degrees'),
+        (stamps, ('a', 'b'), values[::-1], None, 'rad'), (stamps[:2], ('a', 'b'), values[:2], None, 'rad'),
+    ]  # fmt: skip
+    assert len({one, *(identity_of(*other) for other in others)}) == 1 + len(others)
+
+
+def test_a_frame_that_is_there_twice(shelf: Shelf) -> None:
+    """A file of an earlier version lies in the folder still."""
+    folder = shelf.set(files=2)
+    (folder / 'data/chunk-000/file-002.parquet').write_bytes((folder / 'data/chunk-000/file-001.parquet').read_bytes())
+    with pytest.raises(LakeError, match='has a frame twice'):
+        shelf.bring(folder)
+
+
+def test_the_command_reports_what_was_refused(shelf: Shelf, tmp_path: Path) -> None:
+    """With exit code 1; what is there already, and what is not there any more, is no finding."""
+    home = tmp_path / 'home'
+    home.mkdir()
+    (home / 'store').symlink_to(shelf.settings.directory)
+    times = tmp_path / 'times.csv'
+    times.write_text('episode,begin_ns\n' + ''.join(f'{number},{begin_ns(number)}\n' for number in range(3)))
+
+    def run(folder: Path, *more: str) -> tuple[int, str]:
+        runner = CliRunner(env={'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': None, 'COLUMNS': '200'})
+        arguments = ['import-lerobot', str(folder), '--arm', 'arm', '--times', str(times), '--degrees', *more]
+        ran = runner.invoke(command, arguments, standalone_mode=False, catch_exceptions=False)
+        return ran.return_value, ran.stdout
+
+    assert run(shelf.set(numbers=(0, 1, 2))) == (
+        ExitCode.FINE, '3 new episodes of arm with 360 samples, 0 in the store already.\n')  # fmt: skip
+    code, told = run(shelf.set(numbers=(0, 1)))
+    assert code == ExitCode.FINE
+    assert told.endswith('0 new episodes of arm with 0 samples, 2 in the store already, 1 imported before are not in it.\n')
+    code, told = run(shelf.set(numbers=(0, 3, 2)))
+    assert code == ExitCode.FINDING
+    assert f'episode 1 ({iso(begin_ns(1))}) is refused: it changed' in told
+    code, told = run(shelf.set(numbers=(0, 3, 2)), '--json')
+    assert (code, len(json.loads(told)['refused'])) == (ExitCode.FINDING, 1)
