@@ -170,7 +170,7 @@ def test_one_file_of_the_stores_knows_obstore() -> None:
 def test_one_module_owns_the_sql_of_the_spools_index() -> None:
     """What sends SQL elsewhere has a database of its own: notes of an audit, what was fetched, a bag."""
     index = {'spool/index.py', 'spool/gap_table.py', 'spool/request_table.py', 'spool/schema.py'}
-    own = {'spool/deliveries.py', 'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'bags/contents.py', 'bags/verify.py'}
+    own = {'spool/deliveries.py', 'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'bags/contents.py'}
     senders = {
         path.relative_to(ROOT).as_posix() for path in MODULES for node in nodes(path)
         if isinstance(node, ast.Attribute) and node.attr in {'execute', 'executemany', 'executescript'}

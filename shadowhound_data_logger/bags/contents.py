@@ -1,6 +1,7 @@
-"""The messages of a bag's files, whatever their storage: MCAP as it lies, also in a store; SQLite and packed files from the disk.
+"""The files of a bag as one sequence of messages, whatever their storage: MCAP in a folder or a store, SQLite and packed files.
 
-rosbags reads the SQLite, once it is known that its tables are tables: a view would be a program of whoever wrote the file.
+Everything that reads a bag opens it here, so `info`, `cut`, `verify` and `upload` agree on what it holds: what its files hold.
+``metadata.yaml`` is a claim that is compared with them.
 """
 
 from __future__ import annotations
@@ -8,141 +9,403 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Any, Final, Protocol
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
-
-from shadowhound_data_logger.bags.description import BagPart, Description
+from shadowhound_data_logger.bags.description import BagPart, Description, of_files, of_metadata
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural
 from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.errors import BagDamaged, DataLoggerError
-from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.mcap.format import CDR, ROS2
+from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_profile
 from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, path_below, unpacked
+from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, read_whole
+from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
 from shadowhound_data_logger.zstd import ZstdError, ZstdFile
 
 THREADS: Final = 8
-"""Slices that are opened at a time."""
+"""Files that are opened at a time."""
 PIECE_BYTES: Final = 1 << 20
 MOST_RATIO: Final = 1000
 """Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
-_ENCODINGS = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.IDL: 'ros2idl'}
+OWN_METADATA: Final = frozenset({'rosbag2', 'shadowhound_recording'})
+"""Metadata records that every writer makes for its own file."""
+NOT_READ: Final = 'the figures are those of metadata.yaml: its files are not read in a store; fetch the bag to have them read'
+ZSTD_MAGIC: Final = b'\x28\xb5\x2f\xfd'
 _TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
+_LATEST_NS: Final = 1 << 63
 
 
-def is_plain(told: Description | None, slices: Sequence[str]) -> bool:
-    """Whether a bag is of MCAP files that can be read as they lie."""
-    if told is None:
-        return bool(slices) and all(name.endswith('.mcap') for name in slices)
-    return told.storage == 'mcap' and not told.compression
+class BagFile(Protocol):
+    """One file of a bag."""
+
+    @property
+    def profile(self) -> str:
+        """Of its messages, as the header of MCAP has it. Raises BagDamaged, as all others."""
+
+    @property
+    def info(self) -> SliceInfo: ...
+
+    @property
+    def extras(self) -> int:
+        """Attachments and metadata records, which are not messages."""
+
+    def check(self) -> SliceInfo:
+        """What it holds, after a check of what its storage can check without unpacking the messages."""
+
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
 
-class Plain:
-    """Reads the slices of an MCAP bag as one row of messages.
+class McapFile:
+    """An MCAP file on the disk or in a store, opened when something of it is needed, by its summary first."""
 
-    A slice is opened when something of it is wanted, by its summary first.
+    def __init__(self, source: Ranged) -> None:
+        self._source = source
 
-    Life: New; used by one thread. ``told`` saves opening slices of which it says that they are of another time; without it
-    ``clock`` may say what it would (``Description.clock``).
-    """
+    @cached_property
+    def _index(self) -> McapIndex:
+        return read_index(self._source)
 
-    def __init__(self, sources: Sequence[Ranged], told: Description | None, clock: Mapping[str, str] | None = None) -> None:
-        self._sources = sources
-        self._told = told
-        self._clock = clock or {}
-        self._times = _times(told, sources)
-        self._index: Callable[[int], McapIndex] = cache(lambda place: read_index(sources[place]))
+    @cached_property
+    def profile(self) -> str:
+        return read_profile(self._source)
 
-    def span(self) -> tuple[int, int]:
-        if self._told is not None and self._told.messages:
-            return self._told.t_start_ns, self._told.t_end_ns
-        self._open(range(len(self._sources)))
-        found = [index for index in map(self._index, range(len(self._sources))) if index.messages]
-        return min((index.t_start_ns for index in found), default=0), max((index.t_end_ns for index in found), default=0)
+    @property
+    def info(self) -> SliceInfo:
+        return self._index.info(Path(self._source.name), self._source.size)
 
-    def topics(self) -> set[str]:
-        if self._told is not None:
-            return {topic.name for topic in self._told.topics}
-        places = range(len(self._sources))
-        self._open(places)
-        return {channel.topic for place in places for channel in self._index(place).channels.values()}
+    @property
+    def extras(self) -> int:
+        return self._index.attachments + sum(name not in OWN_METADATA for name in self._index.metadata)
 
-    def clock(self) -> Mapping[str, str]:
-        return self._clock if self._told is None else self._told.clock
-
-    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
-        places = [place for place in range(len(self._sources)) if self._may_have(place, wanted)]
-        self._open(places)
-        for place in places:
-            yield from read_messages(self._sources[place], self._index(place), wanted)
-
-    def _open(self, places: Sequence[int]) -> None:
-        """Several at a time."""
-        with ThreadPoolExecutor(THREADS, 'bag-open') as pool:
-            list(pool.map(self._index, places))
-
-    def _may_have(self, place: int, wanted: MessageFilter) -> bool:
-        part = self._times[place]
-        if part is None or part.t_start_ns is None or part.t_end_ns is None:
-            return part is None or part.messages != 0
-        return part.t_start_ns < wanted.end_ns and part.t_end_ns >= wanted.start_ns
-
-
-def _times(told: Description | None, sources: Sequence[Ranged]) -> list[BagPart | None]:
-    parts = {part.name: part for part in told.parts} if told else {}
-    return [parts.get(source.name.rpartition('/')[2]) for source in sources]
-
-
-class Packed:
-    """Reads a bag that is not plain MCAP: SQLite, or compressed outside the storage. Its files are those that the metadata name.
-
-    SQLite knows one stamp alone, when a message came; it stands for both.
-    """
-
-    def __init__(self, folder: Path, told: Description) -> None:
-        self._folder = folder
-        self._told = told
-
-    def span(self) -> tuple[int, int]:
-        return (self._told.t_start_ns, self._told.t_end_ns) if self._told.messages else (0, 0)
-
-    def topics(self) -> set[str]:
-        return {topic.name for topic in self._told.topics}
-
-    def clock(self) -> Mapping[str, str]:
-        return self._told.clock
+    def check(self) -> SliceInfo:
+        return self.info
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
-        is_by_message = 'message' in self._told.compression
-        for part in self._told.parts:
-            with self._unpacked(part.name) as path:
-                found = Plain([LocalFile(path)], None).messages(wanted) if path.suffix == '.mcap' else _stored(path, wanted)
-                for message in found:
-                    yield _plain(message, path) if is_by_message else message
+        return read_messages(self._source, self._index, wanted)
+
+
+class SqliteFile:
+    """A file of rosbag2's SQLite storage, of any version. It has one time for each message, that of its arrival, used for both.
+
+    Its tables are checked before anything is read from them: a view would be a program of whoever wrote the file.
+    """
+
+    profile = ROS2
+    extras = 0
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @cached_property
+    def _channels(self) -> dict[int, Channel]:
+        check_tables(self._path)
+        with self._opened() as database:
+            columns = {str(name) for _, name, *_ in database.execute('PRAGMA table_info(topics)')}
+            wanted = [name if name in columns else "''" for name in ('offered_qos_profiles', 'type_description_hash')]
+            topics = database.execute(f'SELECT id, name, type, serialization_format, {", ".join(wanted)} FROM topics').fetchall()  # noqa: S608 - of the two above
+            known = dict[str, tuple[str, str]]()
+            if database.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'message_definitions'").fetchone():
+                query = 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+                known = {kind: (encoding, text) for kind, encoding, text in database.execute(query)}
+            return {number: _channel(fields, known) for number, *fields in topics}
+
+    @cached_property
+    def info(self) -> SliceInfo:
+        channels = self._channels
+        with self._opened() as database:
+            query = 'SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id'
+            rows = database.execute(query).fetchall()
+            for number, _, *times in rows:
+                if number not in channels:
+                    raise ValueError(f'it has messages of topic {number!r:.80}, which it does not define')
+                list(map(_time, times))
+        counts = {number: count for number, count, _, _ in rows}
+        by_channel = dict[Channel, int]()
+        for number, channel in channels.items():
+            by_channel[channel] = by_channel.get(channel, 0) + counts.get(number, 0)
+        return SliceInfo(
+            self._path, self._path.stat().st_size, '', min((row[2] for row in rows), default=0),
+            max((row[3] for row in rows), default=0), sum(counts.values()), by_channel,
+        )  # fmt: skip
+
+    def check(self) -> SliceInfo:
+        check_tables(self._path)
+        with self._opened() as database:
+            answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
+            if answer != 'ok':
+                raise ValueError(str(answer))
+        return self.info
+
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
+        chosen = {number: channel for number, channel in self._channels.items() if wanted.channel(channel)}
+        marks = ', '.join('?' * len(chosen))
+        query = (
+            f'SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp <= ? AND topic_id IN ({marks}) '  # noqa: S608 - question marks
+            'ORDER BY timestamp, id'
+        )
+        first, last = max(wanted.start_ns, 0), min(wanted.end_ns, _LATEST_NS) - 1
+        with self._opened() as database:
+            for number, log_ns, data in database.execute(query, (first, last, *chosen)):
+                if not isinstance(data, bytes):
+                    raise TypeError('a message has no content')
+                yield RecordedMessage(chosen[number], _time(log_ns), log_ns, 0, data)
 
     @contextmanager
-    def _unpacked(self, name: str) -> Iterator[Path]:
-        """The file as its storage wrote it."""
-        path = path_below(self._folder, name)
-        if 'file' not in self._told.compression:
-            yield path
-            return
-        if not self._told.compression.startswith('zstd'):
-            raise BagDamaged(f'{path} is compressed with {self._told.compression!r}, which is not supported', path=str(path))
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with closing(sqlite3.connect(f'{self._path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
+                yield database
+        except (sqlite3.Error, OSError, UnicodeDecodeError, TypeError, ValueError, LookupError) as error:
+            raise BagDamaged(f'{self._path} cannot be read: {error}', path=str(self._path)) from error
+
+
+class PackedFile:
+    """A file that rosbag2 compressed as a whole; unpacked next to nothing else, each time it is needed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @property
+    def profile(self) -> str:
+        with self._unpacked() as part:
+            return part.profile
+
+    @cached_property
+    def _read(self) -> tuple[SliceInfo, int]:
+        with self._unpacked() as part:
+            return replace(part.info, path=self._path), part.extras
+
+    def check(self) -> SliceInfo:
+        with self._unpacked() as part:
+            return replace(part.check(), path=self._path)
+
+    @property
+    def info(self) -> SliceInfo:
+        return self._read[0]
+
+    @property
+    def extras(self) -> int:
+        return self._read[1]
+
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
+        with self._unpacked() as part:
+            yield from part.messages(wanted)
+
+    @contextmanager
+    def _unpacked(self) -> Iterator[BagFile]:
         with tempfile.TemporaryDirectory(prefix='shadowhound-bag-') as folder:
-            whole = Path(folder, path.stem)
-            _unpack(path, whole)
-            yield whole
+            whole = Path(folder, self._path.stem)
+            _unpack(self._path, whole)
+            yield opened(LocalFile(whole))
+
+
+def opened(source: Ranged) -> BagFile:
+    """By the name of the file; SQLite and packed files are read from the disk."""
+    if isinstance(source, LocalFile) and source.name.endswith(PACKED):
+        return PackedFile(source.path)
+    if isinstance(source, LocalFile) and source.name.endswith(SQLITE):
+        return SqliteFile(source.path)
+    if source.name.endswith(MCAP):
+        return McapFile(source)
+    raise BagDamaged(f'{source.name} is not a file that can be read here: one of {", ".join(SLICES)}', path=source.name)
+
+
+class BagReader:
+    """Reads all files of a bag.
+
+    New; used by one thread. A file that cannot be opened is left out and is in ``describe().damaged``; damage within one raises
+    BagDamaged as it is reached.
+    """
+
+    def __init__(self, sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None = None) -> None:
+        """``sources`` by name, in their order. A manifest, which was made from the files, saves opening all of them."""
+        self.claimed = claimed
+        slices = manifest.slices if manifest is not None else ()
+        self._recorded = {
+            each.file: BagPart(each.file, each.messages, *((each.t_start_ns, each.t_end_ns) if each.messages else (None, None)))
+            for each in slices
+        }
+        self._parts: dict[str, BagFile] = {}
+        self._damaged: dict[str, BagDamaged] = {}
+        for name, source in sources.items():
+            try:
+                self._parts[name] = opened(source)
+            except BagDamaged as error:
+                self._damaged[name] = error
+        self._infos: dict[str, SliceInfo] = {}
+        self._is_packed = claimed is not None and 'message' in claimed.compression
+
+    @property
+    def damaged(self) -> Mapping[str, BagDamaged]:
+        """Files that could not be opened so far."""
+        return self._damaged
+
+    def describe(self) -> Description:
+        """By all files, or by the manifest if it knows all of them. Raises BagDamaged if none can be read."""
+        if self.claimed is not None and self._recorded and self._parts.keys() <= self._recorded.keys() and not self._damaged:
+            return self._by_manifest(self.claimed)
+        infos = self.infos()
+        return of_files(infos, {name: error.what for name, error in self._damaged.items()}, self.claimed)
+
+    def infos(self) -> Mapping[str, SliceInfo]:
+        """What each file holds, of those that can be read. Raises BagDamaged if none can."""
+        self._open(list(self._parts))
+        if self._damaged and not self._infos:
+            raise next(iter(self._damaged.values()))
+        return {name: self._infos[name] for name in self._parts if name in self._infos}
+
+    def profile(self) -> str:
+        """Of the first file that can be read."""
+        for name, part in self._parts.items():
+            if name not in self._damaged:
+                try:
+                    return part.profile
+                except BagDamaged as error:
+                    self._damaged[name] = error
+        return ROS2
+
+    def extras(self) -> int:
+        """Attachments and metadata records in the files that were opened."""
+        return sum(self._parts[name].extras for name in self._infos)
+
+    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
+        """In the order of the files, and within each in its order; SQLite by time."""
+        names = [name for name in self._parts if self._may_have(name, wanted)]
+        self._open(names)
+        for name in names:
+            if name in self._infos:
+                for message in self._parts[name].messages(wanted):
+                    yield self._plain(message, name)
+
+    def _by_manifest(self, claimed: Description) -> Description:
+        parts = self._recorded.values()
+        return replace(
+            claimed, parts=tuple(sorted(parts, key=lambda part: natural(part.name))),
+            messages=sum(part.messages or 0 for part in parts),
+            t_start_ns=min((part.t_start_ns for part in parts if part.t_start_ns is not None), default=None),
+            t_end_ns=max((part.t_end_ns for part in parts if part.t_end_ns is not None), default=None),
+            absent=tuple(name for name in self._recorded if name not in self._parts),
+        )  # fmt: skip
+
+    def _open(self, names: Sequence[str]) -> None:
+        """Several at a time."""
+
+        def one(name: str) -> None:
+            try:
+                self._infos[name] = self._parts[name].info
+            except BagDamaged as error:
+                self._damaged[name] = error
+
+        wanted = [name for name in names if name not in self._infos and name not in self._damaged]
+        with ThreadPoolExecutor(THREADS, 'bag-open') as pool:
+            list(pool.map(one, wanted))
+
+    def _may_have(self, name: str, wanted: MessageFilter) -> bool:
+        part = self._recorded.get(name)
+        if part is not None and name not in self._infos:
+            start, end, messages = part.t_start_ns, part.t_end_ns, part.messages
+        elif (info := self._infos.get(name)) is not None:
+            start, end, messages = info.t_start_ns, info.t_end_ns, info.messages
+        else:
+            return True
+        return bool(messages) and start is not None and end is not None and start < wanted.end_ns and end >= wanted.start_ns
+
+    def _plain(self, message: RecordedMessage, name: str) -> RecordedMessage:
+        """Without rosbag2's compression of each message: no CDR begins as zstd does."""
+        is_packed = message.channel.message_encoding == CDR and message.cdr.startswith(ZSTD_MAGIC)
+        if not (is_packed or self._is_packed):
+            return message
+        try:
+            return message._replace(cdr=unpacked('zstd', message.cdr))
+        except ValueError as error:
+            raise BagDamaged(f'a message in {name} cannot be unpacked: {error}', path=name) from error
+
+
+def described(sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None) -> Description | None:
+    """What a bag holds whose files are in a store, or some of them; None if there is nothing to read.
+
+    SQLite and packed files in a store would have to be downloaded: of a bag with those, it is what the metadata claims.
+    """
+    names = slices_of(sorted(sources, key=natural), claimed)
+    if any(not name.endswith(MCAP) and not isinstance(sources[name], LocalFile) for name in names):
+        return claimed and replace(claimed, remarks=(NOT_READ,))
+    if not names and claimed is None:
+        return None
+    return BagReader({name: sources[name] for name in names}, claimed, manifest).describe()
+
+
+@dataclass(frozen=True, slots=True)
+class FolderBag:
+    """A bag on the disk: a folder, or one file of messages."""
+
+    path: Path
+    files: Mapping[str, Path]
+    """All, by their path in the folder."""
+    manifest: Manifest | None
+    reader: BagReader
+
+
+def open_folder(path: Path, meter: Meter | None = None) -> FolderBag:
+    """Raises BagError where there is no bag, BagDamaged for a manifest or metadata that is invalid."""
+    files = files_of(path)
+    claimed = of_metadata(read_whole(LocalFile(files[METADATA])), str(files[METADATA]), files) if METADATA in files else None
+    manifest = None
+    if MANIFEST in files:
+        manifest = Manifest.from_json(read_whole(LocalFile(files[MANIFEST])), str(files[MANIFEST]))
+    names = slices_of(list(files), claimed)
+    if not names and claimed is None:
+        raise no_bag(path)
+    sources = {name: LocalFile(files[name], meter) for name in names}
+    return FolderBag(path, files, manifest, BagReader(sources, claimed))
+
+
+def files_of(path: Path) -> dict[str, Path]:
+    """Those in a folder by their path in it, in the order of their numbers; or the file itself. Raises BagError."""
+    if path.is_file():
+        return {path.name: path}
+    if not path.is_dir():
+        raise BagError(f'there is no folder {path}', remedy='name the folder that `ros2 bag record -o` made', path=str(path))
+    found = {str(each.relative_to(path)): each for each in path.rglob('*') if each.is_file()}
+    return {name: found[name] for name in sorted(found, key=natural)}
+
+
+def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
+    """The files with messages: all in the folder itself, and those in folders below it that the metadata names."""
+    named = {part.name for part in claimed.parts} if claimed is not None else set()
+    return [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
+
+
+def no_bag(path: Path) -> BagError:
+    """Where there is nothing to read."""
+    return BagError(
+        f'{path} holds no bag: neither {METADATA} nor a finished file of messages ({", ".join(SLICES)}) is in it',
+        remedy='name the folder that `ros2 bag record -o` made', path=str(path),
+    )  # fmt: skip
+
+
+def _channel(fields: Sequence[Any], known: Mapping[str, tuple[str, str]]) -> Channel:
+    """A file without definitions (before Iron) gets those that are known here."""
+    topic, kind, message_encoding, qos, type_hash = fields
+    encoding, definition = known.get(kind, ('', ''))
+    if not all(isinstance(text, str) for text in (*fields, encoding, definition)):
+        raise TypeError('the name, type or definition of a topic is not text')
+    if not definition or encoding not in {'ros2msg', 'ros2idl'}:  # rosbag2 has the encoding "unknown" as well
+        encoding, definition, found = describe(kind)
+        type_hash = type_hash or found
+    return Channel(topic, kind, encoding, definition, type_hash, in_numbers(qos), message_encoding)
 
 
 def check_tables(path: Path) -> None:
-    """Raises BagDamaged for a SQLite file of which a table is none, or holds what is larger than any message."""
+    """Raises BagDamaged for a SQLite file in which a table is a program, or has a row that is larger than any message."""
     try:
         with closing(sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
             why = _refusal(database)
@@ -168,48 +431,11 @@ def _refusal(database: sqlite3.Connection) -> str:
     return ''
 
 
-def channel_of(connection: Connection) -> Channel:
-    """A bag without definitions (SQLite before Iron) gets those that are known here."""
-    encoding, definition, type_hash = _ENCODINGS.get(connection.msgdef.format, ''), connection.msgdef.data, connection.digest
-    if not all(isinstance(text, str) for text in (connection.topic, connection.msgtype, definition, type_hash)):
-        raise TypeError('the name, type or definition of a topic is not text')
-    if not encoding or not definition:
-        encoding, definition, known = describe(connection.msgtype)
-        type_hash = type_hash or known
-    from rosbags.rosbag2.metadata import dump_qos_v8  # noqa: PLC0415 - see _stored
-
-    qos = dump_qos_v8(connection.ext.offered_qos_profiles) if isinstance(connection.ext, ConnectionExtRosbag2) else ''
-    return Channel(connection.topic, connection.msgtype, encoding, definition, type_hash, qos)
-
-
-def _stored(path: Path, wanted: MessageFilter) -> Iterator[RecordedMessage]:
-    from rosbags.rosbag2 import Reader  # noqa: PLC0415 - a tenth of a second of every command, for bags of SQLite alone
-
-    check_tables(path)
-    try:
-        with Reader(path) as reader:
-            channels = {connection.id: channel_of(connection) for connection in reader.connections}
-            chosen = [connection for connection in reader.connections if wanted.channel(channels[connection.id])]
-            for connection, log_ns, cdr in reader.messages(chosen, wanted.start_ns, wanted.end_ns) if chosen else ():
-                yield _message(channels[connection.id], log_ns, cdr)
-    except DataLoggerError:
-        raise
-    except Exception as error:  # whatever rosbags, apsw and ruamel make of a file that is none
-        raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
-
-
-def _message(channel: Channel, log_ns: object, cdr: object) -> RecordedMessage:
-    """SQLite keeps whatever it is given in any column."""
-    if type(log_ns) is not int or not 0 <= log_ns < 1 << 63 or not isinstance(cdr, (bytes, bytearray, memoryview)):
-        raise TypeError('a message has no time or no content')
-    return RecordedMessage(channel, log_ns, log_ns, 0, bytes(cdr))
-
-
-def _plain(message: RecordedMessage, path: Path) -> RecordedMessage:
-    try:
-        return message._replace(cdr=unpacked('zstd', message.cdr))
-    except ValueError as error:
-        raise BagDamaged(f'a message in {path} cannot be unpacked: {error}', path=str(path)) from error
+def _time(value: object) -> int:
+    """SQLite keeps any value in any column."""
+    if type(value) is not int or not 0 <= value < _LATEST_NS:
+        raise TypeError(f'a message has the time {value!r:.80}')
+    return value
 
 
 def _unpack(path: Path, whole: Path) -> None:

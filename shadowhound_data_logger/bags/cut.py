@@ -1,6 +1,10 @@
 """A piece of a bag as a new bag: a span of time and some of the topics, message by message as they were recorded.
 
-Where the clock of the bag was not set, the times stay as they are, and metadata.yaml says of the piece what it says of the bag.
+Nothing is decoded: messages, their encoding, both times, the sequence number, the schema and the metadata of the channel are
+copied, and the profile of the file. Converted are QoS in words (into numbers, which Humble reads) and rosbag2's compression
+outside the storage (into MCAP's). Attachments and metadata records are counted, but not copied.
+
+If the clock of the bag was not set, the times are copied as well, and metadata.yaml has the clock of the bag.
 
 Of an MCAP slice in a store only the summary and the chunks that are needed are read. What is not plain MCAP (SQLite, or
 compressed outside the storage) is downloaded first.
@@ -11,25 +15,24 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
-from shadowhound_data_logger.bags.contents import Packed, Plain, is_plain
+from shadowhound_data_logger.bags.contents import BagReader, open_folder
 from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
-from shadowhound_data_logger.bags.naming import BUCKET, METADATA
-from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, natural
+from shadowhound_data_logger.bags.naming import BUCKET, MCAP, METADATA
+from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, read_manifest
 from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
+from shadowhound_data_logger.errors import BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
-from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, StoredFile, read_whole
+from shadowhound_data_logger.mcap.messages import MessageFilter
+from shadowhound_data_logger.mcap.ranges import Meter, StoredFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment_in_bag
@@ -68,23 +71,15 @@ class Cut:
     read_requests: int
     bag_bytes: int
     absent: tuple[str, ...] = ()
-    """Topics that were asked for and that the bag does not have."""
+    """Topics that were requested and that the bag does not have."""
     missing: tuple[str, ...] = ()
     """Slices with something of that time that are not there."""
-
-
-class CutSource(Protocol):
-    """Where the messages come from."""
-
-    def span(self) -> tuple[int, int]:
-        """Log times of the first and the last message."""
-
-    def topics(self) -> set[str]: ...
-
-    def clock(self) -> Mapping[str, str]:
-        """As ``Description.clock``."""
-
-    def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
+    damaged: Mapping[str, str] = field(default_factory=dict)
+    """Slices that could not be read, and why: none of their messages was copied."""
+    extras: int = 0
+    """Attachments and metadata records in the slices that were read, which are not copied."""
+    remarks: tuple[str, ...] = ()
+    """Where metadata.yaml contradicts the files."""
 
 
 def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
@@ -95,72 +90,69 @@ def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) ->
         )
     meter = Meter()
     file = bag.file(METADATA)
-    told = of_metadata(document(store, file), file.key) if file else None
+    claimed = of_metadata(document(store, file), file.key, {each.name for each in bag.files}) if file else None
     with _new_folder(out) as folder:
-        if is_plain(told, [each.name for each in bag.slices]):
-            sources = [StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices]
-            others = _others(told, [each.name for each in bag.slices])
-            plain = Plain(sources, told, clock_of(store, bag) if told is None else {})
-            return _cut(plain, folder, out, choice, meter, bag.size, others)
+        if all(each.name.endswith(MCAP) for each in bag.slices):
+            sources = {each.name: StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices}
+            reader = BagReader(sources, claimed, read_manifest(store, bag))
+            return _cut(reader, folder, out, choice, meter, bag.size, {} if claimed else clock_of(store, bag))
         fetched = fetch(store, bag, folder / SOURCE)
         meter.add(fetched.downloaded)
-        return _cut(_packed(fetched.folder, told), folder, out, choice, meter, bag.size)
+        return _cut(open_folder(fetched.folder).reader, folder, out, choice, meter, bag.size, {})
 
 
-def cut_folder(folder: Path, out: Path, choice: Choice) -> Cut:
-    """Of a bag on the disk. Raises BagError, BagDamaged, SettingError."""
-    if folder.resolve() in out.absolute().resolve().parents:
-        raise BagError(f'{out} is within the bag that is cut', remedy='choose a folder beside it')
+def cut_folder(path: Path, out: Path, choice: Choice) -> Cut:
+    """Of a bag on the disk, or of one of its files. Raises BagError, BagDamaged, SettingError."""
+    if path.resolve() in out.absolute().resolve().parents:
+        raise BagError(f'{out} is within the bag that is cut', remedy='choose a folder next to it')
     meter = Meter()
-    names = sorted((path.name for path in folder.glob('*.*') if path.is_file()), key=natural)
-    told = of_metadata(read_whole(LocalFile(folder / METADATA)), str(folder / METADATA)) if METADATA in names else None
-    slices = [name for name in names if name.endswith('.mcap')]
-    size = sum((folder / name).stat().st_size for name in names)
+    bag = open_folder(path, meter)
+    size = sum(each.stat().st_size for each in bag.files.values())
     with _new_folder(out) as new:
-        if is_plain(told, slices):
-            plain = Plain([LocalFile(folder / name, meter) for name in slices], told)
-            return _cut(plain, new, out, choice, meter, size, _others(told, slices))
-        return _cut(_packed(folder, told), new, out, choice, meter, size)
+        return _cut(bag.reader, new, out, choice, meter, size, {})
 
 
-def _packed(folder: Path, told: Description | None) -> Packed:
-    if told is None:
-        raise BagDamaged(f'{folder} has neither {METADATA} nor MCAP slices alone', path=str(folder))
-    return Packed(folder, told)
-
-
-def _cut(source: CutSource, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
-         others: Sequence[BagPart] = ()) -> Cut:  # fmt: skip
-    """``others`` are slices that are not there."""
-    first_ns, last_ns = source.span()
+def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Meter, bag_bytes: int,
+         clock: Mapping[str, str]) -> Cut:  # fmt: skip
+    bag = reader.describe()
+    first_ns, last_ns = _span(bag)
     start_ns = moment_in_bag('--start', choice.start, first_ns, last_ns) if choice.start else first_ns
     end_ns = moment_in_bag('--end', choice.end, first_ns, last_ns) if choice.end else last_ns + 1
+    topics = {topic.name for topic in bag.topics}
+    chosen, absent = _topics(choice, topics)
     if start_ns > last_ns and not choice.end:
-        raise _nothing(source, choice, start_ns, start_ns)
+        raise _nothing(bag, choice, absent, start_ns, start_ns)
     if end_ns <= start_ns:
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
-    writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666)
+    writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666, profile=reader.profile())
     try:
         for first, last in ((start_ns, end_ns),) if choice.spans is None else choice.spans:
             if (begin := max(first, start_ns)) < (end := min(last, end_ns)):
-                for message in source.messages(MessageFilter(begin, end, _chosen(choice))):
-                    writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+                for message in reader.messages(MessageFilter(begin, end, lambda channel: channel.topic in chosen)):
+                    writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
     finally:
         writer.abort()
-    missing = tuple(part.name for part in others if _overlaps(part, start_ns, end_ns))
+    missing = tuple(part.name for part in bag.parts if part.name in bag.absent and _overlaps(part, start_ns, end_ns))
     if not info.messages:
         if missing:
             raise BagError(f'what was recorded then is in {", ".join(missing)}, which is not there', remedy=COMES)
-        raise _nothing(source, choice, start_ns, end_ns)
-    (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro='', custom_data=source.clock()))
-    return Cut(out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
-               meter.bytes, meter.requests, bag_bytes, _absent(source, choice), missing)  # fmt: skip
+        if reader.damaged:
+            raise next(iter(reader.damaged.values()))
+        raise _nothing(bag, choice, absent, start_ns, end_ns)
+    (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro='', custom_data=bag.clock or clock))
+    return Cut(
+        out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
+        meter.bytes, meter.requests, bag_bytes, absent, missing, {name: error.what for name, error in reader.damaged.items()},
+        reader.extras(), bag.remarks,
+    )  # fmt: skip
 
 
-def _others(told: Description | None, there: Sequence[str]) -> list[BagPart]:
-    """Slices that the metadata names beside those that are there."""
-    return [part for part in told.parts if part.name not in there] if told is not None else []
+def _span(bag: Description) -> tuple[int, int]:
+    """Log times of the first and the last message. Raises BagError."""
+    if bag.t_start_ns is None or bag.t_end_ns is None:
+        raise BagError('the bag has no messages', remedy='shadowhound-data bag info shows what it has')
+    return bag.t_start_ns, bag.t_end_ns
 
 
 def _overlaps(part: BagPart, start_ns: int, end_ns: int) -> bool:
@@ -169,28 +161,29 @@ def _overlaps(part: BagPart, start_ns: int, end_ns: int) -> bool:
     return part.t_start_ns < end_ns and part.t_end_ns >= start_ns
 
 
-def _absent(source: CutSource, choice: Choice) -> tuple[str, ...]:
-    topics = source.topics() if choice.topics else set()
-    return tuple(name for name in choice.topics if '/' + name.lstrip('/') not in topics)
+def _topics(choice: Choice, topics: set[str]) -> tuple[set[str], tuple[str, ...]]:
+    """The topics to copy, and those that the bag does not have. Raises SettingError for an invalid regular expression.
 
-
-def _chosen(choice: Choice) -> Callable[[Channel], bool]:
-    """Raises SettingError for an invalid regular expression."""
-    names = {'/' + name.lstrip('/') for name in choice.topics}
+    A slash at the beginning or end of a name need not be given: recorders other than rosbag2 have topics without one.
+    """
     try:
         pattern = re.compile(choice.regex) if choice.regex else None
     except re.error as error:
         raise SettingError('--regex', choice.regex, f'a regular expression ({error})') from error
-    if not names and pattern is None:
-        return lambda _: True
-    return lambda channel: channel.topic in names or (pattern is not None and pattern.search(channel.topic) is not None)
+    if not choice.topics and pattern is None:
+        return topics, ()
+    named = {
+        name: {name} & topics or {topic for topic in topics if topic.strip('/') == name.strip('/')} for name in choice.topics
+    }
+    matching = {topic for topic in topics if pattern is not None and pattern.search(topic)}
+    return matching.union(*named.values()), tuple(name for name, found in named.items() if not found)
 
 
-def _nothing(source: CutSource, choice: Choice, start_ns: int, end_ns: int) -> BagError:
+def _nothing(bag: Description, choice: Choice, absent: Sequence[str], start_ns: int, end_ns: int) -> BagError:
     """Says which topics there are, or which times."""
-    topics = sorted(source.topics())
-    first_ns, last_ns = source.span()
-    for name in _absent(source, choice):
+    topics = sorted({topic.name for topic in bag.topics})
+    first_ns, last_ns = _span(bag)
+    for name in absent:
         near = get_close_matches(name, topics, cutoff=0.6)
         return BagError(f'the bag has no topic {name}', remedy=f'is it {near[0]}?' if near else f'it has {", ".join(topics)}')
     if choice.regex and not any(re.search(choice.regex, topic) for topic in topics):

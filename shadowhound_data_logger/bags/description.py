@@ -1,25 +1,28 @@
-"""What a bag holds: its topics, times and files, from its metadata.yaml or, for MCAP, from the summaries of its slices."""
+"""What a bag holds: its topics, times and files, as its files have it; metadata.yaml is what its writer claimed of them.
+
+rosbag2 has written wrong totals: of a split bag, Galactic recorded the start and duration of the last file, Humble of the first.
+"""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.naming import natural
+from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.mcap.slice_info import SliceInfo, counted
 from shadowhound_data_logger.untrusted import check_size, from_yaml
 
 MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
 MOST_BOOT_ID: Final = 100
 """Letters."""
-_LATEST_NS: Final = 1 << 63
+_LATEST_NS: Final = 1 << 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +31,8 @@ class DescribedTopic:
 
     name: str
     type: str
-    messages: int
+    messages: int | None
+    """As in ``Description``."""
     qos: Sequence[Mapping[str, Any]]
     """The offered QoS profiles, as rosbag2 keeps them; empty where they are not known."""
     type_hash: str
@@ -36,7 +40,7 @@ class DescribedTopic:
 
 @dataclass(frozen=True, slots=True)
 class BagPart:
-    """One file of a bag. Times are log times, Unix nanoseconds, both inclusive; None where they are not known."""
+    """One file of a bag. Times are log times, Unix nanoseconds, both inclusive; None if unknown, or without messages."""
 
     name: str
     messages: int | None
@@ -55,54 +59,97 @@ class Description:
     distro: str
     topics: tuple[DescribedTopic, ...]
     parts: tuple[BagPart, ...]
-    messages: int
-    t_start_ns: int
-    t_end_ns: int
+    messages: int | None
+    """Those in the files that could be read; None if there are none of these."""
+    t_start_ns: int | None
+    t_end_ns: int | None
+    """As in ``BagPart``."""
     clock: Mapping[str, str] = field(default_factory=dict)
     """Where the clock was not set: how its times are known, by the words of ``metadata_words.py``. Else empty."""
+    absent: tuple[str, ...] = ()
+    """Files that the metadata names and that are not there."""
+    damaged: Mapping[str, str] = field(default_factory=dict)
+    """Files that cannot be read, and why."""
+    remarks: tuple[str, ...] = ()
+    """Where metadata.yaml contradicts the files."""
 
     @property
-    def duration_s(self) -> float:
+    def duration_s(self) -> float | None:
+        if self.t_start_ns is None or self.t_end_ns is None:
+            return None if self.messages is None else 0.0
         return max(self.t_end_ns - self.t_start_ns, 0) / 1e9
 
 
-def of_metadata(content: bytes, name: str) -> Description:
-    """From a metadata.yaml of any version of rosbag2. Raises BagDamaged for what is none."""
+def of_metadata(content: bytes, name: str, there: Container[str] = ()) -> Description:
+    """What a metadata.yaml of any version of rosbag2 claims. Raises BagDamaged for one that is invalid.
+
+    Paths in it may be absolute or have folders in front (``bag/bag_0.db3``, Foxy): a file is known by its path if it is
+    ``there``, otherwise by its name.
+    """
     try:
-        return _described(from_yaml(content.decode())['rosbag2_bagfile_information'])
+        return _described(from_yaml(content.decode())['rosbag2_bagfile_information'], there)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise BagDamaged(f'{name} is not metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
 
 
-def of_slices(slices: Sequence[SliceInfo]) -> Description:
-    """From what the slices themselves say."""
-    counts: dict[tuple[str, str], int] = {}
-    found: dict[tuple[str, str], DescribedTopic] = {}
-    for one in slices:
-        types = [channel.topic for channel in one.channels]
-        for channel in one.channels:
-            key = (channel.topic, channel.type)
-            counts[key] = counts.get(key, 0) + one.counts.get(channel.topic, 0) // types.count(channel.topic)
-            found.setdefault(key, DescribedTopic(*key, 0, profiles(channel.qos), channel.type_hash))
-    filled = [one for one in slices if one.messages]
-    return Description(
-        storage='mcap', compression='', distro='',
-        topics=tuple(replace(topic, messages=counts[key]) for key, topic in found.items()),
-        parts=tuple(BagPart(one.path.name, one.messages, one.t_start_ns, one.t_end_ns) for one in slices),
-        messages=sum(one.messages for one in slices),
-        t_start_ns=min((one.t_start_ns for one in filled), default=0), t_end_ns=max((one.t_end_ns for one in filled), default=0),
+def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed: Description | None) -> Description:
+    """From what the files hold, by name, and what the metadata claims of the bag as a whole.
+
+    Nothing is counted of files that are absent or damaged.
+    """
+    topics: dict[tuple[str, str], DescribedTopic] = {}
+    for channel, count in counted(each for one in infos.values() for each in one.channels.items()).items():
+        name, qos = (channel.topic, channel.type), profiles(channel.qos)
+        known = topics.setdefault(name, DescribedTopic(*name, 0, (), channel.type_hash))
+        topics[name] = replace(
+            known, messages=(known.messages or 0) + count, qos=(*known.qos, *(each for each in qos if each not in known.qos))
+        )
+    for topic in claimed.topics if claimed is not None else ():  # one without messages, or QoS of a file that has none
+        there = topics.setdefault((topic.name, topic.type), replace(topic, messages=0 if infos else None))
+        topics[topic.name, topic.type] = there if there.qos else replace(there, qos=topic.qos)
+    filled = [one for one in infos.values() if one.messages]
+    parts = [_part_of(name, one) for name, one in infos.items()] + [BagPart(name, None, None, None) for name in damaged]
+    absent = [part for part in claimed.parts if part.name not in {*infos, *damaged}] if claimed is not None else []
+    found = Description(
+        storage='mcap', compression='', distro='', topics=tuple(topics.values()),
+        parts=tuple(sorted((*parts, *absent), key=lambda part: natural(part.name))),
+        messages=sum(one.messages for one in infos.values()) if infos or not absent else None,
+        t_start_ns=min((one.t_start_ns for one in filled), default=None),
+        t_end_ns=max((one.t_end_ns for one in filled), default=None), absent=tuple(part.name for part in absent), damaged=damaged,
     )  # fmt: skip
+    if claimed is None:
+        return found
+    whole = replace(found, storage=claimed.storage, compression=claimed.compression, distro=claimed.distro, clock=claimed.clock)
+    return whole if absent or damaged else replace(whole, remarks=tuple(_contradictions(whole, claimed)))
 
 
-def slice_info(index: McapIndex, path: Path, size: int, sha256: str = '') -> SliceInfo:
-    """A slice as its own summary tells it."""
-    counts, repeated = {channel.topic: 0 for channel in index.channels.values()}, Counter[str]()
-    for number, count in index.counts.items():
-        if number in index.channels:
-            counts[index.channels[number].topic] += count
-            repeated[index.channels[number].topic] += count if index.channels[number].repeated else 0
-    return SliceInfo(path, size, sha256, index.t_start_ns, index.t_end_ns, index.messages, counts, tuple(index.channels.values()),
-                     repeated=+repeated)  # fmt: skip
+def _part_of(name: str, info: SliceInfo) -> BagPart:
+    times = (info.t_start_ns, info.t_end_ns) if info.messages else (None, None)
+    return BagPart(name, info.messages, *times)
+
+
+def _contradictions(found: Description, claimed: Description) -> Iterator[str]:
+    """What the metadata of a bag with all its files claims, and what they hold instead."""
+    names = {part.name for part in claimed.parts}
+    unnamed = [part.name for part in found.parts if part.name not in names]
+    if unnamed:
+        yield f'metadata.yaml does not name {", ".join(unnamed)}'
+    if found.messages != claimed.messages:
+        yield f'metadata.yaml claims {claimed.messages:,} messages, the files have {found.messages:,}'
+    elif _counts(found) != _counts(claimed):
+        yield 'metadata.yaml claims other numbers of messages for the topics than the files have'
+    if (found.t_start_ns, found.t_end_ns) != (claimed.t_start_ns, claimed.t_end_ns) and claimed.messages and found.messages:
+        yield f'metadata.yaml claims the time {_span(claimed)}, the files have {_span(found)}'
+
+
+def _counts(bag: Description) -> dict[tuple[str, str], int]:
+    return {(topic.name, topic.type): topic.messages for topic in bag.topics if topic.messages}
+
+
+def _span(bag: Description) -> str:
+    if bag.t_start_ns is None or bag.t_end_ns is None:
+        return 'unknown'
+    return f'{iso(bag.t_start_ns)} to {iso(bag.t_end_ns)}'
 
 
 def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
@@ -116,17 +163,18 @@ def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
     return tuple(each for each in qos if isinstance(each, Mapping)) if isinstance(qos, list) else ()
 
 
-def _described(found: Mapping[str, Any]) -> Description:
-    start = _whole(found['starting_time'], 'nanoseconds_since_epoch')
-    paths = [PurePosixPath(path).name for path in found['relative_file_paths']]
-    told = {PurePosixPath(each['path']).name: each for each in found.get('files') or ()}
+def _described(found: Mapping[str, Any], there: Container[str]) -> Description:
+    """Every version of the format; what a version does not have is unknown."""
+    start, messages = _whole(found['starting_time'], 'nanoseconds_since_epoch'), _whole(found, 'message_count')
+    told = {_text(each['path']): each for each in found.get('files') or ()}
+    paths = [_text(path) for path in found['relative_file_paths'] or ()]
     compression = ' '.join(_text(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
-    messages = _whole(found, 'message_count')
     return Description(
         storage=_text(found['storage_identifier']), compression='' if compression.lower() == 'none' else compression.lower(),
-        distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found['topics_with_message_count'] or ())),
-        parts=tuple(_part(path, told.get(path)) for path in paths), messages=messages,
-        t_start_ns=start if messages else 0, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else 0,
+        distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found.get('topics_with_message_count') or ())),
+        messages=messages,
+        parts=tuple(_part(path if path in there else PurePosixPath(path).name, told.get(path)) for path in paths),
+        t_start_ns=start if messages else None, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else None,
         clock=clock_said(found.get('custom_data')),
     )  # fmt: skip
 
@@ -141,7 +189,7 @@ def clock_said(custom: object) -> dict[str, str]:
     found = {words.CLOCK: str(known), words.BOOT_ID: boot_id}
     if known == words.UNSET:
         return found
-    if not isinstance(offset_ns, str) or not re.fullmatch('[0-9]{1,19}', offset_ns) or int(offset_ns) >= _LATEST_NS:
+    if not isinstance(offset_ns, str) or not re.fullmatch('[0-9]{1,20}', offset_ns) or int(offset_ns) >= _LATEST_NS:
         return {}
     return {**found, words.CLOCK_OFFSET_NS: offset_ns}
 
@@ -159,17 +207,16 @@ def _part(path: str, told: Mapping[str, Any] | None) -> BagPart:
     if told is None:
         return BagPart(path, None, None, None)
     start, messages = _whole(told['starting_time'], 'nanoseconds_since_epoch'), _whole(told, 'message_count')
-    return BagPart(
-        path, messages, start if messages else None, start + _whole(told['duration'], 'nanoseconds') if messages else None
-    )
+    end = start + _whole(told['duration'], 'nanoseconds')
+    return BagPart(path, messages, start if messages else None, end if messages else None)
 
 
 def _whole(told: Mapping[str, Any], name: str) -> int:
     found = told[name]
-    if isinstance(found, str) and found.isdecimal() and len(found) < 20:
+    if isinstance(found, str) and found.isdecimal() and len(found) <= 20:
         found = int(found)
     if type(found) is not int or not 0 <= found < _LATEST_NS:
-        raise ValueError(f'{name} is not a whole number of 0 ... 2^63')
+        raise ValueError(f'{name} is not a whole number of 0 ... 2^64')
     return found
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.description import slice_info
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, clock_of, missing_of
@@ -150,7 +149,7 @@ def _alone(path: Path) -> Iterator[int]:
 def _describe(folder: Path, bag: RemoteBag, clock: Mapping[str, str]) -> None:
     """Of a bag that is not all there, so that players open what is; the real one replaces it with the rest."""
     slices = [file for file in bag.slices if file.name.endswith('.mcap')]
-    infos = [slice_info(read_index(LocalFile(folder / file.name)), folder / file.name, file.size) for file in slices]
+    infos = [read_index(LocalFile(folder / file.name)).info(folder / file.name, file.size) for file in slices]
     if infos:
         with replacing(folder / METADATA) as file:
             file.write(metadata_yaml(infos, ros_distro='', custom_data=clock))

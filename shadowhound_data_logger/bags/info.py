@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.description import Description, clock_said, of_metadata, of_slices, slice_info
+from shadowhound_data_logger.bags.contents import described, open_folder
+from shadowhound_data_logger.bags.description import Description, clock_said, of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, natural
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,
     GROWING,
@@ -20,16 +19,11 @@ from shadowhound_data_logger.bags.remote import (
     RemoteFile,
     find_bag,
     missing_of,
-    natural,
     state_of,
 )
 from shadowhound_data_logger.errors import BagError
-from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
-
-THREADS: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +39,7 @@ class BagInfo:
     """Name -> bytes, and where it is."""
     manifest: Manifest | None
     missing: Sequence[str]
-    """Slices that the manifest promises and that are nowhere."""
+    """Slices that the manifest or the metadata names and that are nowhere."""
     read_bytes: int
     """So many were enough."""
 
@@ -73,38 +67,34 @@ def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
     sources |= {file.name: StoredFile(store, BUCKET, file.key, file.size, meter) for file in bag.files}
     where = {file.name: (file.size, file.where) for file in waiting.values()}
     where |= {file.name: (file.size, 'store') for file in bag.files}
-    return _info(robot, name, sources, where, meter, tags=_tags(store, bag, waiting))
+    tags = _tags(store, bag, waiting)
+    file = sources.get(MANIFEST)
+    manifest = Manifest.from_json(read_whole(file), file.name) if file is not None else None
+    file = sources.get(METADATA)
+    claimed = of_metadata(read_whole(file), file.name, sources) if file is not None else None
+    description = described(sources, claimed, manifest)
+    if description is None:
+        raise BagError(f'{name} has neither {METADATA} nor a finished MCAP slice', remedy='is it a bag, or only starting?')
+    if claimed is None:
+        description = replace(description, clock=clock_said(tags))
+    return _info(robot, name, where, manifest, description, meter, tags)
 
 
-def info_folder(folder: Path) -> BagInfo:
-    """Of a bag on the disk. Raises BagError, BagDamaged."""
+def info_folder(path: Path) -> BagInfo:
+    """Of a bag on the disk, or of one of its files. Raises BagError, BagDamaged."""
     meter = Meter()
-    paths = [path for path in sorted(folder.iterdir()) if path.is_file()] if folder.is_dir() else [folder]
-    sources: dict[str, Ranged] = {path.name: LocalFile(path, meter) for path in paths}
-    where = {path.name: (path.stat().st_size, 'folder') for path in paths if path.is_file()}
-    return _info('', folder.name, sources, where, meter, tags={})
+    bag = open_folder(path, meter)
+    where = {name: (each.stat().st_size, 'folder') for name, each in bag.files.items()}
+    return _info('', path.name, where, bag.manifest, bag.reader.describe(), meter, {})
 
 
-def _info(robot: str, name: str, sources: Mapping[str, Ranged], where: Mapping[str, tuple[int, str]], meter: Meter,
-          tags: Mapping[str, str]) -> BagInfo:  # fmt: skip
+def _info(robot: str, name: str, where: Mapping[str, tuple[int, str]], manifest: Manifest | None, description: Description,
+          meter: Meter, tags: Mapping[str, str]) -> BagInfo:  # fmt: skip
     files = RemoteBag(robot, name, tuple(RemoteFile(each, '', where[each][0]) for each in sorted(where, key=natural)))
-    manifest = Manifest.from_json(read_whole(sources[MANIFEST]), sources[MANIFEST].name) if MANIFEST in sources else None
-    if METADATA in sources:
-        description = of_metadata(read_whole(sources[METADATA]), sources[METADATA].name)
-    else:
-        slices = [sources[each.name] for each in files.slices if each.name.endswith('.mcap') and each.name in sources]
-        if not slices:
-            raise BagError(f'{name} has neither {METADATA} nor a whole MCAP slice', remedy='is it a bag, or only beginning?')
-        with ThreadPoolExecutor(THREADS, 'bag-info') as pool:
-            description = replace(of_slices(list(pool.map(_slice, slices))), clock=clock_said(tags))
     state = GROWING if any(each.endswith('.open') for each in where) else state_of(files, manifest, tags)
-    missing = missing_of(files, manifest) if manifest else []
+    missing = missing_of(files, manifest) if manifest else description.absent
     return BagInfo(robot, name, state if robot or manifest else FOREIGN, description,
                    {file.name: where[file.name] for file in files.files}, manifest, missing, meter.bytes)  # fmt: skip
-
-
-def _slice(source: Ranged) -> SliceInfo:
-    return slice_info(read_index(source), Path(source.name), source.size)
 
 
 def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:

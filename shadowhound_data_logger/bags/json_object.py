@@ -6,7 +6,8 @@ from typing import Any, Final
 
 from shadowhound_data_logger.errors import BagDamaged
 
-MOST: Final = 1 << 63
+MOST: Final = 1 << 64
+"""Times in MCAP have 64 bits without a sign."""
 
 
 class JsonObject:
@@ -36,7 +37,7 @@ class JsonObject:
     def count(self, name: str) -> int:
         found = self._fields.get(name)
         if type(found) is not int or not 0 <= found < MOST:
-            raise self.wrong(name, 'a whole number of 0 ... 2^63')
+            raise self.wrong(name, 'a whole number of 0 ... 2^64')
         return found
 
     def count_or_none(self, name: str) -> int | None:

@@ -14,12 +14,11 @@ from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, MissionOf, SliceEntry, topics_of
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, slice_file
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, natural, slice_file
 from shadowhound_data_logger.bags.objects import SENSOR, ros_distro
-from shadowhound_data_logger.bags.remote import natural
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.keys import MAX_BAG_BYTES
-from shadowhound_data_logger.mcap.index import read_index
+from shadowhound_data_logger.mcap.index import read_summary
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
@@ -87,13 +86,13 @@ class KeptCut:
     def _copy(self, each: KeptSlice, writer: SliceWriter) -> Generator[None, None, None]:
         """A chunk at a time: several would be read ahead."""
         source = LocalFile(each.path)
-        index = read_index(source)
-        if not index.is_indexed:
+        index = read_summary(source)
+        if index is None or index.chunks is None:
             raise BagDamaged(f'{source.name} has no index', path=source.name)
         wanted = MessageFilter(*self._span, lambda _: True)
         for chunk in index.chunks:
             for message in read_messages(source, replace(index, chunks=(chunk,)), wanted):
-                writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+                writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
             yield
 
     def _objects(self, info: SliceInfo) -> list[DataObject]:

@@ -109,7 +109,7 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic that was recorded, also one without messages."""
+    """A topic of one type that was recorded, also one without messages."""
 
     topic: str
     type: str
@@ -138,8 +138,8 @@ class SliceEntry:
 
     @classmethod
     def of(cls, info: SliceInfo, key: str) -> SliceEntry:
-        return cls(info.path.name, key, info.bytes, info.sha256, info.messages, info.t_start_ns, info.t_end_ns, dict(info.counts),
-                   dict(info.repeated))  # fmt: skip
+        return cls(info.path.name, key, info.bytes, info.sha256, info.messages, info.t_start_ns, info.t_end_ns, info.counts,
+                   info.repeated)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,14 +185,12 @@ class Manifest:
 
 def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
     """What was recorded, in the order in which it first appeared."""
-    types: dict[str, str] = {}
-    counts: dict[str, int] = {}
+    counts: dict[tuple[str, str], int] = {}
     for one in slices:
-        for channel in one.channels:
-            types.setdefault(channel.topic, channel.type)
-        for topic, count in one.counts.items():
-            counts[topic] = counts.get(topic, 0) + count
-    return tuple(RecordedTopic(topic, kind, counts.get(topic, 0)) for topic, kind in types.items())
+        for channel, count in one.channels.items():
+            name = channel.topic, channel.type
+            counts[name] = counts.get(name, 0) + count
+    return tuple(RecordedTopic(topic, kind, count) for (topic, kind), count in counts.items())
 
 
 def read_missing(one: JsonObject) -> Missing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from itertools import count
 from typing import Final
@@ -17,6 +18,9 @@ RECORDING: Final = 'recording'
 UNSYNCED: Final = '_unsynced_'
 """Stands in the name of a bag that has no date, or none yet."""
 METADATA, MANIFEST = 'metadata.yaml', 'manifest.json'
+MCAP, SQLITE, PACKED = '.mcap', '.db3', '.zstd'
+"""What the names of files with messages end with; rosbag2 appends the last to one that it compressed."""
+SLICES: Final = (MCAP, SQLITE, MCAP + PACKED, SQLITE + PACKED)
 
 
 def bag_name(what: str, now_ns: int, is_taken: Callable[[str], bool]) -> str:
@@ -68,3 +72,8 @@ def prefix_of(robot: str, bag: str = '') -> str:
 def key_of(robot: str, bag: str, file: str) -> str:
     """In the bucket of the bags."""
     return f'{prefix_of(robot, bag)}{file}'
+
+
+def natural(name: str) -> list[str | int]:
+    """A sort key in which ``bag_10`` comes after ``bag_9``."""
+    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]

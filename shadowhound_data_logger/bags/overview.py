@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.contents import NOT_READ, described
 from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, given_up, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
@@ -27,6 +28,7 @@ from shadowhound_data_logger.bags.remote import (
 )
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.ranges import StoredFile
 from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8
@@ -50,6 +52,8 @@ class BagRow:
     """Place -> files of the bag there: ``store``, ``spool``, ``recording``, ``quarantine``."""
     finding: str
     """What is wrong with it; empty when nothing is."""
+    remark: str
+    """Where its metadata.yaml contradicts its files; empty when it does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,8 @@ class _Facts:
     topics: int | None = None
     t_start_ns: int | None = None
     t_end_ns: int | None = None
+    finding: str = ''
+    remark: str = ''
 
 
 def bag_overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
@@ -97,6 +103,7 @@ def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], given_up: 
         if manifest is None:
             tags = _tags(store, bag, kept)
         facts = _facts(store, bag, manifest, tags.values())
+        finding = finding or facts.finding
     except BagDamaged as error:
         finding = str(error)
     state = state_of(files, manifest, next(iter(tags.values()), {}))
@@ -108,7 +115,7 @@ def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], given_up: 
         places[file.where] = places.get(file.where, 0) + 1
     slices = len(files.slices) + sum(file.is_open for file in kept)
     return BagRow(bag.robot, bag.name, GROWING if any(file.is_open for file in kept) else state, slices, files.size,
-                  facts.messages, facts.topics, facts.t_start_ns, facts.t_end_ns, places, finding)  # fmt: skip
+                  facts.messages, facts.topics, facts.t_start_ns, facts.t_end_ns, places, finding, facts.remark)  # fmt: skip
 
 
 def _manifest(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -> Manifest | None:
@@ -141,13 +148,18 @@ def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: 
             return _Facts(messages, len(topics))
         return _span(messages, len(topics), [(each.t_start_ns + step_ns, each.t_end_ns + step_ns) for each in filled])
     if file := bag.file(METADATA):
-        told = of_metadata(document(store, file), file.key)
-        return _span(told.messages, len({topic.name for topic in told.topics}), [(told.t_start_ns, told.t_end_ns)])
+        sources = {each.name: StoredFile(store, BUCKET, each.key, each.size) for each in bag.files}
+        found = described(sources, of_metadata(document(store, file), file.key, sources), None)
+        if found is not None:
+            wrong = [f'{name} is not there' for name in found.absent]
+            wrong += [f'{name} cannot be read: {why}' for name, why in found.damaged.items()]
+            return _Facts(found.messages, len({topic.name for topic in found.topics}), found.t_start_ns, found.t_end_ns,
+                          '; '.join(wrong), '; '.join(each for each in found.remarks if each != NOT_READ))  # fmt: skip
     try:
         told_of = [tuple(int(tag[word]) for word in (words.MESSAGES, words.T_START_NS, words.T_END_NS)) for tag in tags]
     except (KeyError, ValueError):
         return _Facts()
-    if not all(0 <= value < 1 << 63 for each in told_of for value in each):
+    if not all(0 <= value < 1 << 64 for each in told_of for value in each):
         return _Facts()
     spans = [(start_ns, end_ns) for messages, start_ns, end_ns in told_of if messages]
     return _span(sum(messages for messages, _, _ in told_of), None, spans) if told_of else _Facts()

@@ -205,7 +205,7 @@ class Recording:
         channel = self._channels.get((lot.topic, lot.type, repeated))
         if channel is None:
             encoding, definition, type_hash = describe(lot.type)
-            channel = Channel(lot.topic, lot.type, encoding, definition, type_hash, lot.qos, repeated)
+            channel = Channel(lot.topic, lot.type, encoding, definition, type_hash, lot.qos, repeated=repeated)
             self._channels[lot.topic, lot.type, repeated] = channel
         return channel
 

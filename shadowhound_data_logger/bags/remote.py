@@ -7,7 +7,6 @@ archive ``<robot>/rosbags/<bag>.tar.gz`` is a bag of that name as well, of which
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -15,7 +14,7 @@ from typing import Final
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import clock_said
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, prefix_of
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural, prefix_of
 from shadowhound_data_logger.errors import BagError
 from shadowhound_data_logger.mcap.ranges import StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -24,8 +23,6 @@ ARCHIVE: Final = '.tar.gz'
 GROWING: Final = 'growing'
 FOREIGN: Final = 'foreign'
 """Not uploaded by this package: nothing says what should be in it."""
-SLICES: Final = ('.mcap', '.db3', '.zstd')
-"""What the name of a file with messages ends with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +124,3 @@ def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[
 
 def _ordered(files: Iterable[RemoteFile]) -> tuple[RemoteFile, ...]:
     return tuple(sorted(files, key=lambda file: natural(file.name)))
-
-
-def natural(name: str) -> list[str | int]:
-    """A sort key in which ``bag_10`` comes after ``bag_9``."""
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]

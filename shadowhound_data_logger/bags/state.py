@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -38,7 +37,7 @@ from shadowhound_data_logger.bags.naming import slice_file, slice_number
 from shadowhound_data_logger.durable_files import sync
 from shadowhound_data_logger.errors import BagDamaged, NameRefused
 from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo, counted
 from shadowhound_data_logger.mcap.writer import OPEN
 from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
@@ -84,7 +83,7 @@ class BagState:
     """Whether its name is for good. Before that nothing of it may leave."""
     is_ending: bool = False
     """Whether what makes it whole is on its way into the spool."""
-    _channels: dict[tuple[str, str], Channel] = field(default_factory=dict)
+    _channels: dict[tuple[str, str, bool], Channel] = field(default_factory=dict)
 
     @classmethod
     def begin(cls, folder: Path, robot: str, mission: MissionOf | None, event: EventOf | None = None,
@@ -105,7 +104,7 @@ class BagState:
         try:
             state._take(JsonObject(from_json(rows.said.encode()), RECORD, 'said'))
             channels = [_channel(one) for one in _list(from_json(rows.channels.encode()))]
-            state._channels = {(one.topic, one.type): one for one in channels}
+            state._channels = {_kind(one): one for one in channels}
             for row in rows.slices:
                 info = state._slice(row)
                 state.slices[info.path.name] = info
@@ -141,11 +140,10 @@ class BagState:
 
     def rows(self, slices: Sequence[SliceInfo] = (), missing: int = 0) -> RecordingRows:
         """What is known of the bag itself, with these slices and so many of what was found missing last."""
-        topics = list(dict.fromkeys(topic for topic, _ in self._channels))
         first = len(self.missing) - missing
         return RecordingRows(
             self.folder.name, self._said(), json.dumps([_fields(one) for one in self._channels.values()]),
-            tuple(self._row(info, topics) for info in slices),
+            tuple(self._row(info) for info in slices),
             tuple(MissingRow(place, one.file, one.what, one.messages, one.topic, one.reason)
                   for place, one in enumerate(self.missing[first:], first)),
         )  # fmt: skip
@@ -177,10 +175,11 @@ class BagState:
 
     def add_slice(self, info: SliceInfo) -> RecordingRows:
         """A slice was closed."""
-        for channel in info.channels:
-            self._channels.setdefault((channel.topic, channel.type), replace(channel, definition='', repeated=False))
-        known = tuple(one for one in self._channels.values() if one.topic in info.counts)
-        self.slices[info.path.name] = info = replace(info, channels=known, damage=None)
+        channels = counted(
+            (self._channels.setdefault(_kind(channel), replace(channel, definition='')), count)
+            for channel, count in info.channels.items()
+        )
+        self.slices[info.path.name] = info = replace(info, channels=channels, damage=None)
         return self.rows([info])
 
     def add_missing(self, *missing: Missing) -> RecordingRows:
@@ -217,42 +216,36 @@ class BagState:
         self.mission, self.event = read_mission(mission) if mission else None, read_event(event) if event else None
         self.clock = read_clock(clock) if clock else None
 
-    def _row(self, info: SliceInfo, topics: Sequence[str]) -> SliceRow:
+    def _row(self, info: SliceInfo) -> SliceRow:
+        counts = json.dumps([info.channels.get(one) for one in self._channels.values()])
         return SliceRow(slice_number(self.folder.name, info.path.name) or 0, info.bytes, info.sha256, info.t_start_ns,
-                        info.t_end_ns, info.messages, json.dumps([_count(info, topic) for topic in topics]))  # fmt: skip
+                        info.t_end_ns, info.messages, counts)  # fmt: skip
 
     def _slice(self, row: SliceRow) -> SliceInfo:
         """The opposite of ``_row``. Raises ValueError."""
-        topics, found = dict.fromkeys(topic for topic, _ in self._channels), _list(from_json(row.counts.encode()))
-        pairs = [one if isinstance(one, list) else (one, 0) for one in found[: len(topics)] if one is not None]
-        if any(len(pair) != 2 for pair in pairs):
-            raise ValueError(f'a row of a slice counts {row.counts:.200}')
-        numbers = [row.number, row.bytes, row.t_start_ns, row.t_end_ns, row.messages, *(one for pair in pairs for one in pair)]
+        found = _list(from_json(row.counts.encode()))
+        numbers = [row.number, row.bytes, row.t_start_ns, row.t_end_ns, row.messages, *(one for one in found if one is not None)]
         if not isinstance(row.sha256, str) or not all(type(one) is int and 0 <= one < MOST for one in numbers):  # type: ignore[redundant-expr]
             raise ValueError(f'a row of a slice is {row!r:.200}')
-        known = (topic for topic, count in zip(topics, found, strict=False) if count is not None)
-        by_topic = dict(zip(known, pairs, strict=True))
-        counts, repeated = ({topic: pair[place] for topic, pair in by_topic.items()} for place in (0, 1))
-        channels = tuple(one for one in self._channels.values() if one.topic in by_topic)
+        channels = {one: count for one, count in zip(self._channels.values(), found, strict=False) if count is not None}
         return SliceInfo(self.folder / slice_file(self.folder.name, row.number), row.bytes, row.sha256, row.t_start_ns,
-                         row.t_end_ns, row.messages, counts, channels, repeated=+Counter(repeated))  # fmt: skip
+                         row.t_end_ns, row.messages, channels)  # fmt: skip
 
 
-def _count(info: SliceInfo, topic: str) -> int | list[int] | None:
-    """Of a topic's messages in a slice, or with it that of the repeated ones among them."""
-    count, repeated = info.counts.get(topic), info.repeated.get(topic)
-    return [count, repeated] if repeated and count is not None else count
+def _kind(channel: Channel) -> tuple[str, str, bool]:
+    """What a channel is known by."""
+    return channel.topic, channel.type, channel.repeated
 
 
-def _fields(channel: Channel) -> list[str]:
-    return [channel.topic, channel.type, channel.encoding, channel.type_hash, channel.qos]
+def _fields(channel: Channel) -> list[str | bool]:
+    return [channel.topic, channel.type, channel.encoding, channel.type_hash, channel.qos, channel.repeated]
 
 
 def _channel(fields: Any) -> Channel:
-    topic, kind, encoding, type_hash, qos = _list(fields)
-    if not all(isinstance(text, str) for text in fields):
+    topic, kind, encoding, type_hash, qos, repeated = _list(fields)
+    if not all(isinstance(text, str) for text in (topic, kind, encoding, type_hash, qos)) or not isinstance(repeated, bool):
         raise TypeError(f'a channel is {fields!r:.200}')
-    return Channel(topic, kind, encoding, '', type_hash, qos)
+    return Channel(topic, kind, encoding, '', type_hash, qos, repeated=repeated)
 
 
 def _newest(rows: Sequence[Any], most_bytes: int) -> Sequence[Any]:

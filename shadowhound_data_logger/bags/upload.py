@@ -63,14 +63,14 @@ class Uploaded:
 @contextmanager
 def planned(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[UploadPlan]:
     """The bag as objects; what had to be made for it is gone afterwards. Raises BagError, BagDamaged, NameRefused."""
-    finished(folder)  # before a folder is made for it
+    found = finished(folder)  # before a folder is made for it
     with on_disk(home):
         (home / SENDING).mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f'{bag[:64]}-', dir=home / SENDING))
         try:
             with flock(work / 'lock'):
                 _sweep(home / SENDING)
-                yield (archive_of if is_archive else plan_of)(folder, robot, bag, work)
+                yield (archive_of if is_archive else plan_of)(found, robot, bag, work)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 

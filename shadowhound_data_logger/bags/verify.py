@@ -1,30 +1,28 @@
-"""Checks whether a bag is what its writer says: every promised file, its size and checksum; every chunk on request.
+"""Checks whether a bag is what its writer recorded: every promised file, its size and checksum; every chunk on request.
 
-Without a manifest there is nobody to compare with: what the metadata.yaml names must be there, and open.
+Without a manifest there is nothing to compare the content with: the files that metadata.yaml names must exist and be readable.
+Where it contradicts them about the bag as a whole, that is a remark.
 """
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import sha256 as sha256_new
 from pathlib import Path
 from typing import Final
 
-from mcap.opcode import Opcode
-
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.contents import check_tables
-from shadowhound_data_logger.bags.description import Description, of_metadata
+from shadowhound_data_logger.bags.contents import files_of, no_bag, opened, slices_of
+from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
 from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
-from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.index import read_index, records
-from shadowhound_data_logger.mcap.messages import unpack, walk
+from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.mcap.index import McapIndex, read_index, scan
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.untrusted import is_path
 
@@ -40,6 +38,8 @@ class FileCheck:
     finding: str
     checked: str
     """What was compared: ``presence``, ``size``, ``sha256`` (the store's word), ``summary``, ``content``, with it ``chunks``."""
+    info: SliceInfo | None = field(default=None, repr=False)
+    """What the file holds, if it was opened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,8 @@ class VerifiedBag:
     read_bytes: int
     missing: tuple[Missing, ...]
     """What the manifest says that the recording could not get in: no finding, since the bag is as it was recorded."""
+    remarks: tuple[str, ...] = ()
+    """Where metadata.yaml contradicts the files, all of which are sound."""
 
     @property
     def findings(self) -> tuple[FileCheck, ...]:
@@ -79,8 +81,9 @@ class _Expected:
 def verify_remote(store: ObjectStore, bag: RemoteBag, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
     """``deep`` reads everything; else what the store says of each file is compared. Raises StoreError."""
     meter = Meter()
-    manifest, described, early = _writers_word(lambda name: _stored(store, bag, name))
-    expected = _expected(manifest, described, {file.name: file.size for file in bag.files})
+    names = [file.name for file in bag.files]
+    manifest, described, early = _writers_word(lambda name: _stored(store, bag, name), names)
+    expected = _expected(manifest, described, names)
 
     def one(each: _Expected) -> FileCheck:
         file = bag.file(each.name)
@@ -89,30 +92,40 @@ def verify_remote(store: ObjectStore, bag: RemoteBag, *, deep: bool = False, tol
         return _check_remote(store, file, each, meter, deep, told)
 
     with ThreadPoolExecutor(THREADS, 'bag-verify') as pool:
-        checks = tuple(pool.map(one, expected))
+        checks = (*early, *pool.map(one, expected))
     tags = {} if manifest or described else _tags(store, bag)
-    return VerifiedBag(bag.name, state_of(bag, manifest, tags), (*early, *checks), meter.bytes, _missing(manifest))
+    state = state_of(bag, manifest, tags)
+    return VerifiedBag(bag.name, state, checks, meter.bytes, _missing(manifest), _remarks(checks, described))
 
 
-def verify_folder(folder: Path, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
-    """Reads every file that a manifest knows. Raises BagError where there is no bag."""
-    files = {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob('*')) if path.is_file()}
-    if not files:
-        raise BagError(f'{folder} holds no bag', path=str(folder))
-    bag = RemoteBag('', folder.name, tuple(RemoteFile(name, '', size) for name, size in files.items()))
-    manifest, described, early = _writers_word(lambda name: _local(folder / name))
-    if manifest is None and described is None and not bag.slices:
-        raise BagError(f'{folder} holds no bag: neither {METADATA} nor a slice is in it', path=str(folder))
-    checks = [_check_local(folder, each, deep, told) for each in _expected(manifest, described, files)]
+def verify_folder(path: Path, *, deep: bool = False, told: Telling = lambda _: None) -> VerifiedBag:
+    """A folder, or one file of messages. Reads every file that a manifest knows. Raises BagError where there is no bag."""
+    files = files_of(path)
+    manifest, described, early = _writers_word(lambda name: _local(files.get(name)), list(files))
+    if manifest is None and described is None and not early and not slices_of(list(files), None):
+        raise no_bag(path)
+    checks = (*early, *(_check_local(files, each, deep, told) for each in _expected(manifest, described, list(files))))
+    sizes = {name: each.stat().st_size for name, each in files.items()}
+    bag = RemoteBag('', path.name, tuple(RemoteFile(name, '', size) for name, size in sizes.items()))
     state = state_of(bag, manifest, {}) if manifest else FOREIGN
-    return VerifiedBag(folder.name, state, (*early, *checks), sum(files.values()), _missing(manifest))
+    return VerifiedBag(path.name, state, checks, sum(sizes.values()), _missing(manifest), _remarks(checks, described))
+
+
+def _remarks(checks: Sequence[FileCheck], described: Description | None) -> tuple[str, ...]:
+    """Of a bag whose files were all opened, and are sound."""
+    infos = {check.name: check.info for check in checks if check.info is not None}
+    if described is None or len(infos) < len(checks) or any(check.finding for check in checks):
+        return ()
+    return of_files(infos, {}, described).remarks
 
 
 def _missing(manifest: Manifest | None) -> tuple[Missing, ...]:
     return manifest.missing if manifest else ()
 
 
-def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, Description | None, tuple[FileCheck, ...]]:
+def _writers_word(
+    get: Callable[[str], bytes | None], there: Sequence[str]
+) -> tuple[Manifest | None, Description | None, tuple[FileCheck, ...]]:
     """Manifest and metadata, and what is wrong with them."""
     manifest, described, findings = None, None, []
     try:
@@ -122,7 +135,7 @@ def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, 
         findings.append(FileCheck(MANIFEST, str(error), 'content'))
     try:
         if (content := get(METADATA)) is not None:
-            described = of_metadata(content, METADATA)
+            described = of_metadata(content, METADATA, there)
         elif manifest is not None:
             findings.append(FileCheck(METADATA, 'is missing', 'presence'))
     except BagDamaged as error:
@@ -130,7 +143,7 @@ def _writers_word(get: Callable[[str], bytes | None]) -> tuple[Manifest | None, 
     return manifest, described, tuple(findings)
 
 
-def _expected(manifest: Manifest | None, described: Description | None, there: Mapping[str, int]) -> list[_Expected]:
+def _expected(manifest: Manifest | None, described: Description | None, there: Sequence[str]) -> list[_Expected]:
     """By the manifest, else by the metadata, else by what is there."""
     if manifest is not None:
         found = {each.file: _Expected(each.file, each.bytes, each.sha256, each.messages) for each in manifest.slices}
@@ -138,8 +151,7 @@ def _expected(manifest: Manifest | None, described: Description | None, there: M
         found = {each.name: _Expected(each.name, None, None, each.messages) for each in described.parts}
     else:
         found = {}
-    slices = RemoteBag('', '', tuple(RemoteFile(name, '', size) for name, size in there.items())).slices
-    return [*found.values(), *(_Expected(file.name, None, None, None) for file in slices if file.name not in found)]
+    return [*found.values(), *(_Expected(name, None, None, None) for name in slices_of(there, described) if name not in found)]
 
 
 def _check_remote(
@@ -160,65 +172,79 @@ def _check_remote(
     return _check_summary(source, expected, 'sha256' if held.sha256 else 'size')
 
 
-def _check_local(folder: Path, expected: _Expected, deep: bool, told: Telling) -> FileCheck:
+def _check_local(files: Mapping[str, Path], expected: _Expected, deep: bool, told: Telling) -> FileCheck:
     if not is_path(expected.name):
         return FileCheck(expected.name, 'is the name of no file', 'presence')
-    path = folder / expected.name
-    if not path.is_file():
+    path = files.get(expected.name)
+    if path is None:
         return FileCheck(expected.name, 'is missing', 'presence')
     size = path.stat().st_size
     if expected.size is not None and size != expected.size:
         return FileCheck(expected.name, f'has {size} bytes, {expected.size} were recorded', 'size')
     source = LocalFile(path)
-    if deep or expected.sha256:
+    if (deep and path.suffix == MCAP) or expected.sha256:
         found = _check_content(source, expected, deep, told)
-        if found.finding or path.suffix != '.db3':
+        if found.finding or path.suffix == MCAP:
             return found
-    return _check_sqlite(path, expected) if path.suffix == '.db3' else _check_summary(source, expected, 'summary')
+    return _check_summary(source, expected, 'summary' if path.suffix == MCAP else 'content')
 
 
 def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileCheck:
-    if not expected.name.endswith('.mcap'):
+    """What the file holds: of an MCAP file by its summary, of another one, on the disk alone, by all of it."""
+    if not expected.name.endswith(MCAP) and not (expected.name.endswith(SLICES) and isinstance(source, LocalFile)):
         return FileCheck(expected.name, '', checked)
     try:
-        index = read_index(source)
+        info = opened(source).check()
     except BagDamaged as error:
-        return FileCheck(expected.name, str(error), checked)
-    if index.is_indexed and expected.messages not in {None, index.messages}:
-        return FileCheck(expected.name, f'has {index.messages} messages, {expected.messages} were recorded', checked)
-    return FileCheck(expected.name, '', checked)
+        return FileCheck(expected.name, _finding(error, source), checked)
+    if expected.messages not in {None, info.messages}:
+        return FileCheck(expected.name, f'has {info.messages:,} messages, {expected.messages:,} were recorded', checked)
+    return FileCheck(expected.name, '', checked, info)
 
 
 def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Telling) -> FileCheck:
     """Reads all of it once; ``deep`` unpacks every chunk on the way, which checks its CRC-32, and counts."""
     once = _Once(source, told)
-    checked = 'content' if expected.sha256 else 'size'
-    if deep and expected.name.endswith('.mcap'):
-        checked += ' and chunks'
+    checked, info = 'content' if expected.sha256 else 'size', None
+    if expected.name.endswith(MCAP):
         try:
             index = read_index(source)
-            count = sum(_messages(kind, start, content, source.name) for kind, start, content in walk(once, index.data_end))
+            info = index.info(Path(source.name), source.size)
+            if deep:
+                checked += ' and chunks'
+                finding = _difference(scan(once, index.data_end), index, expected)
+                if finding:
+                    return FileCheck(expected.name, finding, checked)
         except BagDamaged as error:
-            return FileCheck(expected.name, str(error), checked)
-        promised = expected.messages if expected.messages is not None else index.messages if index.is_indexed else count
-        if count != promised:
-            return FileCheck(expected.name, f'has {count} messages, {promised} were recorded', checked)
+            return FileCheck(expected.name, _finding(error, source), checked)
     found = once.rest()
     if expected.sha256 and found != expected.sha256:
         return FileCheck(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
-    return FileCheck(expected.name, '', checked)
+    if info is not None and expected.messages not in {None, info.messages}:
+        return FileCheck(expected.name, f'has {info.messages:,} messages, {expected.messages:,} were recorded', checked)
+    return FileCheck(expected.name, '', checked, info)
 
 
-def _messages(kind: int, start: int, content: memoryview, name: str) -> int:
-    """In one record."""
-    if kind == Opcode.CHUNK:
-        where = f'the chunk at {start} of {name}'
-        return sum(inner == Opcode.MESSAGE for inner, _, _ in records(unpack(content, where), where))
-    return int(kind == Opcode.MESSAGE)
+def _difference(counted: McapIndex, index: McapIndex, expected: _Expected) -> str:
+    """Between what was counted in a file and what its summary or the manifest has."""
+    promised = index.messages if expected.messages is None else expected.messages
+    if counted.messages != promised:
+        return f'has {counted.messages:,} messages, {promised:,} were recorded'
+    if counted.counts != index.counts or dict(counted.channels) != {each: index.channels[each] for each in counted.channels}:
+        return 'has other channels, or other numbers of messages on them, than its summary'
+    if (counted.t_start_ns, counted.t_end_ns) != (index.t_start_ns, index.t_end_ns):
+        return 'has messages of other times than its summary'
+    return ''
+
+
+def _finding(error: BagDamaged, source: Ranged) -> str:
+    """Without the name of the file, which stands before it."""
+    text = error.what.removeprefix(source.name)
+    return text.strip() if text != error.what else f'is damaged: {error.what}'.replace(f' of {source.name}', '')
 
 
 class _Once:
-    """A file that is read from its beginning to its end, and hashed on the way."""
+    """A file that is read from its beginning to its end, and hashed on the way, also what nobody else needs of it."""
 
     def __init__(self, source: Ranged, told: Telling) -> None:
         self.name = source.name
@@ -229,8 +255,10 @@ class _Once:
         self._at = 0
 
     def read(self, start: int, length: int) -> bytes:
-        found = self._source.read(start, length)
+        while self._at < start:
+            self.read(self._at, min(PIECE_BYTES, start - self._at))
         assert start == self._at, 'out of order'
+        found = self._source.read(start, length)
         self._digest.update(found)
         self._at += length
         self._told(length)
@@ -243,32 +271,13 @@ class _Once:
         return self._digest.hexdigest()
 
 
-def _check_sqlite(path: Path, expected: _Expected) -> FileCheck:
-    try:
-        check_tables(path)
-    except BagDamaged as error:
-        return FileCheck(expected.name, f'is not an SQLite bag: {error}', 'content')
-    try:
-        with sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True) as database:
-            answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
-            count = database.execute('SELECT count(*) FROM messages').fetchone()[0]
-        database.close()
-    except sqlite3.Error as error:
-        return FileCheck(expected.name, f'is not an SQLite bag: {error}', 'content')
-    if answer != 'ok':
-        return FileCheck(expected.name, f'is damaged: {answer}', 'content')
-    if expected.messages not in {None, count}:
-        return FileCheck(expected.name, f'has {count} messages, {expected.messages} were recorded', 'content')
-    return FileCheck(expected.name, '', 'content')
-
-
 def _stored(store: ObjectStore, bag: RemoteBag, name: str) -> bytes | None:
     file = bag.file(name)
     return document(store, file) if file else None
 
 
-def _local(path: Path) -> bytes | None:
-    return read_whole(LocalFile(path)) if path.is_file() else None
+def _local(path: Path | None) -> bytes | None:
+    return read_whole(LocalFile(path)) if path is not None else None
 
 
 def _tags(store: ObjectStore, bag: RemoteBag) -> Mapping[str, str]:

@@ -19,8 +19,7 @@ from stat import S_ISREG
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.fetch import on_disk
-from shadowhound_data_logger.bags.naming import METADATA
-from shadowhound_data_logger.bags.remote import SLICES
+from shadowhound_data_logger.bags.naming import METADATA, SLICES
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, planned, spool_upload
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, finished
 from shadowhound_data_logger.clock import SECOND, Clock, iso

@@ -15,7 +15,7 @@ from shadowhound_data_logger.bags.kept import CUTTING
 from shadowhound_data_logger.bags.objects import ros_distro
 from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar, pack_zip
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.mcap.index import McapIndex, read_summary
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.writer import SliceWriter
@@ -57,9 +57,9 @@ class Halving:
 
     def _slice(self, item: ThinnableObject) -> Thinned | None:
         source = LocalFile(item.path)
-        index = read_index(source)
-        numbers = self._halvable(index) if index.is_indexed else set()
-        if not numbers:
+        index = read_summary(source)
+        numbers = self._halvable(index) if index is not None else set()
+        if index is None or not numbers:
             return None
         bulk = {index.channels[number].topic for number in numbers}
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ class Halving:
                     if seen[topic] % 2 == 0:
                         lost[topic] += 1
                         continue
-                writer.write(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+                writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
             info = writer.close()
         finally:
             writer.abort()

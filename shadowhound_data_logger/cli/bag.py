@@ -19,6 +19,7 @@ from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
 from shadowhound_data_logger.bags.manifest import Missing
+from shadowhound_data_logger.bags.naming import SLICES
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
@@ -37,6 +38,7 @@ from shadowhound_data_logger.cli.common import (
     the_store,
 )
 from shadowhound_data_logger.cli.output import (
+    counted,
     duration,
     number,
     plain,
@@ -59,6 +61,8 @@ from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.times import moment
 
 STORE_THREADS: Final = 8
+LEAST_RATED_S: Final = 0.01
+"""A bag that is shorter has no rates."""
 LOOK_S: Final = 5.0
 """Between two looks for bags that are finished."""
 STATES: Final = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'gaps': 'yellow', 'foreign': 'dim'}
@@ -69,10 +73,10 @@ RELIABILITY: Final = {1: 'reliable', 2: 'best_effort'}
 
 
 def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
-    """A name, or the path of a folder."""
+    """A name, or the path of a folder or of one file of messages."""
     path = Path(name)
-    if '/' in name or name in {'.', '..'}:
-        if not path.is_dir():
+    if '/' in name or name in {'.', '..'} or (name.endswith(SLICES) and path.is_file()):
+        if not path.exists():
             raise BadUsage(f'there is no folder {name}', 'the name of a bag in the store has no slash: shadowhound-data bag list')
         return path.absolute()
     try:
@@ -148,7 +152,8 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
 def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
     """Show topics, rates, times and files of a bag.
 
-    It downloads almost nothing. Exit code 1 when a file is missing.
+    It downloads almost nothing, except of MCAP files whose summary does not have the message counts: those are read as a whole.
+    Exit code 1 when a file is missing or cannot be read.
     """
     if isinstance(bag, Path):
         found = info_folder(bag)
@@ -159,7 +164,7 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
         print_json(_info_json(found))
     else:
         print_page(*_page(found))
-    return exit_code(finding=found.missing)
+    return exit_code(finding=found.missing or found.description.damaged)
 
 
 @bag.command('verify', epilog=examples('bag verify patrol_20251018_120000 --deep'))
@@ -182,7 +187,10 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
             with the_store(STORE_THREADS) as store:
                 found = verify_remote(store, find_bag(store, robot, bag), deep=deep, told=bar.have)
     if as_json:
-        said = {**asdict(found), 'is_sound': found.is_sound, 'is_complete': found.state not in {GROWING, FOREIGN}}
+        checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
+        facts = {'bag': found.bag, 'state': found.state, 'checks': checks, 'read_bytes': found.read_bytes,
+                 'missing': list(map(asdict, found.missing)), 'remarks': list(found.remarks)}  # fmt: skip
+        said = {**facts, 'is_sound': found.is_sound, 'is_complete': found.state not in {GROWING, FOREIGN}}
         print_json(said)
     else:
         print_page(*_verdict(found))
@@ -249,7 +257,7 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
 
     Times are those at which messages were received, as in ros2 bag play; those of --ranges are stamps of messages, which are a
     little earlier: query --pad 1 makes each longer. Of a bag in the store, only the chunks that are needed
-    are read. Exit code 1 when a slice of that time is missing.
+    are read. Exit code 1 when a slice of that time is missing or cannot be read.
     """  # noqa: D301 - click's mark for lines that stay as they are
     names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
     choice = Choice(topics=names, spans=None if ranges is None else _spans(ranges), **wanted)
@@ -261,8 +269,8 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
     if as_json:
         print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))
     else:
-        print_lines(*_told_cut(found))
-    return exit_code(finding=found.missing)
+        print_lines(*_told_cut(found, is_remote=not isinstance(bag, Path)))
+    return exit_code(finding=found.missing or found.damaged)
 
 
 def _spans(ranges: list[Any]) -> tuple[tuple[int, int], ...]:
@@ -304,10 +312,12 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
                 spool_upload(sent, spool)
                 found = deliver(settings, spool, sent, deadline_s=deadline, told=bar)
     if as_json:
-        print_json({**asdict(found), 'is_delivered': found.is_delivered})
+        facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks)}
+        print_json({**asdict(found), 'is_delivered': found.is_delivered, **facts})
     else:
-        print_lines(_told_upload(found))
-    return exit_code(finding=not found.is_delivered)
+        damaged = (plain(f'{name} was uploaded, but cannot be read: {why}', 'red') for name, why in sent.damaged.items())
+        print_lines(_told_upload(found), *damaged, *_remarks(sent.remarks))
+    return exit_code(finding=not found.is_delivered or sent.damaged)
 
 
 @bag.command('watch', epilog=examples('bag watch bags --remove'))
@@ -391,10 +401,10 @@ def _places(where: Mapping[str, int]) -> str:
 
 
 def _findings(rows: Sequence[BagRow]) -> Iterator[RenderableType]:
-    found = [row for row in rows if row.finding]
+    found = [row for row in rows if row.finding or row.remark]
     if found:
         yield ''
-        yield from (plain(f'{row.bag}: {row.finding}', 'yellow') for row in found)
+        yield from (plain(f'{row.bag}: {row.finding or row.remark}', 'yellow') for row in found)
 
 
 def _page(found: BagInfo) -> Iterator[RenderableType]:
@@ -407,10 +417,11 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
         'mission': f'{mission.type}, run {mission.run_id or "-"}, id {mission.mission_id or "-"}' if mission else '',
         'event': ', '.join(f'{each.name} by {each.by}' for each in event.triggers) if event else '',
         'clock': _clock(told.clock, told.t_start_ns) if told.clock else '',
-        'began': f'{shown_time(told.t_start_ns)} UTC' if told.messages else '-',
-        'ended': f'{shown_time(told.t_end_ns)} UTC' if told.messages else '-',
-        'duration': duration(told.duration_s), 'messages': f'{number(told.messages)} on {len(told.topics)} topics',
-        'size': f'{volume(found.bytes)} in {len(found.files)} files',
+        'began': f'{shown_time(told.t_start_ns)} UTC' if told.t_start_ns is not None else '-',
+        'ended': f'{shown_time(told.t_end_ns)} UTC' if told.t_end_ns is not None else '-',
+        'duration': duration(told.duration_s) if told.duration_s is not None else '-',
+        'messages': f'{number(told.messages)} on {counted(len({topic.name for topic in told.topics}), "topic")}',
+        'size': f'{volume(found.bytes)} in {counted(len(found.files), "file")}',
         'storage': ', '.join(filter(None, (told.storage, told.compression, f'ROS {told.distro}' if told.distro else ''))),
     }  # fmt: skip
     yield value_table('', {name: value for name, value in lines.items() if value})
@@ -418,17 +429,19 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     yield _topics(found)
     yield ''
     yield _files(found)
+    yield from (plain(f'{name} cannot be read and is not counted: {why}', 'red') for name, why in told.damaged.items())
     if found.missing:
-        yield plain(f'Not here yet: {", ".join(found.missing)}', 'yellow')
+        yield plain(f'{"Not here yet" if found.robot else "Not here"}: {", ".join(found.missing)}', 'yellow')
+    yield from _remarks(told.remarks)
     yield from _lost(manifest.missing if manifest else ())
 
 
-def _clock(clock: Mapping[str, str], start_ns: int) -> str:
+def _clock(clock: Mapping[str, str], start_ns: int | None) -> str:
     """What the times of a bag are worth whose clock was not set."""
     if words.CLOCK_OFFSET_NS not in clock:
         return f'was never set in boot {clock[words.BOOT_ID]}: the date is not known, and the times below are by that clock'
     offset_ns = int(clock[words.CLOCK_OFFSET_NS])
-    began = f'the bag began {shown_time(start_ns + offset_ns)} UTC'
+    began = f'the bag began {shown_time(start_ns + offset_ns)} UTC' if start_ns is not None else 'the bag has no messages'
     return f'was not set yet: {began}, and {offset_ns / 1e9:.3f} s are to be added to the times below'
 
 
@@ -440,11 +453,22 @@ def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
         yield plain(f'Missing{topic}, in or after {lost.file}: {lost.what}{count}', 'yellow')
 
 
+def _remarks(remarks: Sequence[str]) -> Iterator[Text]:
+    """Where a metadata.yaml contradicts the files, whose figures are shown."""
+    yield from (plain(f'{remark[0].upper()}{remark[1:]}.', 'yellow') for remark in remarks)
+
+
+def _rate(messages: int | None, seconds: float | None) -> str:
+    """Nothing where a bag is too short for one: times may be a counter instead of a clock."""
+    if messages is None or seconds is None or messages < 2 or seconds < LEAST_RATED_S:
+        return '-'
+    return f'{(messages - 1) / seconds:,.1f} Hz'
+
+
 def _topics(found: BagInfo) -> RenderableType:
     table = plain_table('Topics', ('topic', 'type', 'messages', 'rate', 'QoS'), ('topic', 'type', 'QoS'))
-    seconds = found.description.duration_s
-    for topic in sorted(found.description.topics, key=lambda each: each.name):
-        rate = f'{(topic.messages - 1) / seconds:.1f} Hz' if topic.messages > 1 and seconds else '-'
+    for topic in sorted(found.description.topics, key=lambda each: (each.name, each.type)):
+        rate = _rate(topic.messages, found.description.duration_s)
         table.add_row(plain(topic.name), plain(topic.type), number(topic.messages), rate, plain(_qos(topic.qos)))
     return table
 
@@ -476,7 +500,7 @@ def _qos(profiles: Sequence[Mapping[str, Any]]) -> str:
 
 def _info_json(found: BagInfo) -> dict[str, Any]:
     told = found.description
-    times = with_dates({'t_start_ns': told.t_start_ns, 't_end_ns': told.t_end_ns}) if told.messages else {}
+    times = with_dates({'t_start_ns': told.t_start_ns, 't_end_ns': told.t_end_ns}) if told.t_start_ns is not None else {}
     parts = {part.name: with_dates(asdict(part)) for part in told.parts}
     return {
         'robot': found.robot, 'bag': found.bag, 'state': found.state, **times, 'duration_s': told.duration_s,
@@ -485,7 +509,8 @@ def _info_json(found: BagInfo) -> dict[str, Any]:
         'files': [
             {**parts.get(name, {'name': name}), 'bytes': size, 'where': where} for name, (size, where) in found.files.items()
         ],
-        'clock': dict(told.clock) or None, 'missing': list(found.missing), 'read_bytes': found.read_bytes,
+        'clock': dict(told.clock) or None, 'missing': list(found.missing), 'damaged': dict(told.damaged),
+        'remarks': list(told.remarks), 'read_bytes': found.read_bytes,
         'manifest': json.loads(found.manifest.to_json()) if found.manifest else None,
     }  # fmt: skip
 
@@ -495,26 +520,33 @@ def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
         yield plain(f'{check.name} {check.finding}', 'red')
     sound = [check for check in found.checks if not check.finding]
     how = ', '.join(sorted({check.checked for check in sound}))
-    text = f'{number(len(sound))} of {number(len(found.checks))} files are sound (by {how})' if sound else 'No file is sound'
+    are = 'is' if len(sound) == 1 else 'are'
+    text = f'{number(len(sound))} of {counted(len(found.checks), "file")} {are} sound (by {how})' if sound else 'No file is sound'
     yield Text.assemble(plain(found.bag, 'bold'), ' ', plain(found.state, STATES.get(found.state, 'red')), f': {text}.')
     yield from _lost(found.missing)
+    yield from _remarks(found.remarks)
     if found.state == GROWING:
         yield plain('It is still growing: its manifest, or a slice that it promises, is not there yet.', 'yellow')
     if found.state == FOREIGN:
         yield plain('It has no manifest, so what should be in it is not known.', 'dim')
 
 
-def _told_cut(found: Cut) -> Iterator[str | Text]:
+def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
     length = duration((found.t_end_ns - found.t_start_ns) / 1e9)
-    what = f'{number(found.messages)} messages on {number(found.topics)} topics, {volume(found.bytes)}'
-    share = f'{100 * found.read_bytes / max(found.bag_bytes, 1):.1f} %'
-    read = f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)} ({share}) in {number(found.read_requests)} requests.'
+    what = f'{counted(found.messages, "message")} on {counted(found.topics, "topic")}, {volume(found.bytes)}'
     yield f'{found.folder}: {what}, {shown_time(found.t_start_ns)} to {shown_time(found.t_end_ns)} UTC ({length})'
-    yield read
+    if is_remote:
+        requests = counted(found.read_requests, 'request')
+        share = f' ({100 * found.read_bytes / found.bag_bytes:.1f} %)' if found.read_bytes < found.bag_bytes else ''
+        yield f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)}{share} in {requests}.'
+    yield from (plain(f'{name} cannot be read, so nothing of it was copied: {why}', 'red') for name, why in found.damaged.items())
+    if found.extras:
+        yield f'Not copied: {counted(found.extras, "attachment or metadata record")}.'
     if found.absent:
         yield plain(f'The bag has no topic {", ".join(found.absent)}.', 'yellow')
     if found.missing:
-        yield plain(f'Not all of that time: {", ".join(found.missing)} is not there; {COMES}', 'yellow')
+        yield plain(f'Not all of that time: {", ".join(found.missing)} is not there{f"; {COMES}" if is_remote else ""}', 'yellow')
+    yield from _remarks(found.remarks)
 
 
 def _told_upload(found: Uploaded) -> str:

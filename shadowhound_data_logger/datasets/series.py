@@ -21,7 +21,7 @@ import numpy as np
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags import naming
-from shadowhound_data_logger.bags.contents import Plain
+from shadowhound_data_logger.bags.contents import McapFile
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.remote import find_bags, read_manifest
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
@@ -392,9 +392,9 @@ class Recordings:
 
     def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
         source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
-        wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic and not channel.repeated)
+        wanted = MessageFilter(0, 1 << 64, lambda channel: channel.topic == topic and not channel.repeated)
         known: dict[Channel, MessageTypes] = {}
-        for message in Plain([source], None).messages(wanted):
+        for message in McapFile(source).messages(wanted):
             if message.channel not in known:
                 folder = self._stack.enter_context(tempfile.TemporaryDirectory(dir=self._work))
                 known[message.channel] = _types_of(message.channel, Path(folder))
@@ -536,8 +536,8 @@ def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[
     found: dict[tuple[str, int], bytes] = {}
     known: dict[Channel, MessageTypes] = {}
     offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
-    wanted = MessageFilter(0, 1 << 63, lambda channel: channel.topic == topic and not channel.repeated)
-    for message in Plain([StoredFile(store, held.bucket, held.key, held.size)], None).messages(wanted):
+    wanted = MessageFilter(0, 1 << 64, lambda channel: channel.topic == topic and not channel.repeated)
+    for message in McapFile(StoredFile(store, held.bucket, held.key, held.size)).messages(wanted):
         if message.channel not in known:
             folder = stack.enter_context(tempfile.TemporaryDirectory(dir=work))
             known[message.channel] = _types_of(message.channel, Path(folder))

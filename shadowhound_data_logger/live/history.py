@@ -48,7 +48,7 @@ from shadowhound_data_logger.live.past import (
     dates_between,
 )
 from shadowhound_data_logger.mailbox import KeptFilter
-from shadowhound_data_logger.mcap.index import McapIndex, read_index
+from shadowhound_data_logger.mcap.index import McapIndex, read_summary
 from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import Ranged
 from shadowhound_data_logger.model import ON_ROBOT
@@ -302,7 +302,7 @@ class PastReader:
 
     def _of_slice(self, one: PastObject, at_ns: int) -> list[tuple[LiveItem, str]]:
         source, index = self._index(one)
-        if not index.is_indexed:
+        if index is None:
             return []
         wanted = MessageFilter(at_ns - IN_BAG_NS, at_ns + 1, lambda channel: channel.type in KINDS)
         came: dict[tuple[str, str], list[tuple[float, bytes]]] = {}
@@ -327,9 +327,10 @@ class PastReader:
             return next(frames(topic, type_name, self._types, at_ms, cdr, (FULL,)))
         return series(topic, kind, type_name, self._types, messages)
 
-    def _read_index(self, one: PastObject) -> tuple[Ranged, McapIndex]:
+    def _read_index(self, one: PastObject) -> tuple[Ranged, McapIndex | None]:
+        """A file without a complete summary, which the node does not write, is not searched."""
         source = self._contents.ranged(one)
-        return source, read_index(source)
+        return source, read_summary(source)
 
 
 class PullRefused(DataLoggerError):

@@ -12,7 +12,7 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from shadowhound_data_logger.mcap.slice_info import Channel, Damage, SliceInfo
+from shadowhound_data_logger.mcap.slice_info import Channel, Damage, SliceInfo, counted
 
 MAGIC: Final = b'\x89MCAP0\r\n'
 LIBRARY: Final = 'shadowhound_data_logger'
@@ -26,6 +26,8 @@ _STATISTICS: Final = struct.Struct('<QHIIIIQQ')
 _FOOTER: Final = struct.Struct('<QQI')
 _PLACE: Final = struct.Struct('<HQ')
 _COUNTED: Final = struct.Struct('<HI')
+ROS2: Final = 'ros2'
+"""The profile in the header of a file that rosbag2 can read."""
 CDR: Final = 'cdr'
 REPEATED: Final = 'shadowhound_repeated'
 """In the metadata of a channel: see ``Channel.repeated``."""
@@ -49,9 +51,17 @@ def mapping(values: Mapping[str, str]) -> bytes:
     return struct.pack('<I', len(body)) + body
 
 
-def head() -> bytes:
-    """What a slice begins with: always the same, so that recovery knows where the records begin."""
-    return MAGIC + record(Opcode.HEADER, text('ros2'), text(LIBRARY))
+def definition_bytes(definition: str) -> bytes:
+    """The bytes of a schema, which ``Schemas`` decoded losslessly even if they are not text."""
+    try:
+        return definition.encode(errors='surrogateescape')
+    except UnicodeEncodeError:
+        return definition.encode(errors='replace')
+
+
+def head(profile: str = ROS2) -> bytes:
+    """What a slice begins with: the same for all that the node records, so that recovery knows where the records begin."""
+    return MAGIC + record(Opcode.HEADER, text(profile), text(LIBRARY))
 
 
 @dataclass(slots=True)
@@ -99,15 +109,19 @@ class Contents:
     def declare(self, channel: Channel) -> tuple[ChannelTrack, bytes]:
         """A channel of its own, with the records that must precede its first message."""
         schema, records = (channel.type, channel.encoding, channel.definition), b''
-        number = self._schema_ids.get(schema)
+        number = self._schema_ids.get(schema) if any(schema) else 0
         if number is None:
             number = self._schema_ids[schema] = len(self.schemas) + 1
-            records = record(Opcode.SCHEMA, struct.pack('<H', number), *map(text, schema))
-            self.schemas[number] = records
+            data = definition_bytes(channel.definition)
+            fields = struct.pack('<H', number), text(channel.type), text(channel.encoding), struct.pack('<I', len(data))
+            self.schemas[number] = records = record(Opcode.SCHEMA, *fields, data)
         track = ChannelTrack(len(self.tracks) + 1, channel)
-        said = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
-        said |= {REPEATED: 'true'} if channel.repeated else {}
-        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), text(channel.topic), text(CDR), mapping(said))
+        ros = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
+        if channel.message_encoding != CDR:
+            ros = {name: value for name, value in ros.items() if value}
+        said = {**ros, **dict(channel.metadata), **({REPEATED: 'true'} if channel.repeated else {})}
+        names = text(channel.topic), text(channel.message_encoding)
+        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), *names, mapping(said))
         self.tracks[track.number], self.declared[track.number] = track, declared
         return track, records + declared
 
@@ -137,12 +151,8 @@ class Contents:
 
     def info(self, path: Path, size: int = 0, sha256: str = '', damage: Damage | None = None) -> SliceInfo:
         """What is known of the slice, its channels in the order in which they were declared."""
-        counts: dict[str, int] = {}
-        for track in self.tracks.values():
-            counts[track.channel.topic] = counts.get(track.channel.topic, 0) + track.count
-        channels = tuple(track.channel for track in self.tracks.values())
-        repeated = {track.channel.topic: track.count for track in self.tracks.values() if track.channel.repeated and track.count}
-        return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, counts, channels, damage, repeated)
+        channels = counted((track.channel, track.count) for track in self.tracks.values())
+        return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, channels, damage)
 
     def ending(self, at: int, metadata: str) -> bytes:
         """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 import logging
 import os
 import struct
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -25,7 +24,6 @@ from shadowhound_data_logger.durable_files import fingerprint, sync
 from shadowhound_data_logger.mcap import salvage
 from shadowhound_data_logger.mcap.format import RECORD, ChannelTrack, Contents, head, record, span, text
 from shadowhound_data_logger.mcap.index import UNREADABLE, Schemas, parsed, read_index
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.mcap.salvage import PRIVATE, IntactChunk, IntactRecord, Piece, Salvage
@@ -180,8 +178,6 @@ class _Scanner:
 
 log = logging.getLogger(__name__)
 
-_EVER = (0, 1 << 64)
-
 
 def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
     """Turn ``<name>.mcap.open`` into ``<name>.mcap``; its ``damage`` is what could not be kept.
@@ -214,31 +210,12 @@ def recover(path: Path, *, ros_distro: str = '') -> SliceInfo:
 
 
 def read_info(path: Path, *, digest: bool = False) -> SliceInfo:
-    """Of a whole MCAP file, ours or another's, by its summary; by all its messages where it has none.
+    """Of a complete MCAP file, ours or another recorder's. ``sha256`` is computed when ``digest`` is set.
 
-    ``sha256`` is computed when ``digest`` is set. Raises BagDamaged for what is not a whole MCAP file.
+    Raises BagDamaged for a file that is not a complete MCAP file.
     """
     source = LocalFile(path)
-    index = read_index(source)
-    sha256 = fingerprint(path)[1] if digest else ''
-    channels, messages, span = list(index.channels.values()), index.messages, (index.t_start_ns, index.t_end_ns)
-    counts, repeated = {channel.topic: 0 for channel in channels}, Counter[str]()
-    told = messages and sum(index.counts.values()) == messages and index.counts.keys() <= index.channels.keys()
-    if index.is_indexed or told:
-        for number, count in index.counts.items():
-            counts[index.channels[number].topic] += count
-            repeated[index.channels[number].topic] += count if index.channels[number].repeated else 0
-    else:
-        channels, messages, span, counts = [], 0, (0, 0), {}
-        for message in read_messages(source, index, MessageFilter(*_EVER, lambda _: True)):
-            if message.channel.topic not in counts:
-                channels.append(message.channel)
-            counts[message.channel.topic] = counts.get(message.channel.topic, 0) + 1
-            repeated[message.channel.topic] += message.channel.repeated
-            span = (min(span[0], message.log_ns), max(span[1], message.log_ns)) if messages else (message.log_ns, message.log_ns)
-            messages += 1
-    return SliceInfo(path, source.size, sha256, *(span if messages else (0, 0)), messages, counts, tuple(channels),
-                     repeated=+repeated)  # fmt: skip
+    return read_index(source).info(path, source.size, fingerprint(path)[1] if digest else '')
 
 
 def _write(file: int, at: int, content: bytes) -> None:

@@ -17,7 +17,6 @@ from shadowhound_data_logger.untrusted import from_yaml
 
 VERSION: Final = 8
 STORAGE: Final = 'mcap'
-SERIALIZATION: Final = 'cdr'
 _INFINITE_NS: Final = (1 << 63) - 1
 _PLAIN: Final = re.compile(r'(?!(true|false|null|yes|no|on|off|y|n)$)[a-z_]+')
 """Keys that need no quotes: YAML 1.1 reads the others as something else, or may."""
@@ -42,7 +41,10 @@ def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: 
 def bagfile_information(
     slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """What rosbag2 calls BagMetadata. A topic with messages of two types appears once with each."""
+    """What rosbag2 calls BagMetadata. A topic with messages of two types appears once with each.
+
+    Of several channels with one topic and type, as merged files have them, the QoS profiles are listed one after the other.
+    """
     start = min((one.t_start_ns for one in slices if one.messages), default=0)
     end = max((one.t_end_ns for one in slices if one.messages), default=0)
     return {
@@ -111,26 +113,32 @@ def to_yaml(value: Mapping[str, Any]) -> str:
 
 
 def _topics(slices: Sequence[SliceInfo]) -> list[dict[str, Any]]:
-    counts: dict[str, int] = {}
-    channels: dict[str, Channel] = {}
+    topics: dict[tuple[str, str, str], dict[Channel, int]] = {}
     for one in slices:
-        for topic, count in one.counts.items():
-            counts[topic] = counts.get(topic, 0) + count
-        for channel in one.channels:
-            channels.setdefault(channel.topic, channel)
+        for channel, count in one.channels.items():
+            of = topics.setdefault((channel.topic, channel.type, channel.message_encoding), {})
+            of[channel] = of.get(channel, 0) + count
     return [
         {
             'topic_metadata': {
-                'name': channel.topic,
-                'type': channel.type,
-                'serialization_format': SERIALIZATION,
-                'offered_qos_profiles': channel.qos,
-                'type_description_hash': channel.type_hash,
+                'name': name,
+                'type': kind,
+                'serialization_format': encoding,
+                'offered_qos_profiles': _merged(channel.qos for channel in counts),
+                'type_description_hash': next(iter(counts)).type_hash,
             },
-            'message_count': counts.get(channel.topic, 0),
+            'message_count': sum(counts.values()),
         }
-        for channel in channels.values()
+        for (name, kind, encoding), counts in topics.items()
     ]
+
+
+def _merged(profiles: Iterable[str]) -> str:
+    """Those of each channel once; block sequences of YAML follow one another as one."""
+    found = list(dict.fromkeys(qos for qos in profiles if qos))
+    if len(found) > 1 and all(qos.startswith('- ') for qos in found):
+        return '\n'.join(qos.rstrip('\n') for qos in found)
+    return found[0] if found else ''
 
 
 def _profile(profile: Any) -> dict[str, Any]:

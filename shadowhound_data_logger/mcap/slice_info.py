@@ -1,20 +1,22 @@
-"""What is known of a whole slice without opening it: its channels, times, counts, and what recovery had to leave out."""
+"""What a finished slice holds: its channels with their message counts, its times, and what recovery lost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic with one type: all that a reader needs to decode its messages.
+    """One topic with one type: everything that a reader needs to decode its messages.
 
-    ``type`` is the ROS name (``sensor_msgs/msg/Imu``). ``encoding`` says how ``definition`` is written: ``ros2msg`` or
-    ``ros2idl``; both are empty where nobody knows the type. ``type_hash`` is ``RIHS01_...``, empty where the distribution
-    knows none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, its policies in
-    numbers as Humble reads them, empty when it is not known.
+    ``type`` is the ROS name (``sensor_msgs/msg/Imu``), or the name of another recorder's schema. ``encoding`` is the format of
+    ``definition``: ``ros2msg`` or ``ros2idl``, or another recorder's (``protobuf``, ``jsonschema``); all three are empty if the
+    type is unknown. A definition that is not text keeps its bytes (``surrogateescape``). ``type_hash`` is ``RIHS01_...``, empty
+    where the distribution has none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, its policies in numbers
+    as Humble reads them, empty if unknown. ``message_encoding`` is the format of the messages. ``metadata`` is the rest of the
+    channel's metadata in the file.
     """
 
     topic: str
@@ -23,9 +25,19 @@ class Channel:
     definition: str
     type_hash: str
     qos: str
+    message_encoding: str = 'cdr'
+    metadata: tuple[tuple[str, str], ...] = ()
     repeated: bool = False
     """Whether its messages repeat latched messages of earlier slices, so that this slice can be played on its own. They have a
     channel of their own in addition to that of the topic's other messages."""
+
+
+def counted(channels: Iterable[tuple[Channel, int]]) -> dict[Channel, int]:
+    """The messages of each channel; two that differ in nothing but their number in the file are one."""
+    found: dict[Channel, int] = {}
+    for channel, count in channels:
+        found[channel] = found.get(channel, 0) + count
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +57,8 @@ class Damage:
 class SliceInfo:
     """A finished MCAP file. Times are log times, Unix nanoseconds, both inclusive, 0 in a slice without messages.
 
-    ``sha256`` is in hex, empty where it was not asked for. ``counts`` has every channel's topic, also those without messages.
-    ``damage`` is None unless the slice was recovered. ``repeated`` has those of ``counts`` that are on repeated channels.
+    ``sha256`` is in hex, empty if it was not requested. ``channels`` has the number of messages of each channel, including
+    channels without messages. ``damage`` is None unless the slice was recovered.
     """
 
     path: Path
@@ -55,12 +67,28 @@ class SliceInfo:
     t_start_ns: int
     t_end_ns: int
     messages: int
-    counts: Mapping[str, int]
-    channels: tuple[Channel, ...]
+    channels: Mapping[Channel, int]
     damage: Damage | None = None
-    repeated: Mapping[str, int] = field(default_factory=dict)
 
     @property
-    def recorded(self) -> Mapping[str, int]:
+    def counts(self) -> dict[str, int]:
+        """Messages by topic, for what is counted by topic alone: the ledger."""
+        return _by_topic(self.channels.items())
+
+    @property
+    def repeated(self) -> dict[str, int]:
+        """Those of ``counts`` that are on repeated channels, where there are any."""
+        return _by_topic((channel, count) for channel, count in self.channels.items() if channel.repeated and count)
+
+    @property
+    def recorded(self) -> dict[str, int]:
         """By topic, the messages that were received while the slice was written: all but the repeated ones."""
-        return {topic: count - self.repeated.get(topic, 0) for topic, count in self.counts.items()}
+        repeated = self.repeated
+        return {topic: count - repeated.get(topic, 0) for topic, count in self.counts.items()}
+
+
+def _by_topic(channels: Iterable[tuple[Channel, int]]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for channel, count in channels:
+        found[channel.topic] = found.get(channel.topic, 0) + count
+    return found

@@ -18,6 +18,7 @@ from shadowhound_data_logger.mcap.format import (
     MESSAGE,
     MESSAGE_FIELDS,
     RECORD,
+    ROS2,
     ChannelTrack,
     ChunkPacking,
     Contents,
@@ -48,9 +49,9 @@ class SliceWriter:
 
     def __init__(
         self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = '',
-        mode: int = 0o600,
+        mode: int = 0o600, profile: str = ROS2,
     ) -> None:  # fmt: skip
-        """``mode``: who may read it, less what the umask takes away."""
+        """``mode``: who may read it, less what the umask takes away. ``profile``: that of the file which is copied."""
         self.path = path
         self._ros_distro = ros_distro
         if compression not in _COMPRESSORS:
@@ -59,7 +60,9 @@ class SliceWriter:
         self._compression = compression if compression != 'none' else ''
         self._chunk_bytes = chunk_bytes
         self._contents = Contents()
-        self._tracks: dict[str, ChannelTrack] = {}
+        self._last: dict[str, tuple[Channel, ChannelTrack]] = {}
+        """By topic, the channel of its last message: a look-up by channel takes longer."""
+        self._tracks: dict[Channel, ChannelTrack] = {}
         self._chunk = bytearray(chunk_bytes)
         self._view = memoryview(self._chunk)
         self._used = 0
@@ -72,7 +75,7 @@ class SliceWriter:
         self._file = os.open(self._open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         self._written = 0
         try:
-            self._append(head())
+            self._append(head(profile))
             sync(path.parent)  # a file that was synced is lost all the same while its folder does not know it
         except OSError:
             self.abort()
@@ -84,23 +87,24 @@ class SliceWriter:
         return self._written + self._used
 
     def write(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, cdr: bytes) -> None:
-        """Add a message, a copy of ``cdr``. A topic keeps what its first channel says of QoS.
+        """Add a message that was received, a copy of ``cdr``.
 
-        Stamps are Unix nanoseconds; where the publisher's is not known (0 or less), it is the log time, as MCAP wants it.
+        Stamps are Unix nanoseconds; if the publisher's is unknown (0 or less), it is the log time, as MCAP requires.
         """
-        track = self._tracks.get(channel.topic)
-        if track is None or (track.channel is not channel and _kind(track.channel) != _kind(channel)):
-            track = self._declare(channel)
         log_ns = max(log_ns, 0)
-        if publish_ns <= 0:
-            publish_ns = log_ns
-        length, at = len(cdr), self._used
+        self.copy(channel, log_ns, publish_ns if publish_ns > 0 else log_ns, sequence, cdr)
+
+    def copy(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
+        """Add a message of another file, with its times as they are there: 64 bits without a sign."""
+        last = self._last.get(channel.topic)
+        track = last[1] if last is not None and last[0] is channel else self._track(channel)
+        length, at = len(data), self._used
         after = at + MESSAGE.size + length
         if after > self._chunk_bytes:
             at, after = 0, self._make_room(MESSAGE.size + length)
         size = length + MESSAGE_FIELDS
         MESSAGE.pack_into(self._chunk, at, _MESSAGE, size, track.number, sequence & 0xFFFFFFFF, log_ns, publish_ns)
-        self._view[at + MESSAGE.size : after] = cdr
+        self._view[at + MESSAGE.size : after] = data
         track.index.append(log_ns)
         track.index.append(at)
         self._used = after
@@ -136,14 +140,13 @@ class SliceWriter:
             os.close(self._file)
             self._file = -1
 
-    def _declare(self, channel: Channel) -> ChannelTrack:
-        """The track of a topic's type, which another type of the same topic may have taken the place of."""
-        tracks = self._contents.tracks.values()
-        track = next((one for one in tracks if one.channel.topic == channel.topic and _kind(one.channel) == _kind(channel)), None)
+    def _track(self, channel: Channel) -> ChannelTrack:
+        track = self._tracks.get(channel)
         if track is None:
             track, records = self._contents.declare(channel)
+            self._tracks[channel] = track
             self._declared += records
-        self._tracks[channel.topic] = track
+        self._last[channel.topic] = channel, track
         return track
 
     def _make_room(self, size: int) -> int:
@@ -176,11 +179,6 @@ class SliceWriter:
             while view:
                 view = view[os.write(self._file, view) :]
             self._written += len(part)
-
-
-def _kind(channel: Channel) -> tuple[str, bool]:
-    """Messages of one topic are on channels of their own where they differ in this."""
-    return channel.type, channel.repeated
 
 
 def _zstd(raw: memoryview) -> bytes:

@@ -26,8 +26,8 @@ CLOCK = ClockOf('unset', 'boot', 60, 70, None)
 
 
 def info(folder: Path, number: int, size: int = 10, channels: tuple[Channel, ...] = (IMU,)) -> SliceInfo:
-    counts = {channel.topic: 3 * place for place, channel in enumerate(channels)}
-    return SliceInfo(folder / slice_file(folder.name, number), size, 'ab' * 32, 1, 2, sum(counts.values()), counts, channels)
+    counts = {channel: 3 * place for place, channel in enumerate(channels)}
+    return SliceInfo(folder / slice_file(folder.name, number), size, 'ab' * 32, 1, 2, sum(counts.values()), counts)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_it_is_read_as_it_was_told(state: BagState) -> None:
     (_, rows) = state.all_rows()
     assert BagState.of_rows(state.folder, 'thor', rows) == state
     assert BagState.of_record(state.folder, 'thor', state.record('thor', 2)) == state
-    assert state.slices['b_1.mcap'].channels == (replace(IMU, definition=''), replace(POSE, definition=''))
+    assert state.slices['b_1.mcap'].channels == {replace(IMU, definition=''): 3, replace(POSE, definition=''): 0}
     assert state.slices['b_1.mcap'].counts == {'/pose': 0, '/imu': 3}
 
 

@@ -92,7 +92,7 @@ def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
     assert (found.return_value, told['topics'], told['messages']) == (0, 2, 221)
     assert told['read_bytes'] < told['bag_bytes'] / 3
     found = run(home, 'cut', tmp_path / 'here' / NAME, '--end', '1', '--regex', 'imu', '-o', tmp_path / 'other')
-    assert '100 messages on 1 topics' in found.output
+    assert '100 messages on 1 topic,' in found.output
     assert run(home, 'verify', tmp_path / 'other').return_value == 0
 
 

@@ -29,6 +29,8 @@ from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, record, text
 from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.messages import read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.mcap.slice_info import Channel
+from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if sys.version_info >= (3, 14):
@@ -117,7 +119,7 @@ FINE = {'storage': 'mcap', 'duration': '5', 'start': '7', 'name': '/a', 'qos': '
     'changed',
     [
         {'name': LAUGHS}, {'qos': LAUGHS}, {'name': '[/a]'}, {'storage': '{a: b}'}, {'start': '1' * 5000}, {'start': '-1'},
-        {'start': str(1 << 63)}, {'duration': '1e9'}, {'duration': '1' * 300}, {'name': 60 * '[' + 60 * ']'},
+        {'start': str(1 << 64)}, {'duration': '1e9'}, {'duration': '1' * 300}, {'name': 60 * '[' + 60 * ']'},
         {'name': 5000 * '['}, {'storage': '!!python/object/apply:os.getcwd []'}, {'start': '2001-01-01'},
     ],
     ids=range(13),
@@ -172,6 +174,9 @@ def test_one_bad_bag_does_not_end_the_list(tmp_path: Path) -> None:
     ):  # fmt: skip
         (root / name).mkdir(parents=True)
         (root / name / 'metadata.yaml').write_bytes(body)
+    writer = SliceWriter(root / 'fine' / 'a.mcap')
+    writer.write(Channel('/a', 'a/msg/A', '', '', '', ''), 7, 7, 0, b'1234')
+    writer.close()
     rows = {row.bag: row for row in bag_overview(store, 'thor', tmp_path / 'home')}
     assert {name: bool(row.finding) for name, row in rows.items()} == {'deep': True, 'late': True, 'large': True, 'fine': False}
     assert rows['fine'].messages == 1
@@ -203,7 +208,7 @@ PROGRAMS = {
     'a number for content': ('UPDATE messages SET data = 1000000000000', 'no content'),
     'a text for a time': ("UPDATE messages SET timestamp = 'late'", 'cannot be read'),
     'bytes for a name': ("UPDATE topics SET name = X'80'", 'cannot be read'),
-    'deep QoS': ("UPDATE topics SET offered_qos_profiles = '" + 1000 * '[' + "'", 'cannot be read'),
+    'a number for QoS': ("UPDATE topics SET offered_qos_profiles = X'80'", 'cannot be read'),
 }
 
 

@@ -20,8 +20,8 @@ OTHER = Channel('/späti', 'std_msgs/msg/Empty', '', '', '', '')
 
 
 def info(number: int, start: int, end: int, count: int, *channels: Channel) -> SliceInfo:
-    counts = {channel.topic: count for channel in channels}
-    return SliceInfo(Path(f'/somewhere/bag_{number}.mcap'), 100, '0' * 64, start, end, sum(counts.values()), counts, channels)
+    counts = dict.fromkeys(channels, count)
+    return SliceInfo(Path(f'/somewhere/bag_{number}.mcap'), 100, '0' * 64, start, end, sum(counts.values()), counts)
 
 
 def read(content: bytes) -> dict[str, Any]:

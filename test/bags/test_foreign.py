@@ -1,0 +1,190 @@
+"""Bags of other recorders: what their files hold counts, and what is not decoded is copied as it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bags.real_bags import T0
+from click.testing import CliRunner
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from shadowhound_data_logger.bags.cut import Choice, cut_folder
+from shadowhound_data_logger.bags.info import info_folder
+from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.mcap.index import read_index, read_summary
+from shadowhound_data_logger.mcap.ranges import LocalFile
+
+S = 10**9
+STRING = ('std_msgs/msg/String', 'ros2msg', b'string data\n')
+INT = ('std_msgs/msg/Int32', 'ros2msg', b'int32 data\n')
+CDR = b'\0\1\0\0\2\0\0\0a\0'
+BARE: dict[str, Any] = {
+    'index_types': IndexType.NONE, 'use_statistics': False, 'use_summary_offsets': False, 'repeat_channels': False,
+    'repeat_schemas': False,
+}  # fmt: skip
+
+
+def write(path: Path, fill: Callable[[Writer], None], *, profile: str = 'ros2', **options: Any) -> Path:
+    """A file of the reference writer, in a folder of its own; returns the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open('wb') as file:
+        writer = Writer(file, **options)
+        writer.start(profile, 'other')
+        fill(writer)
+        writer.finish()
+    return path.parent
+
+
+def ten(writer: Writer) -> None:
+    """Ten messages on two topics, a second apart."""
+    schema = writer.register_schema(*STRING)
+    channels = [writer.register_channel(topic, 'cdr', schema) for topic in ('/chat', '/talk')]
+    for n in range(10):
+        writer.add_message(channels[n % 2], T0 + n * S, CDR, T0 + n * S, n)
+
+
+def read(path: Path) -> list[tuple[object, ...]]:
+    """As the `mcap` package reads a file: everything of each message and of its channel but their numbers."""
+    with path.open('rb') as file:
+        return [
+            (channel.topic, channel.message_encoding, channel.metadata, schema and (schema.name, schema.encoding, schema.data),
+             message.log_time, message.publish_time, message.sequence, message.data)
+            for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
+        ]  # fmt: skip
+
+
+def topics(folder: Path) -> dict[tuple[str, str], int | None]:
+    return {(topic.name, topic.type): topic.messages for topic in info_folder(folder).description.topics}
+
+
+@pytest.mark.parametrize('options', [
+    BARE, {**BARE, 'use_chunking': False}, {'use_statistics': False}, {'repeat_channels': False, 'repeat_schemas': False},
+    {'repeat_schemas': False}, {'use_chunking': False}, {'use_chunking': False, 'use_statistics': False},
+    {'index_types': IndexType.ALL & ~IndexType.MESSAGE}, {'index_types': IndexType.MESSAGE}, {'enable_crcs': False},
+    {'compression': CompressionType.LZ4, 'chunk_size': 60},
+], ids=lambda options: ' '.join(options) or 'all')  # fmt: skip
+def test_every_part_of_a_summary_is_optional(tmp_path: Path, options: dict[str, Any]) -> None:
+    """What it does not have is counted, by channel."""
+    folder = write(tmp_path / 'b' / 'b_0.mcap', ten, **options)
+    found = info_folder(folder).description
+    assert (found.messages, found.t_start_ns, found.t_end_ns) == (10, T0, T0 + 9 * S)
+    assert topics(folder) == {('/chat', STRING[0]): 5, ('/talk', STRING[0]): 5}
+    assert verify_folder(folder, deep=True).is_sound
+    cut = cut_folder(folder, tmp_path / 'piece', Choice('2', '7', topics=('/chat',)))
+    assert cut.messages == 3
+    assert [one[4] for one in read(tmp_path / 'piece' / 'piece_0.mcap')] == [T0 + n * S for n in (2, 4, 6)]
+
+
+def test_a_complete_summary_is_enough(tmp_path: Path) -> None:
+    """Then nothing else of the file is read; without one ``read_summary`` finds nothing."""
+    folder = write(tmp_path / 'b' / 'b_0.mcap', ten)
+    assert read_summary(LocalFile(folder / 'b_0.mcap')) == read_index(LocalFile(folder / 'b_0.mcap'))
+    folder = write(tmp_path / 'c' / 'c_0.mcap', ten, **BARE)
+    assert read_summary(LocalFile(folder / 'c_0.mcap')) is None
+
+
+ENCODINGS = {
+    'ros1': ('ros1', ('std_msgs/String', 'ros1msg', b'string data\n'), b'\1\0\0\0a', {'callerid': '/talker', 'latching': '1'}),
+    'json': ('json', ('Chat', 'jsonschema', b'{"type": "object"}'), b'{"a": 1}', {}),
+    'protobuf': ('protobuf', ('demo.Image', 'protobuf', bytes([10, 200, 1, 10, 255, 254, 0])), b'\x08\x01\xff', {'k': 'v\n'}),
+    'cdr idl': (
+        'cdr',
+        ('a/msg/B', 'ros2idl', 'module ä {};'.encode()),
+        CDR,
+        {'offered_qos_profiles': '', 'topic_type_hash': 'RIHS01_0'},
+    ),
+    'text': ('text', None, b'\xff\xfe', {}),
+}
+
+
+@pytest.mark.parametrize('name', ENCODINGS)
+@pytest.mark.parametrize('is_chunked', [True, False])
+def test_what_is_not_decoded_is_copied_as_it_is(tmp_path: Path, name: str, is_chunked: bool) -> None:
+    """Encoding, schema and its bytes, the channel's metadata, both times, the sequence number, the profile."""
+    encoding, schema, data, metadata = ENCODINGS[name]
+
+    def fill(writer: Writer) -> None:
+        number = writer.register_schema(*schema) if schema is not None else 0
+        channel = writer.register_channel('/x', encoding, number, metadata)
+        writer.add_message(channel, T0, data, 0, 7)
+        writer.add_message(channel, T0 + 1, data * 2, T0 - 1, 1)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill, profile=name, use_chunking=is_chunked)
+    cut_folder(folder, tmp_path / 'piece', Choice())
+    piece = tmp_path / 'piece' / 'piece_0.mcap'
+    assert read(piece) == read(folder / 'b_0.mcap')
+    with piece.open('rb') as file:
+        assert make_reader(file).get_header().profile == name
+    cut_folder(tmp_path / 'piece', tmp_path / 'again', Choice())
+    assert (tmp_path / 'again' / 'again_0.mcap').read_bytes() == piece.read_bytes().replace(b'piece_0', b'again_0')
+
+
+def test_channels_are_counted_not_topics(tmp_path: Path) -> None:
+    """Two channels of one topic, of one type or of two, and with other QoS: also in a piece of the bag."""
+
+    def fill(writer: Writer) -> None:
+        qos = [{'offered_qos_profiles': f'- history: {n}\n  depth: 1', 'topic_type_hash': ''} for n in (1, 2)]
+        strings = [writer.register_channel('/tf', 'cdr', writer.register_schema(*STRING), each) for each in qos]
+        number = writer.register_channel('/tf', 'cdr', writer.register_schema(*INT))
+        for n in range(11):
+            writer.add_message(number if n == 0 else strings[n % 2], T0 + n, CDR, T0 + n)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
+    cut_folder(folder, tmp_path / 'piece', Choice())
+    for each in (folder, tmp_path / 'piece'):
+        assert topics(each) == {('/tf', INT[0]): 1, ('/tf', STRING[0]): 10}
+        (text,) = (topic for topic in info_folder(each).description.topics if topic.type == STRING[0])
+        assert {profile['history'] for profile in text.qos} == {1, 2}
+    assert len({str(one[2]) for one in read(tmp_path / 'piece' / 'piece_0.mcap') if one[3][0] == STRING[0]}) == 2  # type: ignore[index]
+
+
+def metadata_yaml(folder: Path, files: Mapping[str, tuple[int, int, int]] | None = None, **changed: Any) -> None:
+    """As rosbag2 4 or 5 writes it; ``files`` has messages, start and duration of each."""
+    names = sorted(path.name for path in folder.glob('*_[0-9].*'))
+    told = {
+        'version': 5, 'storage_identifier': 'mcap', 'relative_file_paths': names, 'duration': {'nanoseconds': 9 * S},
+        'starting_time': {'nanoseconds_since_epoch': T0}, 'message_count': 10, 'compression_format': '', 'compression_mode': '',
+        'topics_with_message_count': [
+            {'topic_metadata': {'name': topic, 'type': STRING[0], 'serialization_format': 'cdr', 'offered_qos_profiles': ''},
+             'message_count': 5} for topic in ('/chat', '/talk')
+        ],
+        'files': [
+            {'path': name, 'starting_time': {'nanoseconds_since_epoch': start}, 'duration': {'nanoseconds': length},
+             'message_count': count} for name, (count, start, length) in (files or {}).items()
+        ],
+    }  # fmt: skip
+    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**told, **changed}}))
+
+
+@pytest.mark.parametrize('start', [T0, T0 + 20 * S], ids=['Humble', 'Galactic'])
+def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: int) -> None:
+    """Humble records start and duration of the first file, Galactic of the last: info, cut and verify say so once."""
+    folder = tmp_path / 'b'
+    for part in range(3):
+
+        def fill(writer: Writer, part: int = part) -> None:
+            channel = writer.register_channel('/chat', 'cdr', writer.register_schema(*STRING))
+            for n in range(10):
+                writer.add_message(channel, T0 + (10 * part + n) * S, CDR, 0)
+
+        write(folder / f'b_{part}.mcap', fill)
+    topic = {'topic_metadata': {'name': '/chat', 'type': STRING[0], 'serialization_format': 'cdr'}, 'message_count': 30}
+    metadata_yaml(folder, starting_time={'nanoseconds_since_epoch': start}, message_count=30, topics_with_message_count=[topic])
+    found = info_folder(folder).description
+    assert (found.messages, found.t_start_ns, found.t_end_ns) == (30, T0, T0 + 29 * S)
+    cut = cut_folder(folder, tmp_path / 'piece', Choice())
+    assert (cut.messages, cut.t_start_ns, cut.t_end_ns) == (30, T0, T0 + 29 * S)
+    assert cut_folder(folder, tmp_path / 'later', Choice('12', '13')).messages == 1
+    (remark,) = cut.remarks
+    assert remark.startswith('metadata.yaml claims the time 2025-10-18T12:00:')
+    assert found.remarks == verify_folder(folder).remarks == cut.remarks
+    for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
+        ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
+        assert ran.return_value == 0, ran.output
+        assert ran.output.count('etadata.yaml claims') == 1
