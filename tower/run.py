@@ -2,7 +2,7 @@
 
 The same set-up as compose.yaml, as plain processes of this user, with the credentials of make_secrets.py and the data below one
 folder. It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow as
-another user, whose files are below /var/lib.
+users of their own, whose files are below /var/lib; it makes the one of MLflow (``shadowhound-mlflow``).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LOOPBACK: Final = '127.0.0.1'
 EVERY_ADDRESS: Final = ('0.0.0.0', '::')  # noqa: S104 - as it may be asked for
 READY_S: Final = 120.0
 LOOK_S: Final = 1.0
-POSTGRES_USER, NOBODY = 'postgres', 'nobody'
+POSTGRES_USER, MLFLOW_USER = 'postgres', 'shadowhound-mlflow'
 
 
 class Runner:
@@ -52,7 +52,7 @@ class Runner:
         self._offset = offset
         self._settings = make_secrets.read_env(folder / '.env')
         self._running = ExitStack()
-        self._owner = _unprivileged()
+        self._is_root = not os.geteuid()
         self._given: dict[str, str] = {}
         self._certificate = [folder.absolute() / 'tls' / name for name in ('ca.pem', 'tower.crt', 'tower.key')]
         self._has_tls = make_secrets.has_certificate(folder)
@@ -64,6 +64,8 @@ class Runner:
     def start(self, robots: Sequence[str]) -> None:
         """Returns when all answer. Raises ServerFailed with the end of the log of the one that does not."""
         self._ask_for_ports()
+        if self._is_root and not _exists(MLFLOW_USER):
+            _make_account()
         with ExitStack() as running:
             for name in ('s3', 'mlflow', 'logs'):
                 (self._folder / 'data' / name).mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -76,7 +78,7 @@ class Runner:
 
     def look(self) -> None:
         """Hand on to MLflow who its users are by now, where it cannot look itself."""
-        if self._owner:
+        if self._is_root:
             self._give(self._folder / 'mlflow' / 'users.json')
 
     def stop(self) -> None:
@@ -160,18 +162,18 @@ class Runner:
     def _start_postgres(self, running: ExitStack) -> str:
         """The URI of MLflow's database: PostgreSQL on a socket in the data folder that this user alone may enter, else SQLite."""
         programs = _postgres()
-        if programs is None:
+        if programs is None or (self._is_root and not _exists(POSTGRES_USER)):
             print('PostgreSQL is not installed here: MLflow keeps its runs in SQLite (Debian: apt install postgresql)')
             self.database = 'SQLite'
-            before, database = (folder / 'mlflow.db' for folder in (self._folder / 'data' / 'mlflow', self._mlflow_folder()))
-            if before.exists() and not database.exists():  # of when root ran MLflow itself
-                with database.open('xb') as file:
-                    file.write(before.read_bytes())
-                self._hand_over(database)
-            return f'sqlite:///{database}'
+            return f'sqlite:///{self._mlflow_folder() / "mlflow.db"}'
         self.database = 'PostgreSQL'
-        home = self._folder_of('postgres') if self._owner else self._folder / 'data' / 'postgres'
-        as_owner = self._as_owner()
+        home = sockets = self._folder_of('postgres') if self._is_root else self._folder / 'data' / 'postgres'
+        as_owner = self._as(POSTGRES_USER)
+        if self._is_root:  # MLflow's user reaches the socket, whose group is that of the folder, and nothing else
+            sockets = unprivileged_folders(self._folder, self._offset)['sockets']
+            sockets.mkdir(mode=0o700, exist_ok=True)
+            os.chown(sockets, pwd.getpwnam(POSTGRES_USER).pw_uid, pwd.getpwnam(MLFLOW_USER).pw_gid)
+            sockets.chmod(0o2710)
         port = POSTGRES_PORT + self._offset
         if not (home / 'data' / 'PG_VERSION').exists():
             made = subprocess.run([*as_owner, str(programs / 'initdb'), '-D', str(home / 'data'), '-U', 'mlflow', '--auth=peer',
@@ -180,74 +182,81 @@ class Runner:
             if made.returncode:
                 raise ServerFailed(f'PostgreSQL could not be set up in {home}:\n{made.stderr}')
         command = [*as_owner, str(programs / 'postgres'), '-D', str(home / 'data'), '-c', 'listen_addresses=', '-c',
-                   f'unix_socket_directories={home}', '-c', f'port={port}']  # fmt: skip
+                   f'unix_socket_directories={sockets}', '-c', 'unix_socket_permissions=0770', '-c', f'port={port}']  # fmt: skip
         server = self._launch(running, 'postgresql', command, self._environ())
-        ask = [*as_owner, str(programs / 'pg_isready'), '-q', '-h', str(home), '-p', str(port)]
+        ask = [*as_owner, str(programs / 'pg_isready'), '-q', '-h', str(sockets), '-p', str(port)]
         server.wait(lambda: subprocess.run(ask, check=False, cwd='/').returncode == 0, READY_S)
-        return f'postgresql+psycopg2://mlflow@/postgres?host={home}&port={port}'
+        return f'postgresql+psycopg2://mlflow@/postgres?host={sockets}&port={port}'
 
     def _folder_of(self, name: str) -> Path:
-        """A folder of the unprivileged user, which could not get to root's own, and of nobody else."""
+        """A folder for a server that does not run as root, which only its user may enter."""
         folder = unprivileged_folders(self._folder, self._offset)[name]
         folder.mkdir(mode=0o700, exist_ok=True)
-        self._hand_over(folder)
+        self._hand_over(folder, POSTGRES_USER if name == 'postgres' else MLFLOW_USER)
         return folder
 
-    def _hand_over(self, path: Path) -> None:
-        if self._owner:
-            user = pwd.getpwnam(self._owner)
+    def _hand_over(self, path: Path, owner: str = MLFLOW_USER) -> None:
+        if self._is_root:
+            user = pwd.getpwnam(owner)
             os.chown(path, user.pw_uid, user.pw_gid, follow_symlinks=False)
 
-    def _as_owner(self) -> list[str]:
-        """What a command begins with to run as the unprivileged user."""
-        if not self._owner:
+    def _as(self, owner: str) -> list[str]:
+        """What a command begins with to run as a server's user, where this is root."""
+        if not self._is_root:
             return []
-        group = pwd.getpwnam(self._owner).pw_gid
-        return ['setpriv', f'--reuid={self._owner}', f'--regid={group}', '--init-groups', '--no-new-privs', 'env', '--chdir=/']
+        group = pwd.getpwnam(owner).pw_gid
+        return ['setpriv', f'--reuid={owner}', f'--regid={group}', '--init-groups', '--no-new-privs', 'env', '--chdir=/']
 
     def _mlflow_folder(self) -> Path:
         """Where MLflow's own files are."""
-        return self._folder_of('mlflow') if self._owner else self._folder / 'data' / 'mlflow'
+        return self._folder_of('mlflow') if self._is_root else self._folder / 'data' / 'mlflow'
+
+    def _write_private(self, name: str, content: str) -> Path:
+        """A file of MLflow's that its user alone may read."""
+        make_secrets.write(part := self._mlflow_folder() / f'{name}.new', content)
+        self._hand_over(part)
+        return part.replace(part.with_name(name))
 
     def _give(self, path: Path) -> Path:
         """A file as MLflow can read it: the file itself, or a copy for its user alone, made anew when the file has changed."""
-        if not self._owner:
+        if not self._is_root:
             return path
-        copy, content = self._mlflow_folder() / path.name, path.read_text(encoding='utf-8')
+        content = path.read_text(encoding='utf-8')
         if content != self._given.get(path.name):
-            make_secrets.write(part := copy.with_suffix('.new'), content)
-            self._hand_over(part)
-            part.replace(copy)
+            self._write_private(path.name, content)
             self._given[path.name] = content
-        return copy
+        return self._mlflow_folder() / path.name
 
     def _python(self) -> list[str]:
         """The command of an interpreter with MLflow that the server's user may run. Raises ServerFailed."""
         found = find_spec('mlflow')
         if found is None or not found.origin:
             raise ServerFailed('MLflow is not installed', remedy='pip install mlflow flask-wtf')
-        if not self._owner:
+        if not self._is_root:
             return [sys.executable]
         places = os.pathsep.join((str(Path(found.origin).parents[1]), str(HERE.parent)))
         ask = 'import sys; from importlib.util import find_spec; sys.exit(not (find_spec("mlflow") and find_spec(sys.argv[1])))'
         usual = f'/usr/bin/python{sys.version_info.major}.{sys.version_info.minor}'
         for command in ([sys.executable], ['env', f'PYTHONPATH={places}', usual]):
-            words = [*self._as_owner(), *command, '-c', ask, mlflow_access.__name__]
+            words = [*self._as(MLFLOW_USER), *command, '-c', ask, mlflow_access.__name__]
             if subprocess.run(words, capture_output=True, check=False).returncode == 0:
                 return command
         remedy = 'run the Tower as a user of its own, or install Python where others may read it'
-        raise ServerFailed(f'MLflow does not run as root, and the user {self._owner} cannot run {sys.executable}', remedy=remedy)
+        raise ServerFailed(f'MLflow does not run as root, and the user {MLFLOW_USER} cannot run {sys.executable}', remedy=remedy)
 
     def _start_mlflow(self, running: ExitStack, uri: str, robots: Sequence[str]) -> None:
         folder, users = self._mlflow_folder(), self._give(self._folder / 'mlflow' / 'users.json')
-        command = [*self._as_owner(), *self._python(), '-m', 'mlflow', 'server', *mlflow_access.APP, '--host', self._bind,
+        command = [*self._as(MLFLOW_USER), *self._python(), '-m', 'mlflow', 'server', *mlflow_access.APP, '--host', self._bind,
                    '--port', str(MLFLOW_PORT + self._offset), '--workers', '1', '--backend-store-uri', uri,
                    '--artifacts-destination', 's3://mlflow']  # fmt: skip
         if self._bind not in EVERY_ADDRESS:  # else MLflow answers to private addresses, and to no name
             command += ['--allowed-hosts', ','.join(f'{host}:*' for host in (self._bind, 'localhost', LOOPBACK))]
+        names = {'aws_access_key_id': 'MLFLOW_ACCESS_KEY_ID', 'aws_secret_access_key': 'MLFLOW_SECRET_ACCESS_KEY'}
+        keys = self._write_private(
+            's3.keys', '[default]\n' + ''.join(f'{name} = {self._settings[ours]}\n' for name, ours in names.items())
+        )
         environ = self._environ(
-            AWS_ACCESS_KEY_ID=self._settings['MLFLOW_ACCESS_KEY_ID'],
-            AWS_SECRET_ACCESS_KEY=self._settings['MLFLOW_SECRET_ACCESS_KEY'], AWS_DEFAULT_REGION='us-east-1',
+            AWS_SHARED_CREDENTIALS_FILE=str(keys), AWS_DEFAULT_REGION='us-east-1',
             MLFLOW_S3_ENDPOINT_URL=self.store_url, HOME=str(folder), **mlflow_access.environment(folder, users, uri),
         )  # fmt: skip
         trust: ssl.SSLContext | None = None
@@ -256,9 +265,9 @@ class Runner:
             environ['AWS_CA_BUNDLE'] = str(authority)
             command += ['--uvicorn-opts', shlex.join([f'--ssl-certfile={certificate}', f'--ssl-keyfile={key}'])]
             trust = ssl.create_default_context(cafile=self._certificate[0])
-        if self._owner:
+        if self._is_root:
             self._hand_over(folder / 'auth.ini')
-            print(f'MLflow does not run as root: it is the user {self._owner} here, and its files are in {folder}')
+            print(f'MLflow does not run as root: it is the user {MLFLOW_USER} here, and its files are in {folder}')
         server = self._launch(running, 'mlflow', command, environ)
         server.wait(lambda: mlflow_access.is_up(self.tracking_uri, trust), READY_S)
         try:
@@ -271,7 +280,7 @@ class Runner:
 def unprivileged_folders(folder: Path, offset: int) -> dict[str, Path]:
     """Where the files of PostgreSQL and MLflow are when root runs the Tower of this folder: each folder's are its own."""
     ours = Path('/var/lib') / f'shadowhound-tower-{hashlib.sha256(bytes(folder.absolute())).hexdigest()[:12]}-{offset}'
-    return {'postgres': ours, 'mlflow': ours.with_name(f'{ours.name}-mlflow')}
+    return {'postgres': ours, 'sockets': ours.with_name(f'{ours.name}-sockets'), 'mlflow': ours.with_name(f'{ours.name}-mlflow')}
 
 
 def _answers(url: str) -> bool:
@@ -290,12 +299,23 @@ def _postgres() -> Path | None:
     return next((folder for folder in folders if (folder / 'initdb').exists()), None)
 
 
-def _unprivileged() -> str:
-    """The user that the servers run as which must not be root; empty where this one is not."""
-    if os.geteuid():
-        return ''
-    there = {user.pw_name for user in pwd.getpwall()}
-    return POSTGRES_USER if POSTGRES_USER in there else NOBODY
+def _exists(account: str) -> bool:
+    return any(user.pw_name == account for user in pwd.getpwall())
+
+
+def _make_account() -> None:
+    """The system account that MLflow runs as, which no other program is. Raises ServerFailed."""
+    command = ['useradd', '--system', '--user-group', '--no-create-home', '--home-dir', '/nonexistent', '--shell',
+               '/usr/sbin/nologin', MLFLOW_USER]  # fmt: skip
+    try:
+        made = subprocess.run(command, check=False, capture_output=True, text=True)
+        pwd.getpwnam(MLFLOW_USER)  # another Tower may have made it
+    except (OSError, KeyError) as error:
+        said = error if isinstance(error, OSError) else made.stderr.strip()
+        raise ServerFailed(
+            f'MLflow does not run as root, and its account {MLFLOW_USER} cannot be made: {said}',
+            remedy=f'make it: {shlex.join(command)}; or run the Tower as another user than root',
+        ) from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

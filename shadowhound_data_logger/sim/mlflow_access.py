@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import hmac
+import ipaddress
 import json
 import os
 import re
@@ -23,6 +24,7 @@ import subprocess
 import sys
 import time
 from base64 import b64encode
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -55,6 +57,14 @@ SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^
 BODY_BYTES: Final = 32 << 20
 """The longest body of a request that MLflow keeps in memory whole; the inputs of a run
 may have 17 MB. Artifacts are streamed."""
+MOST_WRONG, WRONG_S = 10, 60.0
+"""After this many wrong passwords within this time an address must wait."""
+MOST_ADDRESSES: Final = 1000
+"""Addresses whose wrong passwords are remembered; beyond it the one that failed least recently is forgotten."""
+LOOPBACK: Final = frozenset({'', '127.0.0.1', '::1'})
+"""Addresses that never wait: of programs of this machine, such as a proxy in front, behind which are all others."""
+SILENT_S: Final = 20.0
+"""A connection on which no request arrives is closed at the latest after twice this time."""
 NO_USER: Final = 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are not a user of this Tower'
 ANSWER_S: Final = 30.0
 START_S: Final = 180.0
@@ -148,31 +158,109 @@ def _user(given: Authorization | None) -> str:
     return user if any(hmac.compare_digest(told, one) for one in known) else ''
 
 
-def connection(**given: Any) -> Protocol:
-    """The protocol of uvicorn, whose app gets no body of a stranger and none without a bound.
+class WrongPasswords:
+    """Which addresses sent wrong passwords lately. For the event loop alone; of a bounded size.
 
-    MLflow's app reads each body into memory, and only then asks ``authenticate``. Artifacts are streamed, after it.
+    There is no limit for all addresses together: it would let any host in the network lock out everybody.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._failures: dict[str, deque[float]] = {}
+
+    def wait_s(self, address: str) -> float:
+        """How long the address must wait before it may try another password; 0 where it need not."""
+        known = self._failures.get(_network_of(address))
+        return max(0.0, known[0] + WRONG_S - self._now()) if known is not None and len(known) == MOST_WRONG else 0.0
+
+    def add(self, address: str) -> None:
+        network = _network_of(address)
+        known = self._failures.pop(network, None) or deque(maxlen=MOST_WRONG)
+        known.append(self._now())
+        self._failures[network] = known  # the last one now
+        if len(self._failures) > MOST_ADDRESSES:
+            del self._failures[next(iter(self._failures))]
+
+
+def _network_of(address: str) -> str:
+    """The address, or of IPv6 its /64: a host there may have any address of it."""
+    try:
+        found = ipaddress.ip_address(address.partition('%')[0])
+    except ValueError:
+        return address
+    found = getattr(found, 'ipv4_mapped', None) or found
+    return str(found) if found.version == 4 else str(ipaddress.ip_network((found, 64), strict=False))
+
+
+_WRONG: Final = WrongPasswords()
+
+
+def connection(**given: Any) -> Protocol:
+    """The protocol of uvicorn, whose app gets no body of a stranger and none without a bound, and no request of whoever guesses.
+
+    MLflow's app reads each body into memory, and only then asks ``authenticate``. Artifacts are streamed, after it. uvicorn
+    closes a connection that is idle after a request, but neither one that never sends a request nor one that never ends its head.
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 - see authenticate
 
-    made = H11Protocol(**given)
-    made.app = _with_bound(made.app)
-    return made
+    class Connection(H11Protocol):
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._begun = self._running = 0
+            self._served, self.app = self.app, self._serve
+            self._timer = self.loop.call_later(SILENT_S, self._watch, 0)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._timer.cancel()
+            super().connection_lost(exc)
+
+        def _watch(self, begun: int) -> None:
+            """Close it where no request began since the last look, and none is being served."""
+            if begun == self._begun and not self._running:
+                self.transport.close()
+            else:
+                self._timer = self.loop.call_later(SILENT_S, self._watch, self._begun)
+
+        async def _serve(self, scope: Message, receive: Receive, send: Send) -> None:
+            self._begun += 1
+            self._running += 1
+            try:
+                await _with_bound(self._served)(scope, receive, send)
+            finally:
+                self._running -= 1
+
+    return Connection(**given)
 
 
 def _with_bound(served: Served) -> Served:
     async def app(scope: Message, receive: Receive, send: Send) -> None:
-        refused = _body_refused(scope) if scope['type'] == 'http' else None
+        refused = (_wait(scope) or _body_refused(scope)) if scope['type'] == 'http' else None
         if refused is None:
             await served(scope, receive, send)
             return
         status, code, message = refused
         headers = [(b'content-type', b'application/json'), (b'connection', b'close')]
         headers += [(b'www-authenticate', b'Basic realm="Tower"')] if status == 401 else []
+        headers += [(b'retry-after', str(round(WRONG_S)).encode())] if status == 429 else []
         await send({'type': 'http.response.start', 'status': status, 'headers': headers})
         await send({'type': 'http.response.body', 'body': json.dumps({'error_code': code, 'message': message}).encode()})
 
     return app
+
+
+def _wait(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
+    """As ``_body_refused``, of an address that sent too many wrong passwords; a wrong one that comes now is counted."""
+    from werkzeug.datastructures import Authorization  # noqa: PLC0415 - see authenticate
+
+    given = next((value for name, value in scope['headers'] if name == b'authorization'), None)
+    if given is None:
+        return None
+    address = scope['client'][0] if scope.get('client') else ''
+    if address in LOOPBACK or not _WRONG.wait_s(address):
+        if not _user(Authorization.from_header(given.decode('latin-1'))):
+            _WRONG.add(address)
+        return None  # the app says what is wrong with it
+    return 429, 'RESOURCE_EXHAUSTED', 'too many wrong passwords from this address; wait a minute'
 
 
 def _body_refused(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:

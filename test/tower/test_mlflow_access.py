@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import os
+import socket
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPResponse
@@ -379,3 +381,74 @@ def test_its_files_hold_no_password(tower: Tower) -> None:
         except OSError:
             continue
     assert not [word for word in words if word.decode() in repr(tower)]
+
+
+class Neighbor:
+    """A host of the network, for which another address of the loopback stands; the server's own address never waits."""
+
+    def __init__(self, tower: Tower, address: str) -> None:
+        self._place = urllib3.util.parse_url(tower.tracking_uri)
+        self.address = address
+
+    def status(self, user: str, password: str) -> tuple[int, str | None]:
+        """Of a request with this login, and how long to wait."""
+        connection = HTTPConnection(str(self._place.host), self._place.port, timeout=60, source_address=(self.address, 0))
+        login = base64.b64encode(f'{user}:{password}'.encode()).decode()
+        try:
+            connection.request('GET', '/version', headers={'Authorization': f'Basic {login}'})
+            answer = connection.getresponse()
+            return answer.status, answer.headers['Retry-After']
+        finally:
+            connection.close()
+
+
+def test_whoever_guesses_has_to_wait_and_nobody_else(tower: Tower) -> None:
+    """After some wrong passwords an address gets no answer to the right one either; other addresses do."""
+    password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
+    guesser, other = Neighbor(tower, '127.0.9.1'), Neighbor(tower, '127.0.9.2')
+    wrong = [guesser.status('spark', f'guess {number}')[0] for number in range(mlflow_access.MOST_WRONG + 2)]
+    assert wrong == [401] * mlflow_access.MOST_WRONG + [429] * 2
+    assert guesser.status('spark', password) == (429, '60')
+    assert other.status('spark', password) == (200, None)
+    assert Neighbor(tower, '127.0.0.1').status('spark', password) == (200, None)
+
+
+def test_what_is_remembered_of_wrong_passwords_is_bounded() -> None:
+    """Any number of addresses may guess; those that guess now are remembered, and a wait ends."""
+    now = [0.0]
+    wrong = mlflow_access.WrongPasswords(lambda: now[0])
+    for number in range(3 * mlflow_access.MOST_ADDRESSES):
+        wrong.add(f'10.0.{number >> 8}.{number & 255}')
+    assert len(wrong._failures) == mlflow_access.MOST_ADDRESSES
+    for number in range(3 * mlflow_access.MOST_WRONG):
+        assert bool(wrong.wait_s('fd00::1')) is (number >= mlflow_access.MOST_WRONG)
+        wrong.add(f'fd00::{number:x}')
+    assert len(wrong._failures['fd00::/64']) == mlflow_access.MOST_WRONG
+    assert (wrong.wait_s('fd00:0:0:1::'), wrong.wait_s('10.9.9.9')) == (0.0, 0.0)
+    now[0] += mlflow_access.WRONG_S
+    assert wrong.wait_s('fd00::1') == 0.0
+
+
+@pytest.mark.long('connections that are silent for half a minute')
+@pytest.mark.parametrize('said', [b'', b'GET / HT', b'GET /version HTTP/1.1\r\nHost: x\r\nX-Slow: ', b'two'])
+def test_a_silent_connection_is_closed(tower: Tower, said: bytes) -> None:
+    """Whoever sends no complete request is disconnected, also after a first one, and while a byte comes now and then."""
+    place = urllib3.util.parse_url(tower.tracking_uri)
+    with socket.create_connection((str(place.host), int(place.port or 0)), timeout=1.0) as one:
+        if said == b'two':
+            one.sendall(b'GET /health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n')
+            assert one.recv(1 << 16).startswith(b'HTTP/1.1 200')
+            said = b'GET /version HTTP/1.1\r\nX: '
+        one.sendall(said)
+        end_s = time.monotonic() + 2 * mlflow_access.SILENT_S + 5.0
+        while True:
+            assert time.monotonic() < end_s
+            try:
+                if said.startswith(b'GET /version'):
+                    one.sendall(b'x')
+                if one.recv(1 << 16) == b'':
+                    break
+            except TimeoutError:
+                continue
+            except OSError:
+                break

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import errno
+import os
+import pwd
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import time
@@ -20,6 +23,7 @@ import pytest
 from botocore.exceptions import ClientError
 from open_seaweed import free_offset
 from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_database, run
+from tower_scripts import run as run_module
 
 from shadowhound_data_logger.sim.servers import ServerFailed
 
@@ -91,13 +95,55 @@ def test_artifacts_go_through_mlflow_to_the_store(folder: Path, offset: int) -> 
     assert s3.get_object(Bucket='mlflow', Key='1/hello.txt')['Body'].read() == b'hello'
 
 
-def test_mlflow_is_nobody_of_importance(folder: Path, offset: int) -> None:
-    """Its processes are not root's, whoever runs the Tower."""
+def _mlflow_processes(offset: int) -> list[Path]:
     port = str(5001 + offset).encode()
-    servers = [entry.parent for entry in Path('/proc').glob('[0-9]*/cmdline')
-               if b'--port' in (words := _words(entry)) and port in words and b'_guard.py' not in b' '.join(words)]  # fmt: skip
+    return [entry.parent for entry in Path('/proc').glob('[0-9]*/cmdline')
+            if b'--port' in (words := _words(entry)) and port in words and b'_guard.py' not in b' '.join(words)]  # fmt: skip
+
+
+def test_mlflow_is_nobody_of_importance(folder: Path, offset: int) -> None:
+    """Its processes are not root's, whoever runs the Tower, and not those of a user whom another service runs as."""
+    servers = _mlflow_processes(offset)
     assert servers
-    assert 0 not in {server.stat().st_uid for server in servers}
+    owners = {pwd.getpwuid(server.stat().st_uid).pw_name for server in servers}
+    assert owners == ({'shadowhound-mlflow'} if os.geteuid() == 0 else {pwd.getpwuid(os.geteuid()).pw_name})
+
+
+def test_no_environment_and_no_command_line_has_the_key_of_the_store(folder: Path, offset: int) -> None:
+    """MLflow's key is in a file for its user alone."""
+    secret = make_secrets.read_env(folder / '.env')['MLFLOW_SECRET_ACCESS_KEY'].encode()
+    servers = _mlflow_processes(offset)
+    assert servers
+    told = [(server / name).read_bytes() for server in servers for name in ('environ', 'cmdline')]
+    assert not any(secret in one for one in told)
+    named = {word.partition(b'=')[2].decode() for one in told for word in one.split(b'\0')
+             if word.startswith(b'AWS_SHARED_CREDENTIALS_FILE=')}  # fmt: skip
+    (keys,) = (Path(name) for name in named)
+    assert secret in keys.read_bytes()
+    assert (stat.S_IMODE(keys.stat().st_mode), stat.S_IMODE(keys.parent.stat().st_mode)) == (0o600, 0o700)
+    assert keys.stat().st_uid in {server.stat().st_uid for server in servers}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='another user is needed')
+@pytest.mark.parametrize('user', ['nobody', 'postgres'])
+def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, offset: int, user: str) -> None:
+    """Neither its environment nor its files, as a user that services share; nor, as nobody, the database."""
+    mlflow, sockets = (run_module.unprivileged_folders(folder, offset)[name] for name in ('mlflow', 'sockets'))
+    wanted = [str(server / 'environ') for server in _mlflow_processes(offset)]
+    wanted += [str(mlflow / name) for name in ('s3.keys', 'auth.ini')]
+    if user == 'nobody' and sockets.exists():
+        wanted.append(str(next(sockets.glob('.s.PGSQL.*[0-9]'))))
+    try:
+        pwd.getpwnam(user)
+    except KeyError:
+        pytest.skip(f'there is no user {user} here')
+    ask = 'import socket, sys\nfor path in sys.argv[1:]:\n try:\n'
+    ask += '  socket.socket(socket.AF_UNIX).connect(path) if "PGSQL" in path else open(path).read()\n  print("read", path)\n'
+    ask += ' except PermissionError:\n  print("denied")\n'
+    command = ['setpriv', f'--reuid={user}', '--clear-groups', '/usr/bin/python3', '-c', ask, *wanted]
+    said = subprocess.run(command, check=True, capture_output=True, text=True, cwd='/').stdout.splitlines()
+    assert len(wanted) >= 3
+    assert said == ['denied'] * len(wanted)
 
 
 def test_a_password_of_mlflow_is_changed_while_it_runs(folder: Path, offset: int) -> None:
