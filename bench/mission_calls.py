@@ -29,6 +29,8 @@ FRAME_EVERY: Final = 10
 JPEG: Final = b'\xff\xd8' + os.urandom(150_000)
 MEDIAN_S, P99_S = 1e-3, 10e-3
 PLAIN_CALLS: Final = 50
+START_S: Final = {'up': 0.1, 'away': 0.1, 'hung': 2.1}
+"""Of ``start_mission`` right after the constructor."""
 
 
 def timed(call: Callable[[], object]) -> float:
@@ -84,7 +86,8 @@ def measure(options: argparse.Namespace) -> Report:
                 bars.append(Bar(f'median of a log call, Tower {name}', 'under 1 ms', median * 1e3, 'ms', median < MEDIAN_S))
                 bars.append(Bar(f'p99 of a log call, Tower {name}', 'under 10 ms', p99 * 1e3, 'ms', p99 < P99_S))
                 start = took['start_mission'][0]
-                bars.append(Bar(f'start_mission, Tower {name}', 'at most 2.1 s', start, 's', start < 2.1))
+                most_s = START_S[name]
+                bars.append(Bar(f'start_mission, Tower {name}', f'at most {most_s:g} s', start, 's', start < most_s))
                 figures[name] = {
                     call: {'calls': len(all_), 'median_ms': statistics.median(all_) * 1e3, 'p99_ms': percentile(all_, 99) * 1e3}
                     for call, all_ in took.items()

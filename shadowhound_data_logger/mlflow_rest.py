@@ -1,4 +1,4 @@
-"""The few requests to an MLflow server that the doctor and policies need, by hand: MLflow's own client takes seconds to import.
+"""The few requests to an MLflow server that are made by hand, because MLflow's own client takes seconds to import.
 
 https://mlflow.org/docs/latest/api_reference/rest-api.html
 """
@@ -21,6 +21,8 @@ from shadowhound_data_logger.errors import TrackingError, TrackingRefused, Track
 from shadowhound_data_logger.untrusted import from_json
 
 LOGIN: Final = ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD')
+BUNDLES: Final = ('MLFLOW_TRACKING_SERVER_CERT_PATH', 'REQUESTS_CA_BUNDLE', 'CURL_CA_BUNDLE')
+"""Variables that name the authorities to trust, the first that is set."""
 TEXT: Final = 300
 """Letters of an answer that are shown."""
 ANSWER_S: Final = 4.0
@@ -52,8 +54,11 @@ class MlflowRest:
         self._authorization = _authorization(self.user, password, environ.get('MLFLOW_TRACKING_TOKEN', ''))
         self._trust: ssl.SSLContext | None = None
         if url.startswith('https:'):
-            bundle = environ.get('MLFLOW_TRACKING_SERVER_CERT_PATH') or environ.get('REQUESTS_CA_BUNDLE') or None
-            self._trust = ssl.create_default_context(cafile=bundle)
+            bundle = next(filter(None, map(environ.get, BUNDLES)), None)
+            is_folder = bundle is not None and Path(bundle).is_dir()
+            self._trust = ssl.create_default_context(cafile=None if is_folder else bundle, capath=bundle if is_folder else None)
+            if client := environ.get('MLFLOW_TRACKING_CLIENT_CERT_PATH'):
+                self._trust.load_cert_chain(client)
             if environ.get('MLFLOW_TRACKING_INSECURE_TLS', '').lower() == 'true':
                 self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
         self._opener = build_opener(_NoRedirects, HTTPSHandler(context=self._trust))

@@ -23,10 +23,10 @@ from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared
 from shadowhound_data_logger.missions.batch import send
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
-from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, run_name, stamped, write_json
+from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
 from shadowhound_data_logger.missions.objects import Spooler
-from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, summary_of
+from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, run_request, summary_of
 from shadowhound_data_logger.missions.tracking import Tracking
 from shadowhound_data_logger.missions.values import MAX_TAG
 
@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 ARTIFACTS_A_STEP: Final = 4
 OBJECTS_A_STEP: Final = 64
 BYTES_A_STEP: Final = 8 << 20
+AGENT_S: Final = 30.0
+"""How long the agent may take to create the run: its requests have deadlines, but a server may send an answer byte by byte."""
 NODE_S: Final = 30.0
 """How long the end of a mission waits for a node that does not let go of its journal: it takes a second, unless it hangs."""
 
@@ -60,6 +62,7 @@ class Delivery:
         self._pictures = pictures
         self._monotonic = monotonic
         self._asked_s: float | None = None
+        self._made_by_s = monotonic() + AGENT_S
 
     @property
     def sent(self) -> MissionSent:
@@ -71,6 +74,8 @@ class Delivery:
         self._recall()
         if self.sent.ended:
             return self._track_node()
+        if self._agent_makes_run():
+            return False
         batch = self._agent.points(self._is_node_over)
         if batch is None:
             return self._track_node() or self._end_abandoned()
@@ -181,6 +186,7 @@ class Delivery:
         """After a restart: tell the stories what was sent before."""
         self._node.recall()
         self._agent.recall()
+        self.run = self.run or self.folder.run()
 
     def _end_abandoned(self) -> bool:
         """Where the agent died in the middle, say so in its place; whether that was so."""
@@ -218,13 +224,17 @@ class Delivery:
 
     def _run_of(self) -> Run:
         if self.run is None:
-            start = self._story.start
-            tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
-            name = run_name(start['type'], int(start['t']))
-            run = self._tracking.run_of(self.folder.mission_id, name, int(start['t']) // 1_000_000, tags)
+            run = self._tracking.run_of(self.folder.mission_id, *run_request(self._story.start))
             self.folder.set_run(run)
             self.run = run
         return self.run
+
+    def _agent_makes_run(self) -> bool:
+        """Whether the agent is creating the run at this moment (new_run.py)."""
+        if self.run is not None or self._monotonic() > self._made_by_s or not journal.is_locked(self.folder.path):
+            self.run = self.run or self.folder.run()
+            return False
+        return True
 
     def _send(self, run: Run, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
         send(self._tracking, run.run_id, (points, params, tags), self._refuse)

@@ -23,6 +23,7 @@ from shadowhound_data_logger.errors import NameRefused, SettingError
 from shadowhound_data_logger.keys import check_name
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.new_run import RunRequests
 from shadowhound_data_logger.missions.overview import Report, has_arrived, report, sizes
 from shadowhound_data_logger.missions.recorder import Beginning, Mission
 from shadowhound_data_logger.missions.story import FAILED, KILLED
@@ -65,7 +66,8 @@ class MissionDataLogger:
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)
         every_s = _seconds('frame_artifact_every_s', frame_artifact_every_s)
-        self._beginning = Beginning(self.home, self.robot, every_s, SystemClock.of_this_machine())
+        self._runs = RunRequests(self._environ, experiment) if replay and RunRequests.can_ask(self._environ) else None
+        self._beginning = Beginning(self.home, self.robot, every_s, SystemClock.of_this_machine(), self._runs)
         self._lock = threading.RLock()
         self._mission: Mission | None = None
         self._ended: list[Mission] = []
@@ -76,6 +78,8 @@ class MissionDataLogger:
         self._worker = Worker('missions', self._step)
         self._closed = False
         _alive.add(self)
+        if self._runs:
+            self._runs.prepare()
         if self._replayer:
             self._replayer.start()
         self._worker.start()
@@ -88,10 +92,10 @@ class MissionDataLogger:
     def start_mission(self, mission_type: str, mission_command: str) -> str:
         """Begin a mission; a mission that is active ends as KILLED.
 
-        Returns the MLflow run id when it is made within ``start_timeout_s``, else the mission's own id: both find the mission
-        from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). The type keeps its
-        spelling (at most 128 characters) everywhere but in keys and names of files, where other characters than A-Z, a-z, 0-9,
-        ``_``, ``-`` and ``.`` are replaced.
+        Returns the MLflow run's id, or the mission's own id if no server answers or ``start_timeout_s`` is over: both find the
+        mission from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). The type keeps
+        its spelling (at most 128 characters) everywhere but in keys and names of files, where other characters than A-Z, a-z,
+        0-9, ``_``, ``-`` and ``.`` are replaced.
         """
         mission = self._start(mission_type, mission_command)
         return mission.run_id or mission.id
@@ -182,8 +186,17 @@ class MissionDataLogger:
         mission = self._begin(mission_type, mission_command)
         if self._replayer and mission.is_active:
             self._replayer.wake()
-            _until(lambda: mission.run_id is not None, self._start_timeout_s)
+            self._await_run(mission)
         return mission
+
+    def _await_run(self, mission: Mission) -> None:
+        """For ``start_timeout_s``, or until no server answers."""
+        end, new = time.monotonic() + self._start_timeout_s, mission.new_run
+        if new is not None:
+            new.is_settled.wait(self._start_timeout_s)
+            if new.run is not None or new.is_hopeless:
+                return
+        _until(lambda: mission.run_id is not None, end - time.monotonic())
 
     def _begin(self, mission_type: str, mission_command: str) -> Mission:
         """Make it the active one; when the disk takes nothing, the mission goes on unlogged."""
@@ -240,6 +253,8 @@ class MissionDataLogger:
         for mission in (*self._ended, *((self._mission,) if self._mission else ())):
             mission.forget()
         self._mission, self._ended = None, []
+        if self._runs:
+            self._runs.forget()
         if self._replayer:
             self._replayer.forget()
             self._replayer = None

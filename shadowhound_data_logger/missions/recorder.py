@@ -23,6 +23,7 @@ from shadowhound_data_logger.missions import copies, values
 from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, stamped
 from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.missions.new_run import NewRun, RunRequests
 from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
 from shadowhound_data_logger.policies.folder import PolicyFolder
 
@@ -41,8 +42,10 @@ class Mission:
     """
 
     def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock,
-                 policy: str | None = None) -> None:  # fmt: skip
+                 policy: str | None = None, new_run: NewRun | None = None) -> None:  # fmt: skip
         self.folder = folder
+        self.new_run = new_run
+        """The run that this process asks MLflow for; None where it leaves that to the sender."""
         self._clock = clock
         self._policies = PolicyFolder(folder.path.parents[1])
         self._policy = policy
@@ -71,7 +74,7 @@ class Mission:
     @property
     def run_id(self) -> str | None:
         """The MLflow run's id; None until it is made."""
-        run = self.folder.run()
+        run = (self.new_run and self.new_run.run) or self.folder.run()
         return run.run_id if run else None
 
     @property
@@ -274,6 +277,8 @@ class Beginning:
     robot: str
     frame_artifact_every_s: float
     clock: Clock
+    runs: RunRequests | None = None
+    """What creates runs in this process."""
 
     def mission(self, mission_type: str, mission_command: str) -> Mission | None:
         """A new one; None when the disk does not take it, which is said."""
@@ -284,13 +289,20 @@ class Beginning:
             start['policy'] = policy
         if time_ns < EARLIEST_SANE_NS:  # of which boot the clock is that this time is of
             start['boot_id'] = self.clock.boot_id
+        new_run = None
         try:
             folder = new_folder(self.home, given, time_ns)
+            if self.runs is not None and time_ns >= EARLIEST_SANE_NS:
+                new_run = NewRun(folder)  # before the sender sees the journal
             journal = _begun(folder, start)
         except OSError as error:
+            if new_run is not None:
+                new_run.settle()
             log.error('the mission %.80s is not logged: %s', given, error)  # noqa: TRY400 - no defect
             return None
-        return Mission(folder, journal, self.frame_artifact_every_s, self.clock, policy)
+        if self.runs is not None and new_run is not None:
+            self.runs.create(new_run, start)
+        return Mission(folder, journal, self.frame_artifact_every_s, self.clock, policy, new_run)
 
     def nothing(self, mission_type: str) -> Mission:
         """A mission that is over: all its calls do nothing. For a disk that takes no journal."""

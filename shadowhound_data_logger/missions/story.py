@@ -193,6 +193,12 @@ class Story:
         return Point(key, value, max(time_ms, last_ms + 1), MAX_STEP)
 
 
+def run_request(start: Mapping[str, Any]) -> tuple[str, int, dict[str, str]]:
+    """Name, start (ms) and tags of the run of a mission that started so."""
+    tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
+    return run_name(start['type'], int(start['t'])), int(start['t']) // MS, tags
+
+
 def named(policies: Iterable[str | None]) -> str:
     """``go2_patrol@7#..., go2_patrol@6#...``, where none was active ``none``; empty where none ever was."""
     names = [*policies]

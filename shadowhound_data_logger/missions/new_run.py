@@ -1,0 +1,181 @@
+"""Creates the run of a new mission in the agent's own process, by one request, before its sender has loaded MLflow.
+
+This is a shortcut: whatever fails here is left to the sender, which looks for a run with the mission's id before it creates one,
+and reports errors. While a request is under way the mission's folder is locked (flock), and the sender leaves it alone; the lock
+ends with the process. Stores without a server (``sqlite:``, ``file:``) and logins of MLflow's client alone have no shortcut.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+from shadowhound_data_logger.durable_files import lock
+from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.missions.folder import MissionFolder, Run
+from shadowhound_data_logger.missions.story import run_request
+from shadowhound_data_logger.missions.tracking import MISSION_TAG
+from shadowhound_data_logger.mlflow_rest import LOGIN, MlflowRest
+
+log = logging.getLogger(__name__)
+
+OTHER_LOGINS: Final = ('MLFLOW_TRACKING_AUTH', 'MLFLOW_TRACKING_AWS_SIGV4')
+"""Variables of MLflow's client that its own code has to carry out."""
+
+
+class NewRun:
+    """The run of one mission while it is being created.
+
+    Lifecycle: New, before the mission's journal is there; ``settle`` once, from any thread. The folder is locked in between.
+    """
+
+    def __init__(self, folder: MissionFolder) -> None:
+        """Raises OSError."""
+        self.folder = folder
+        self.run: Run | None = None
+        self.is_hopeless = False
+        """Whether no server answered: nobody else will have a run soon."""
+        self.is_settled = threading.Event()
+        self._descriptor = os.open(folder.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        lock(self._descriptor, wait=False)
+
+    def settle(self, run: Run | None = None, *, is_hopeless: bool = False) -> None:
+        """Note the run, if there is one, and unlock the folder."""
+        self.run, self.is_hopeless = run, is_hopeless
+        self.is_settled.set()  # the agent does not wait for the disk: a run that was not noted is found by the mission's id
+        try:
+            if run is not None:
+                self.folder.set_run(run)
+        except OSError as error:
+            log.warning('the run of mission %s cannot be noted: %s', self.folder.mission_id, error)
+        finally:
+            descriptor, self._descriptor = self._descriptor, -1
+            if descriptor >= 0:
+                with suppress(OSError):
+                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # for the copies that forked processes have as well
+                os.close(descriptor)
+
+    def forget(self) -> None:
+        """In a forked child: the parent alone creates it."""
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+
+class RunRequests:
+    """Asks one MLflow server for runs.
+
+    Lifecycle: New; ``prepare`` once; ``create`` any number of times. Each request has a thread of its own, which ends with it.
+    ``_lock`` guards the connection's settings and the experiment's id.
+    """
+
+    def __init__(self, environ: Mapping[str, str], experiment: str) -> None:
+        self._environ = environ
+        self._experiment = experiment
+        self._lock = threading.Lock()
+        self._rest: MlflowRest | None = None
+        self._experiment_id = ''
+        self._open: set[NewRun] = set()
+
+    @staticmethod
+    def can_ask(environ: Mapping[str, str]) -> bool:
+        """Whether the environment names a server that takes plain requests."""
+        is_server = environ.get('MLFLOW_TRACKING_URI', '').startswith(('http://', 'https://'))
+        return is_server and not any(environ.get(name, '').lower() not in {'', 'false'} for name in OTHER_LOGINS)
+
+    def prepare(self) -> None:
+        """Look for the experiment now; returns immediately."""
+        self._begin(self._prepare)
+
+    def create(self, new: NewRun, start: Mapping[str, Any]) -> None:
+        """Create the run of a mission that started so; returns immediately."""
+        self._open.add(new)
+        if not self._begin(self._create, new, start):
+            self._settle(new)
+
+    def forget(self) -> None:
+        """In a forked child."""
+        for new in tuple(self._open):
+            new.forget()
+
+    # -- within ----------------------------------------------------------------------------------------------------
+
+    def _begin(self, work: Any, *arguments: object) -> bool:
+        try:
+            threading.Thread(target=work, args=arguments, name='mission-run', daemon=True).start()
+        except RuntimeError as error:  # no more threads
+            log.warning('MLflow is not asked for a run by this process: %s', error)
+            return False
+        return True
+
+    def _prepare(self) -> None:
+        with suppress(TrackingRefused, TrackingUnavailable, OSError, ValueError), self._lock:
+            self._find(self._connected())
+
+    def _create(self, new: NewRun, start: Mapping[str, Any]) -> None:
+        try:
+            self._settle(new, self._created(new.folder.mission_id, start))
+        except TrackingUnavailable as error:
+            log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
+            self._settle(new, is_hopeless=True)
+        except Exception as error:  # noqa: BLE001 - of any kind: the sender tries again, and reports it
+            log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
+            with self._lock:
+                self._rest, self._experiment_id = None, ''  # another password, another experiment
+            self._settle(new)
+
+    def _settle(self, new: NewRun, run: Run | None = None, *, is_hopeless: bool = False) -> None:
+        new.settle(run, is_hopeless=is_hopeless)
+        self._open.discard(new)
+
+    def _created(self, mission_id: str, start: Mapping[str, Any]) -> Run | None:
+        with self._lock:
+            rest = self._connected()
+            experiment_id = self._experiment_id or self._find(rest) or self._new(rest)
+        name, start_ms, tags = run_request(start)
+        made = rest.json('POST', 'runs/create', {
+            'experiment_id': experiment_id, 'user_id': start['robot'], 'run_name': name, 'start_time': start_ms,
+            'tags': [{'key': key, 'value': value} for key, value in {**tags, MISSION_TAG: mission_id}.items()],
+        })['run']['info']  # fmt: skip
+        if not is_name(str(made['run_id'])):
+            raise ValueError(f'a run id that cannot be in a key: {made["run_id"]!r:.80}')
+        return Run(str(made['run_id']), experiment_id, str(made['artifact_uri']))
+
+    def _connected(self) -> MlflowRest:
+        if self._rest is None:
+            url, environ = _address(self._environ)
+            self._rest = MlflowRest(url, environ, Path(environ.get('HOME') or '/'))
+        return self._rest
+
+    def _find(self, rest: MlflowRest) -> str:
+        """The experiment's id; empty if it does not exist."""
+        found = rest.experiment(self._experiment)
+        if found is not None and found['lifecycle_stage'] != 'active':
+            raise ValueError(f'the experiment {self._experiment} is deleted')
+        self._experiment_id = str(found['experiment_id']) if found is not None else ''
+        return self._experiment_id
+
+    def _new(self, rest: MlflowRest) -> str:
+        try:
+            rest.create(self._experiment)
+        except TrackingRefused as error:
+            if error.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # of another process, just now
+                raise
+        return self._find(rest)
+
+
+def _address(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """The server's URL without user and password, and the environment with those that were in it, as MLflow's client has them."""
+    parts = urlsplit(environ['MLFLOW_TRACKING_URI'])
+    login, _, server = parts.netloc.rpartition('@')
+    user, _, password = login.partition(':')
+    given = dict(zip(LOGIN, (unquote(user), unquote(password)), strict=True)) if user else {}
+    return urlunsplit((parts.scheme, server, parts.path.rstrip('/'), '', '')), {**environ, **given}
