@@ -28,6 +28,8 @@ class Sample(NamedTuple):
     cdr: bytes
     received_ns: int = 0
     """When it arrived, as of ``Taken``."""
+    publisher: str | None = None
+    """Who sent it, as of ``Taken``."""
 
 
 class Taken(NamedTuple):

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from shadowhound_data_logger.capture.rejections import ENCODER_FAILED, RejectionLog
 from shadowhound_data_logger.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -29,8 +30,6 @@ THREADS: Final = min(max(2, len(os.sched_getaffinity(0)) // 2), 4)
 """Encoder threads: half the cores that this process may use, at least two, at most four."""
 MAX_MESSAGES: Final = 50_000
 """Messages that wait for an encoder at most, however small they are."""
-ENCODER_FAILED: Final = 'encoder_failed'
-"""Why samples are rejected whose encoder has a fault."""
 PATIENCE_S: Final = 60.0
 """A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
 Marking = Callable[[DataObject], DataObject]
@@ -162,11 +161,12 @@ class EncodePool:
 
     def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
                  writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *,
-                 preview: Preview = lambda _: None, threads: int = THREADS) -> None:  # fmt: skip
+                 preview: Preview = lambda _: None, reports: RejectionLog | None = None,
+                 threads: int = THREADS) -> None:  # fmt: skip
         """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
 
         ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
-        ``preview`` may make a small one of an object, which goes the same way before it.
+        ``preview`` may make a small one of an object, which goes the same way before it. ``reports`` says what was rejected.
         """
         self._queue = queue
         self._sensors = sensors
@@ -177,7 +177,7 @@ class EncodePool:
         self._marks = marks
         self._observe = observe
         self._preview = preview
-        self._told: set[tuple[str, str]] = set()
+        self._reports = RejectionLog() if reports is None else reports
         self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
 
     def open(self) -> None:
@@ -194,6 +194,7 @@ class EncodePool:
         return all(done)
 
     def _step(self) -> None:
+        self._reports.look()
         batch = self._queue.get(WAIT_S)
         if batch is not None:
             try:
@@ -213,13 +214,15 @@ class EncodePool:
             raise
         if encoding.rejected:
             self._accounts.reject(batch.topic, encoding.rejected, first_ns, last_ns)
-            self._tell(batch.topic, encoding.details)
+            self._reports.add(batch.topic, batch.sensor, encoding.rejections)
         if encoding.object is not None:
             try:
                 self._spool(encoding.object)
             except BaseException:
                 self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples}, first_ns, last_ns)
                 raise
+            if encoding.corrected:
+                self._accounts.correct(batch.topic, encoding.corrected)
         self._observe(batch, encoding.object)
 
     def _spool(self, item: DataObject) -> None:
@@ -227,10 +230,3 @@ class EncodePool:
             item = mark(item)
         preview = self._preview(item)
         self._writer.put(*([preview] if preview is not None else []), item)
-
-    def _tell(self, topic: str, details: Mapping[str, str]) -> None:
-        """Say once for each topic and reason what is wrong; the ledger counts the rest."""
-        for reason, text in details.items():
-            if (topic, reason) not in self._told:
-                self._told.add((topic, reason))
-                log.warning('%s: a message cannot be stored: %s; further ones are only counted', topic, text)

@@ -11,12 +11,11 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
-import numpy as np
-
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import MissionSettings, SensorSettings
 from shadowhound_data_logger.encode.image import encode_jpeg
 from shadowhound_data_logger.encode.payload import Job
+from shadowhound_data_logger.encode.pointcloud import xyz_of
 from shadowhound_data_logger.encode.records import ODOMETRY
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
@@ -29,8 +28,6 @@ from shadowhound_data_logger.options import POINT_CLOUD
 log = logging.getLogger(__name__)
 
 JPEG: Final = 'image/jpeg'
-FLOAT32: Final = 7
-"""sensor_msgs/msg/PointField."""
 
 
 class MissionObserver:
@@ -101,20 +98,10 @@ class MissionObserver:
         return Pose(sample.stamp_ns, at.x, at.y, yaw_of(turn), at.z, message.header.frame_id)
 
     def _cloud(self, sample: Sample) -> Cloud | None:
-        """None for a cloud without x, y and z as float32, or with gaps between its rows."""
+        """None for a cloud without x, y and z as float32."""
         message = self._types.deserialize(POINT_CLOUD, sample.cdr)
-        offsets = {field.name: field.offset for field in message.fields if field.datatype == FLOAT32}
-        size, data = message.point_step, message.data
-        if not {'x', 'y', 'z'} <= offsets.keys() or not size or data.size != message.width * message.height * size:
-            return None
-        at = [offsets[name] for name in 'xyz']
-        if max(at) + 4 > size:
-            return None
-        kind = '>f4' if message.is_bigendian else '<f4'
-        layout = np.dtype({'names': ['x', 'y', 'z'], 'formats': [kind] * 3, 'offsets': at, 'itemsize': size})
-        points = np.frombuffer(data, layout)
-        xyz = np.stack([points[name] for name in 'xyz'], axis=1).astype(np.float32)
-        return Cloud(sample.stamp_ns, message.header.frame_id, xyz)
+        xyz = xyz_of(message)
+        return None if xyz is None else Cloud(sample.stamp_ns, message.header.frame_id, xyz)
 
     def _readings(self, type_name: str, sample: Sample, fields: Mapping[str, list[str]]) -> Iterator[Reading]:
         message = self._types.deserialize(type_name, sample.cdr)

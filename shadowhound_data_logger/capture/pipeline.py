@@ -38,6 +38,7 @@ from shadowhound_data_logger.capture.mission import MissionWatch
 from shadowhound_data_logger.capture.mission_observer import MissionObserver
 from shadowhound_data_logger.capture.parameters import Parameters, live
 from shadowhound_data_logger.capture.pose_track import RobotTrack
+from shadowhound_data_logger.capture.rejections import RejectionLog
 from shadowhound_data_logger.capture.sampling import Sampler
 from shadowhound_data_logger.capture.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.capture.unheard import Unheard
@@ -51,7 +52,7 @@ from shadowhound_data_logger.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.keys import dated
 from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.options import ON_REQUEST
-from shadowhound_data_logger.ros.reader import endpoints
+from shadowhound_data_logger.ros.reader import endpoints, node_of
 from shadowhound_data_logger.ship.requests import RequestServer
 from shadowhound_data_logger.ship.thinning import Thinner
 from shadowhound_data_logger.ship.uploader import Uploader
@@ -161,7 +162,7 @@ class Pipeline:
         keeping = Keeping(settings.keep, sensors, settings.robot)
         marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
-                               preview=keeping.preview)  # fmt: skip
+                               preview=keeping.preview, reports=RejectionLog(partial(node_of, node)))  # fmt: skip
         self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,

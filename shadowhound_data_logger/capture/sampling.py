@@ -197,12 +197,12 @@ class Sampler(Consumer):
         kept: list[Sample] = []
         if not (drained.paused or self.idle):
             keep, has_header, date = sampled.rule.keep, sampled.has_header, self._stamps.date
-            for cdr, source_ns, _, _, received_ns in drained.messages:
+            for cdr, source_ns, publisher, _, received_ns in drained.messages:
                 stamp_ns, refused = date(header_stamp_ns(cdr) if has_header else 0, source_ns, received_ns)
                 if refused:
                     account.by_arrival[refused] += 1
                 if keep(stamp_ns, cdr):
-                    kept.append(Sample(stamp_ns, cdr, received_ns))
+                    kept.append(Sample(stamp_ns, cdr, received_ns, publisher))
         return kept
 
     def take(self, drained: Drained) -> None:

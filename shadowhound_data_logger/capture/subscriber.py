@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple
 
 import rclpy
@@ -18,13 +20,15 @@ from rclpy.context import Context
 from rclpy.node import Node
 
 from shadowhound_data_logger.capture.consumers import Consumer
+from shadowhound_data_logger.capture.rejections import RejectionLog
 from shadowhound_data_logger.capture.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.encode.payload import Rejection
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
-from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, unavailable
-from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, Accounts
+from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, node_of, unavailable
+from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE, Accounts
 from shadowhound_data_logger.stamps import StampRule
 
 log = logging.getLogger(__name__)
@@ -42,6 +46,7 @@ MAX_OTHERS: Final = 4
 OTHER_DEPTH: Final = 10
 """Messages of such a type that are held between two drains: whoever sends more costs no more memory, and is not all counted."""
 OTHER_NODE: Final = '_shadowhound_other_types'
+OTHER_REMEDY: Final = 'stop that publisher, rename its topic, or name the type to log in the types of the sensor'
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +81,7 @@ class OtherTypes:
         self._node: Node | None = None
         self._refused = False
         self._readers: dict[str, Reader] = {}
+        self._reports = RejectionLog(partial(node_of, beside))
 
     def follow(self, topic: str, types: Sequence[str]) -> str:
         """The one of these types, all published there now, that is listened to from now on; empty for none of them."""
@@ -94,6 +100,7 @@ class OtherTypes:
         """Take all that waits, and count it."""
         for topic, reader in self._readers.items():
             self._count(topic, reader)
+        self._reports.look()
 
     def close(self) -> None:
         """Idempotent."""
@@ -112,6 +119,10 @@ class OtherTypes:
         refused = reader.drain()
         if refused:
             self._accounts.refuse(topic, reader.plan.type, len(refused), refused[0].received_ns, refused[-1].received_ns)
+            by = Counter(message.publisher or '' for message in refused)
+            text = f'{WRONG_TYPE}: it is a {reader.plan.type}'
+            self._reports.add(topic, '', [Rejection(WRONG_TYPE, gid, text, count, OTHER_REMEDY) for gid, count in by.items()],
+                              is_known=True)  # fmt: skip
 
     def _make(self, topic: str, type_name: str) -> Reader | None:
         """None where that cannot be done; whether it can be done at all is tried once."""

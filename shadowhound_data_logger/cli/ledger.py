@@ -188,6 +188,8 @@ def notes(found: Mapping[str, Any]) -> list[str]:
                 mark = '~' if part['missed'] is None else ''
                 lines.append(f'{topic}: missed by {_listed(part["missed_by"], mark)}{f" ({grade})" * (len(row["by_grade"]) > 1)}')
         lines += [f'{topic}: {name} by {_listed(row[name])}' for name in ('rejected', 'dropped') if row[name]]
+        if row.get('corrected'):
+            lines.append(f'{topic}: of the stored messages, corrected: {_listed(row["corrected"])}')
         if row.get('by_arrival'):
             lines.append(f'{topic}: dated by arrival, not by the message: {_listed(row["by_arrival"])}')
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}

@@ -63,8 +63,9 @@ def archive(pack: Callable[[Iterable[ArchiveFile]], bytes], ext: str, content_ty
         for sample in job.batch.samples:
             try:
                 files.append(encode(job, sample))
+                rejections.add_corrected(files[-1])
             except Rejected as error:
-                rejections.add(error)
+                rejections.add(error, sample)
         if not files:
             return None
         kept = tuple(sample for file in files for sample in file.kept)

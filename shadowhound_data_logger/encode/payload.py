@@ -38,19 +38,43 @@ class Payload:
     or in an archive the JSON beside the file."""
     statistics: bytes = b''
     """Of the numbers in it, as ``statistics.packed``; empty where nobody looked."""
+    corrected: str = ''
+    """What was wrong with the message, by a short word, if it was stored all the same because it has only one reading."""
+
+
+@dataclass(slots=True)
+class Rejection:
+    """Messages of one publisher that were rejected for one reason."""
+
+    reason: str
+    publisher: str
+    """Its gid, '' if that is unknown."""
+    text: str
+    """What was wrong with the first one, a sentence."""
+    count: int = 0
+    remedy: str = ''
+    """What to do about it, if that is not what helps against the reason in general."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejections:
-    """The samples of a batch that are not in its object."""
+    """The samples of a batch that are not in its object, and those that are there corrected."""
 
-    counts: Counter[str] = field(default_factory=Counter)
-    details: dict[str, str] = field(default_factory=dict)
-    """Reason -> what was wrong with the first one, a sentence."""
+    found: dict[tuple[str, str], Rejection] = field(default_factory=dict)
+    """By reason and publisher."""
+    corrected: Counter[str] = field(default_factory=Counter)
+    """Of the samples in the object, those that had to be corrected, by what was wrong with them."""
 
-    def add(self, error: Rejected, samples: int = 1) -> None:
-        self.counts[error.reason] += samples
-        self.details.setdefault(error.reason, str(error))
+    def add(self, error: Rejected, *samples: Sample) -> None:
+        for sample in samples:
+            publisher = sample.publisher or ''
+            known = self.found.setdefault((error.reason, publisher), Rejection(error.reason, publisher, str(error)))
+            known.count += 1
+
+    def add_corrected(self, payload: Payload) -> None:
+        """Count what was wrong with a message that is stored all the same."""
+        if payload.corrected:
+            self.corrected[payload.corrected] += 1
 
 
 Encoder = Callable[[Job, Rejections], 'Payload | None']
@@ -69,12 +93,13 @@ def one_message(encode: OneMessage) -> Encoder:
         payload = None
         for sample in job.batch.samples:
             if payload is not None:
-                rejections.add(Rejected('surplus', f'{job.sensor.format} holds one message'))
+                rejections.add(Rejected('surplus', f'{job.sensor.format} holds one message'), sample)
                 continue
             try:
                 payload = encode(job, sample)
+                rejections.add_corrected(payload)
             except Rejected as error:
-                rejections.add(error)
+                rejections.add(error, sample)
         return payload
 
     return encoder
@@ -85,3 +110,8 @@ def encode_cdr(job: Job, sample: Sample) -> Payload:  # noqa: ARG001 - as every 
     if len(sample.cdr) < ENCAPSULATION_BYTES:
         raise Rejected('malformed', f'{len(sample.cdr)} bytes are not CDR')
     return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream')
+
+
+def verbatim(sample: Sample, why: str, facts: Mapping[str, Fact], corrected: str = '') -> Payload:
+    """The bytes of a message that its format cannot hold: not converted, and not lost. ``why`` is a short word."""
+    return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream', {**facts, 'verbatim': why}, corrected=corrected)

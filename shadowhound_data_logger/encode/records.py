@@ -79,7 +79,7 @@ def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejecti
         try:
             message = job.types.deserialize(job.batch.type, sample.cdr)
         except Rejected as error:
-            rejections.add(error)
+            rejections.add(error, sample)
             continue
         kept.append(sample)
         yield record(job, sample, message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -10,7 +11,16 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.archive import archive, pack_tar, pack_zip
 from shadowhound_data_logger.encode.image import encode_jpeg, encode_png
-from shadowhound_data_logger.encode.payload import Encoder, Fact, Job, Payload, Rejections, encode_cdr, one_message
+from shadowhound_data_logger.encode.payload import (
+    Encoder,
+    Fact,
+    Job,
+    Payload,
+    Rejection,
+    Rejections,
+    encode_cdr,
+    one_message,
+)
 from shadowhound_data_logger.encode.pointcloud import encode_cloud
 from shadowhound_data_logger.encode.records import encode_records
 from shadowhound_data_logger.encode.types import MessageTypes
@@ -32,21 +42,40 @@ ENCODERS: Final[Mapping[str, Encoder]] = {
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """What became of a batch: ``object.samples`` plus the sum of ``rejected`` is its number of samples."""
+    """What became of a batch: ``object.samples`` plus the sum of ``rejected`` is its number of samples.
+
+    Those that were corrected are among ``object.samples``.
+    """
 
     object: DataObject | None
     """None when no sample could be encoded."""
-    rejected: Mapping[str, int]
-    """Reason -> number of samples that are not in the object."""
-    details: Mapping[str, str] = field(default_factory=dict)
-    """Reason -> what was wrong with the first of them."""
+    rejections: tuple[Rejection, ...] = ()
+    """The samples that are not in it, by reason and publisher."""
+    corrected: Mapping[str, int] = field(default_factory=dict)
+    """Reason -> number of samples that are in the object although something was wrong with them."""
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Reason -> number of samples that are not in the object."""
+        counts = Counter[str]()
+        for each in self.rejections:
+            counts[each.reason] += each.count
+        return dict(counts)
+
+    @property
+    def details(self) -> dict[str, str]:
+        """Reason -> what was wrong with the first of them."""
+        found: dict[str, str] = {}
+        for each in self.rejections:
+            found.setdefault(each.reason, each.text)
+        return found
 
 
 def encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes) -> Encoding:
     """Encode a batch in the sensor's format. Thread-safe; a sample that cannot be encoded is counted, the rest goes on."""
     rejections = Rejections()
     made = _encode(batch, sensor, robot, types, rejections)
-    return Encoding(made, dict(rejections.counts), rejections.details)
+    return Encoding(made, tuple(rejections.found.values()), dict(rejections.corrected) if made else {})
 
 
 def _encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes, rejections: Rejections) -> DataObject | None:
@@ -57,7 +86,7 @@ def _encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageType
     try:
         key = dated(pattern, payload.kept[0].stamp_ns)
     except NameRefused as error:
-        rejections.add(Rejected('unsafe_key', str(error)), len(payload.kept))
+        rejections.add(Rejected('unsafe_key', str(error)), *payload.kept)
         return None
     return _object(batch, sensor, robot, payload, key, pattern)
 

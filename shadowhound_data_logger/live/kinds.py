@@ -20,6 +20,7 @@ import orjson
 import simplejpeg
 
 from shadowhound_data_logger.encode.image import JPEG_MAGIC
+from shadowhound_data_logger.encode.pointcloud import xyz_of
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
@@ -43,8 +44,6 @@ _COLORSPACES: Final = {'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': '
 _AXES: Final = ('x', 'y', 'z')
 MOST_NAMES, MOST_NAME = 64, 64
 """Figures in a row, and letters in the name of one."""
-_MOST_STEP: Final = 1 << 16
-"""Bytes of a point."""
 _FAR: Final = 1e7
 """Metres: no point of a robot's lidar is further from where its frame begins."""
 _GO2_IMU_NAMES: Final = [*(f'{name}.{axis}' for name in ('rpy', 'gyro', 'accel') for axis in _AXES), 'temperature']
@@ -62,8 +61,6 @@ _LITTLE: Final = 1
 _FRAME_ID: Final = 12
 """Where it is in the CDR of a message that begins with a header."""
 _LENGTH: Final = struct.Struct('<I')
-_FLOAT32: Final = 7
-"""sensor_msgs/msg/PointField.FLOAT32."""
 
 
 @dataclass(frozen=True)
@@ -341,16 +338,10 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str]:
 def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
     """A cloud's finite points in each size that is asked for: x, y, z as uint16, metres are ``low + value * step``."""
     cloud = types.deserialize(POINT_CLOUD, memoryview(cdr))
-    offsets = {field.name: field.offset for field in cloud.fields if field.name in _AXES and field.datatype == _FLOAT32}
-    count, step = cloud.width * cloud.height, cloud.point_step
-    if len(offsets) != len(_AXES) or not max(offsets.values()) + 4 <= step <= _MOST_STEP or cloud.data.size < count * step:
-        raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with fewer bytes than it says')
-    layout = np.dtype({'names': list(_AXES), 'formats': [('>' if cloud.is_bigendian else '<') + 'f4'] * 3,
-                       'offsets': [offsets[axis] for axis in _AXES], 'itemsize': step})  # fmt: skip
-    every = max(1, -(-count // MOST_POINTS))
-    points = np.frombuffer(cloud.data, layout, count)[::every]
-    columns = np.array([points[axis] for axis in _AXES], '<f4')
-    yield from points_items(topic, at_ms, columns.T, cloud.header.frame_id, sizes)
+    xyz = xyz_of(cloud, max(1, -(-cloud.width * cloud.height // MOST_POINTS)))
+    if xyz is None:
+        raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with another number of bytes than it says')
+    yield from points_items(topic, at_ms, xyz, cloud.header.frame_id, sizes)
 
 
 def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, sizes: Sequence[int]) -> Iterator[LiveItem]:

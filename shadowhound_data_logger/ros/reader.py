@@ -168,6 +168,12 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
     ]
 
 
+def node_of(node: Node, topic: str, publisher: str) -> str:
+    """The full name of the node of a publisher of a resolved topic; '' if it is unknown, as that of a program without ROS is."""
+    gid = publisher.partition('.')[0]  # what follows it counts the successors of a publisher
+    return next((each.node for each in endpoints(node, topic) if each.gid == gid), '')
+
+
 class Reader:
     """A live subscription. Created, drained and closed by one thread alone: a take after a destroy raises."""
 

@@ -8,6 +8,9 @@ from typing import Any
 
 from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
 
+BY_ARRIVAL, CORRECTED = 'by_arrival', 'corrected'
+"""Kinds of remarks about messages, in the index and in the ledger."""
+
 
 @dataclass(frozen=True, slots=True)
 class PublisherRow:
@@ -63,6 +66,8 @@ class TopicRow:
     """No message up to this stamp can still be lost on its way into the spool."""
     by_arrival: Mapping[str, int] = field(default_factory=dict)
     """Messages that were dated by their arrival, by the reason why their own time was not trusted."""
+    corrected: Mapping[str, int] = field(default_factory=dict)
+    """Stored messages that had to be corrected, by what was wrong with them."""
 
     @property
     def open(self) -> int:
@@ -98,6 +103,8 @@ class Totals:
     gaps: int = 0
     """How often messages were lost in a row, for whatever cause."""
     by_arrival: Mapping[str, int] = field(default_factory=dict)
+    """As of ``TopicRow``."""
+    corrected: Mapping[str, int] = field(default_factory=dict)
     """As of ``TopicRow``."""
 
 

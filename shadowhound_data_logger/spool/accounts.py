@@ -82,6 +82,8 @@ class TopicAccount:
     dropped: Counter[str] = field(default_factory=Counter)
     by_arrival: Counter[str] = field(default_factory=Counter)
     """Messages whose stamp or time of sending was replaced by their arrival, by reason (``stamps``)."""
+    corrected: Counter[str] = field(default_factory=Counter)
+    """Messages in objects that had to be corrected, by what was wrong with them (``encode/payload``)."""
     publishers: dict[str, Span] = field(default_factory=dict)
     estimated: int = 0
     """Of ``received``, those without numbers that a rhythm counts."""
@@ -373,6 +375,11 @@ class Accounts:
                 if count and from_ns:
                     account.gaps.add(REJECTED, reason, count, from_ns, to_ns)
 
+    def correct(self, topic: str, reasons: Mapping[str, int]) -> None:
+        """Messages are in an object that goes to the spool, but were corrected on the way: reason -> number."""
+        with self.entry(topic) as account:
+            account.corrected.update(reasons)
+
     def see_other(self, topic: str, type_name: str, nodes: Iterable[str], *, counted: bool, named: bool,
                   only_known: bool = False) -> None:  # fmt: skip
         """As of the topic's account; with ``only_known`` where there is one already."""
@@ -605,7 +612,7 @@ class Accounts:
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
             account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, heard_ns,
-            account.complete_ns, dict(account.by_arrival),
+            account.complete_ns, dict(account.by_arrival), dict(account.corrected),
         )  # fmt: skip
 
 
@@ -620,5 +627,5 @@ def _totals(account: TopicAccount) -> Totals:
         account.dropped.total() - paused, paused, account.missed, account.about_missed, account.open,
         account.rejected[WRONG_TYPE],
         {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
-        dict(missed_by), account.gaps.count, dict(account.by_arrival),
+        dict(missed_by), account.gaps.count, dict(account.by_arrival), dict(account.corrected),
     )  # fmt: skip

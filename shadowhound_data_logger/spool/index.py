@@ -40,7 +40,15 @@ from shadowhound_data_logger.model import (
     State,
     waits_for,
 )
-from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
+from shadowhound_data_logger.spool.account_rows import (
+    BY_ARRIVAL,
+    CORRECTED,
+    AccountSnapshot,
+    OtherTypeRow,
+    PublisherRow,
+    RhythmRow,
+    TopicRow,
+)
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.request_table import RequestTable
 from shadowhound_data_logger.spool.schema import (
@@ -809,9 +817,10 @@ class Index:
             ((session, row.topic, row.type, json.dumps(row.publishers), row.messages) for row in snapshot.other_types),
         )  # fmt: skip
         self._db.executemany(
-            'INSERT OR REPLACE INTO by_arrival VALUES (?,?,?,?)',
-            ((session, row.topic, reason, count) for row in snapshot.topics for reason, count in row.by_arrival.items()),
-        )
+            'INSERT OR REPLACE INTO remarks VALUES (?,?,?,?,?)',
+            ((session, row.topic, kind, reason, count) for row in snapshot.topics
+             for kind, counts in ((BY_ARRIVAL, row.by_arrival), (CORRECTED, row.corrected)) for reason, count in counts.items()),
+        )  # fmt: skip
         self.gaps.write(session, snapshot.gaps, snapshot.taken_back)
 
     def sessions(self, *, ended: bool) -> list[int]:
@@ -849,12 +858,12 @@ class Index:
         rows = self._db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
 
-    def by_arrival(self) -> dict[str, dict[str, int]]:
-        """Topic -> reason -> messages that were dated by their arrival, over all sessions."""
-        found: dict[str, dict[str, int]] = {}
-        rows = self._db.execute('SELECT topic, reason, sum(messages) FROM by_arrival GROUP BY topic, reason')
-        for topic, reason, count in rows:
-            found.setdefault(topic, {})[reason] = count
+    def remarks(self) -> dict[tuple[str, str], dict[str, int]]:
+        """(topic, BY_ARRIVAL or CORRECTED) -> reason -> messages, over all sessions."""
+        found: dict[tuple[str, str], dict[str, int]] = {}
+        rows = self._db.execute('SELECT topic, kind, reason, sum(messages) FROM remarks GROUP BY topic, kind, reason')
+        for topic, kind, reason, count in rows:
+            found.setdefault((topic, kind), {})[reason] = count
         return found
 
     def rhythms(self) -> list[RhythmRow]:

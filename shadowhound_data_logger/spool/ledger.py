@@ -12,7 +12,7 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import act_record, clock_record
-from shadowhound_data_logger.spool.account_rows import OtherTypeRow
+from shadowhound_data_logger.spool.account_rows import BY_ARRIVAL, CORRECTED, OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
@@ -67,12 +67,12 @@ def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
     with index.snapshot():
         topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
-        journal, by_arrival = index.gaps.sums(), index.by_arrival()
+        journal, remarks = index.gaps.sums(), index.remarks()
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     for topic, row in accounts.items():
         row['gaps'] = _journaled(topic, journal)
-        row['by_arrival'] = by_arrival.get(topic, {})
+        row |= {kind: remarks.get((topic, kind), {}) for kind in (BY_ARRIVAL, CORRECTED)}
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip

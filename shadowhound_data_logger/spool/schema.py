@@ -93,12 +93,13 @@ CREATE TABLE other_types (
   PRIMARY KEY (session, topic, type)) WITHOUT ROWID;
 """
 """Types that a topic was published under and that were not logged; messages is NULL where nobody counted them all."""
-_BY_ARRIVAL: Final = """
-CREATE TABLE by_arrival (
-  session INTEGER NOT NULL, topic TEXT NOT NULL, reason TEXT NOT NULL, messages INTEGER NOT NULL,
-  PRIMARY KEY (session, topic, reason)) WITHOUT ROWID;
+_REMARKS: Final = """
+CREATE TABLE remarks (
+  session INTEGER NOT NULL, topic TEXT NOT NULL, kind TEXT NOT NULL, reason TEXT NOT NULL, messages INTEGER NOT NULL,
+  PRIMARY KEY (session, topic, kind, reason)) WITHOUT ROWID;
 """
-"""Messages that were dated by their arrival, because their own time was not trusted."""
+"""Messages that were accounted for like all others although something was wrong with them. Kinds: ``by_arrival``, dated by their
+arrival because their own time was not trusted; ``corrected``, stored by the only reading that their data allow."""
 _ESTIMATES: Final = """
 CREATE TABLE estimates (
   session INTEGER NOT NULL, topic TEXT NOT NULL, estimated INTEGER NOT NULL, unknown INTEGER NOT NULL, missed TEXT NOT NULL,
@@ -297,7 +298,7 @@ CREATE TABLE sessions (
 {_CATALOGUE}
 {_CONTENTS}
 {_OTHER_TYPES}
-{_BY_ARRIVAL}
+{_REMARKS}
 {_ESTIMATES}
 {_GAP_TABLE}
 {_COMPACT_OBJECTS}
@@ -352,7 +353,7 @@ _NUMBERS: Final = {
     'accounts': ('session', 'received', 'skipped', 'stored', 'last_kept_ns', 'first_ns', 'heard_ns', 'complete_ns'),
     'publishers': ('session', 'first', 'last', 'published', 'received', 'heard_ns'),
     'other_types': ('session', 'messages'),
-    'by_arrival': ('session', 'messages'),
+    'remarks': ('session', 'messages'),
     'estimates': ('session', 'estimated', 'unknown'),
     'rhythms': ('last',),
     'tally': ('objects', 'bytes', 'samples'),
@@ -381,7 +382,7 @@ _TEXTS: Final = {
     'accounts': ('topic', 'type', 'accounting', 'rejected', 'dropped'),
     'publishers': ('topic', 'publisher', 'missed'),
     'other_types': ('topic', 'type', 'publishers'),
-    'by_arrival': ('topic', 'reason'),
+    'remarks': ('topic', 'kind', 'reason'),
     'estimates': ('topic', 'missed'),
     'rhythms': ('topic', 'publisher', 'of'),
     'tally': ('topic', 'state'),

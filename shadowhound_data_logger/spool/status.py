@@ -32,7 +32,7 @@ _TOPIC: Final[dict[str, Any]] = {
     'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
-    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {},
+    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {}, 'corrected': {},
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},

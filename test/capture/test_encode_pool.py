@@ -13,6 +13,7 @@ import pytest
 from shadowhound_data_logger.capture import encode_pool as pool_module
 from shadowhound_data_logger.capture.encode_pool import BatchQueue, EncodePool
 from shadowhound_data_logger.config import QueueSettings, SensorSettings
+from shadowhound_data_logger.encode.registry import Encoding, encode
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.model import Batch, DataObject, Sample
 
@@ -28,6 +29,7 @@ class Outcome:
         self.queue = BatchQueue(QueueSettings())
         self.objects: list[DataObject] = []
         self.rejected: Counter[str] = Counter()
+        self.corrected: Counter[str] = Counter()
         self.lock = threading.Lock()
         self.accounts = self.spool = self
         sensors = {'talk': SensorSettings(name='talk', batch_s=1.0)}
@@ -48,6 +50,11 @@ class Outcome:
         assert (from_ns, to_ns) == (ARRIVAL_NS, ARRIVAL_NS)
         with self.lock:
             self.rejected.update(reasons)
+
+    def correct(self, topic: str, reasons: Mapping[str, int]) -> None:
+        assert topic == '/talk'
+        with self.lock:
+            self.corrected.update(reasons)
 
     @property
     def samples(self) -> int:
@@ -81,6 +88,22 @@ def test_what_is_wrong_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
     assert outcome.rejected == {'malformed': 3}
     (record,) = caplog.records
     assert record.getMessage().startswith('/talk: a message cannot be stored: malformed: ')
+
+
+def test_corrected_messages_are_stored_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What had to be corrected is counted once its object is on its way, among the stored messages."""
+
+    def correcting(batch: Batch, *rest: Any) -> Encoding:
+        made = encode(batch, *rest)
+        return replace(made, corrected={'row_step': len(batch.samples)}) if made.object else made
+
+    monkeypatch.setattr(pool_module, 'encode', correcting)
+    outcome = Outcome()
+    outcome.pool.open()
+    outcome.queue.put(talk(TEXT, TEXT), 5)
+    outcome.queue.put(talk(b'bad'), 5)
+    assert outcome.pool.close(60)
+    assert (outcome.samples, outcome.corrected, outcome.rejected) == (2, {'row_step': 2}, {'malformed': 1})
 
 
 def test_an_observer_with_a_fault_costs_nothing() -> None:

@@ -24,9 +24,10 @@ from shadowhound_data_logger.encode.registry import encode
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import Run, missions
-from shadowhound_data_logger.missions.node_log import Frame, Reading
+from shadowhound_data_logger.missions.node_log import Cloud, Frame, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 from shadowhound_data_logger.model import Batch, DataObject, Sample
+from shadowhound_data_logger.options import POINT_CLOUD
 
 SECOND = 10**9
 NOON_NS = 1_760_788_800 * SECOND
@@ -268,3 +269,16 @@ def test_a_raw_picture_is_encoded_once(monkeypatch: pytest.MonkeyPatch, paramete
     assert isinstance(frame, Frame)
     assert simplejpeg.is_jpeg(frame.body)
     assert (frame.body == item.body, len(made) - of_sensor) == (not again, again)
+
+
+@pytest.mark.parametrize(('row_step', 'pad'), [(48, 0), (0, 0), (96, 0), (60, 12)])
+def test_the_floor_under_an_organized_cloud(row_step: int, pad: int) -> None:
+    """The floor plan has each point of a cloud with several rows where it is, however these are laid out."""
+    types = STORE.types
+    points = np.arange(24, dtype='<f4').reshape(6, 4)
+    rows = np.hstack((points.view(np.uint8).reshape(2, -1), np.full((2, pad), 9, np.uint8)))
+    fields = [types['sensor_msgs/msg/PointField'](name, 4 * number, 7, 1) for number, name in enumerate('xyzi')]
+    cloud = types[POINT_CLOUD](a_header('odom'), 2, 3, fields, False, 16, row_step, rows.reshape(-1), True)
+    (fact,) = new_observer().facts(batch('lidar', '/point_cloud2', POINT_CLOUD, cloud))
+    assert isinstance(fact, Cloud)
+    np.testing.assert_array_equal(fact.xyz, points[:, :3])

@@ -32,6 +32,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
             account.receive('p', number)
         account.skipped += 3
         account.by_arrival['stamp_too_old'] += 2
+        account.corrected['row_step'] += 2
     spool.accounts.reject('/camera', {'truncated': 1})
     spool.accounts.drop('/camera', 'queue_full', 1)
     with spool.accounts.entry('/imu') as account:
@@ -53,7 +54,8 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'skipped': 3, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                 'gaps': {'missed': {'transport': 2}, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                          'quarantined': {'refused': 1}},
-                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'stored': 3, 'open': 1, 'stored_in': {
+                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'corrected': {'row_step': 2},
+                'stored': 3, 'open': 1, 'stored_in': {
                     'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0, 'kept': 0,
                 },
             },
@@ -62,7 +64,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'published_estimated': None, 'missed_estimated': None, 'by_grade': {
                     'received-only': {'published': None, 'published_estimated': None, 'received': 5, 'missed': None,
                                       'missed_estimated': None, 'missed_by': {}}},
-                'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'by_arrival': {},
+                'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'by_arrival': {}, 'corrected': {},
                 'stored': 0, 'open': 5, 'stored_in': {
                     'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0, 'kept': 0,
                 },
