@@ -31,7 +31,8 @@ def a_topic(**figures: Any) -> dict[str, Any]:
         'sensor': 'imu', 'type': 'x/msg/Y', 'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False,
         'unavailable': '', 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
         'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
-        'missed_estimated': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {},
+        'missed_estimated': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0,
+        'by_arrival': {}, 'corrected': {},
     }  # fmt: skip
     return row | figures
 
