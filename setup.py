@@ -26,15 +26,15 @@ setup(
     python_requires='>=3.10',
     # The same as requirements/runtime.in, which says what each is for.
     install_requires=[
-        'aiohttp>=3.9',
+        'aiohttp>=3.14.4',
         'backports-zstd>=1.0; python_version < "3.14"',
         'boto3>=1.36',
         'click>=8.1',
         'lz4>=4.0',
         'mcap>=1.1',
         'numpy>=1.21',
-        'orjson>=3.9',
-        'pillow>=9',
+        'orjson>=3.11.6',
+        'pillow>=12.2',
         'rich>=13',
         'rosbags>=0.11.9',
         'ruamel-yaml>=0.17',
@@ -46,7 +46,7 @@ setup(
         'policies': ['cryptography>=41', 'onnxruntime>=1.17'],
         'likeness': ['onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
-        'train': ['mlflow-skinny>=2.14', 'torch>=2.2'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
+        'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
         'webrtc': ['aiortc>=1.15,<1.17', 'av>=15'],
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
     },

@@ -3,7 +3,8 @@
 
     sbom    build/sbom/LOCK.cdx.json of each lock file that users install, and vendored.cdx.json of what is bundled here:
             CycloneDX 1.6, with versions, package URLs and SHA-256 or SHA-512 of every file that may be installed
-    audit   known vulnerabilities of the pins; exit code 1 where there are some, 0 where the database cannot be reached
+    audit   known vulnerabilities of the pins, also of those in the image of MLflow; exit code 1 where there are some, 0 where the
+            database cannot be reached, with a line that says when it was reached last
 
 The tools have an environment of their own, .cache/audit, from requirements/audit.txt.
 """
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -25,7 +27,10 @@ from xml.etree import ElementTree
 ROOT: Final = Path(__file__).resolve().parents[1]
 LOCKS: Final = ('robot', 'runtime')
 """What robots and other machines install (docs/dependencies.md)."""
+AUDITED: Final = (*(ROOT / 'requirements' / f'{lock}.txt' for lock in LOCKS), ROOT / 'tower' / 'mlflow.txt')
 TOOLS: Final = ROOT / '.cache' / 'audit'
+REACHED: Final = ROOT / '.cache' / 'audit-reached'
+"""When the database answered last, as RFC 3339 in UTC."""
 PAGE: Final = ROOT / 'requirements' / 'page' / 'package-lock.json'
 LICENSES: Final = ROOT / 'shadowhound_data_logger' / 'live' / 'page' / 'vendor' / 'LICENSES.txt'
 ANSWER_S: Final = 3.0
@@ -84,19 +89,32 @@ def vendored() -> Iterator[dict[str, Any]]:
 
 def audit() -> int:
     """Print what is known of the pins; the exit code. A machine that does not reach the database says so in a line."""
-    locks = [ROOT / 'requirements' / f'{lock}.txt' for lock in LOCKS]
-    first = re.findall(r'^(\S+)==(\S+)', locks[0].read_text(encoding='utf-8'), re.MULTILINE)[0]
+    first = re.findall(r'^(\S+)==(\S+)', AUDITED[0].read_text(encoding='utf-8'), re.MULTILINE)[0]
     if not reachable(url := f'{database()}/{first[0]}/{first[1]}/json'):
-        print(f'audit: skipped, {url} does not say within {ANSWER_S:g} s what is known')
+        print(f'audit: skipped, {url} does not say within {ANSWER_S:g} s what is known; {last_reached()}')
         return 0
     try:
         tools()
-        lines, asked = judged([row for lock in locks for row in audited(lock)])
+        lines, asked = judged([row for lock in AUDITED for row in audited(lock)])
     except (subprocess.SubprocessError, OSError, ValueError, LookupError) as error:
-        print(f'audit: skipped, pip-audit gives no answer: {str(error)[:200]}')
+        print(f'audit: skipped, pip-audit gives no answer: {str(error)[:200]}; {last_reached()}')
         return 0
+    REACHED.parent.mkdir(exist_ok=True)
+    REACHED.write_text(f'{datetime.now(timezone.utc).isoformat(timespec="seconds")}\n', encoding='utf-8')
     print('\n'.join(lines) or f'audit: nothing is known against {asked} packages')
     return 1 if lines else 0
+
+
+def last_reached() -> str:
+    """When the database answered last on this machine."""
+    try:
+        then = datetime.fromisoformat(REACHED.read_text(encoding='utf-8').strip())
+        days = (datetime.now(timezone.utc) - then).days
+    except FileNotFoundError:
+        return 'it has never been reached from here'
+    except (OSError, ValueError, TypeError) as error:
+        return f'when it was reached last is unknown ({error})'
+    return f'it was last reached at {then.isoformat()}, {days} days ago'
 
 
 def audited(lock: Path) -> list[dict[str, Any]]:

@@ -31,13 +31,33 @@ def services() -> dict[str, Any]:
 
 
 def test_every_image_is_pinned(services: dict[str, Any]) -> None:
-    """An image has a tag that says its version; what is built installs exact versions."""
-    for service in services.values():
-        assert re.fullmatch(r'[\w./-]+:\d+\.\d+[\w.-]*', service['image'])
+    """An image has a tag that names an exact version; what is built installs wheels from a lock file with their hashes."""
     built = (TOWER / 'Dockerfile.mlflow').read_text(encoding='utf-8')
-    assert re.search(r'^FROM python:3\.12', built, re.MULTILINE)
-    packages = re.findall(r' ([\w-]+)==\d', built)
-    assert packages == ['mlflow', 'psycopg2-binary', 'boto3', 'flask-wtf', 'starlette']
+    (base,) = re.findall(r'^FROM (\S+)$', built, re.MULTILINE)
+    images = {base, *(service['image'] for service in services.values())}
+    assert {image.partition(':')[0] for image in images} == {
+        'python', 'chrislusf/seaweedfs', 'postgres', 'shadowhound-tower-mlflow',
+    }  # fmt: skip
+    for image in images:
+        assert re.fullmatch(r'[\w./-]+:(4\.\d+|17\.\d+-[\w-]+|3\.\d+\.\d+[\w-]*)', image), image
+    assert 'pip install --no-cache-dir --no-deps --require-hashes --only-binary :all: -r /tmp/mlflow.txt' in built
+    assert len(re.findall('pip install', built)) == 1
+
+
+def test_the_image_of_mlflow_has_what_the_tests_run(services: dict[str, Any]) -> None:
+    """Its lock file has a hash for each file, and of each package the version that the environment of the tests has."""
+    locked = re.findall(r'^([\w.-]+)==([^ \\]+)(?: ;[^\\]*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)',
+                        (TOWER / 'mlflow.txt').read_text(encoding='utf-8'), re.MULTILINE)  # fmt: skip
+    names = {name for name, _, _ in locked}
+    lines = [line for line in (TOWER / 'mlflow.txt').read_text(encoding='utf-8').splitlines() if re.match(r'\w', line)]
+    assert len(locked) == len(lines)
+    assert {'mlflow', 'psycopg2-binary', 'boto3', 'flask-wtf', 'starlette'} <= names
+    tested = (TOWER.parent / 'requirements' / 'wheels.txt').read_text(encoding='utf-8')
+    assert [name for name, version, _ in locked if f'\n{name}=={version} ' not in tested] == []
+    version = dict(one[:2] for one in locked)['mlflow']
+    assert services['mlflow']['image'] == services['prepare']['image'] == f'shadowhound-tower-mlflow:{version}'
+    ignored = (TOWER / '.dockerignore').read_text(encoding='utf-8').split('\n')
+    assert ignored[1:] == ['*', '!mlflow.txt', '']
 
 
 def test_servers_are_watched_and_come_back(services: dict[str, Any]) -> None:
