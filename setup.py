@@ -43,7 +43,7 @@ setup(
     extras_require={
         'datasets': ['av>=15', 'daft>=0.7.26,<0.8', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],
         'lake': ['daft>=0.7.26,<0.8', 'matplotlib>=3.6', 'obstore>=0.11', 'pyarrow>=16'],
-        'policies': ['cryptography>=41', 'onnxruntime>=1.17'],
+        'policies': ['cryptography>=48', 'onnxruntime>=1.17', 'securesystemslib>=1.6', 'tuf>=7'],
         'likeness': ['onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more

@@ -42,6 +42,11 @@ ONE_ROBOT_AT_A_TIME = (
 """Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
 ONE_SENDER = ('test/missions/test_guide.py', 'test/missions/test_mlflow.py')
 """Files whose missions one process sends, which has loaded MLflow."""
+ONE_TEAM = (
+    'test/e2e/test_closed_loop.py', 'test/policies/test_attacks.py', 'test/policies/test_fleet.py',
+    'test/policies/test_transfer.py', 'test/policies/test_way.py',
+)  # fmt: skip
+"""Files that sign policies on a shared Tower, which serves one team at a time."""
 WAITING = ('test/doctor/', 'test/e2e/', 'test/missions/', 'test/sim/', 'test/tower/')
 """Folders whose tests mostly wait for other processes."""
 MAKE_WAY = os.nice(0) + 10
@@ -90,6 +95,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
         def _split_scope(self, nodeid: str) -> str:
             if nodeid.startswith(ONE_SENDER):
                 return 'sender'
+            if nodeid.startswith(ONE_TEAM):
+                return 'team'
             return 'robots' if has_robot(nodeid) else str(super()._split_scope(nodeid))
 
         def remove_node(self, node: Any) -> str | None:

@@ -28,7 +28,7 @@ ALLOWED = {
     'rclpy': {'capture', 'doctor', 'live', 'ros', 'sim'},
     'aiohttp': {'live'},
     **{name: {'stores'} for name in ('boto3', 'botocore')},
-    'cryptography': {'policies'},
+    **{name: {'policies'} for name in ('cryptography', 'securesystemslib', 'tuf')},
     'mlflow': {'missions'},
     'onnxruntime': {'lake', 'policies'},
     'tokenizers': {'lake'},
@@ -39,7 +39,7 @@ ALLOWED = {
     'pyarrow': {'datasets', 'lake', 'live', 'sim'},
 }
 HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av',
-         'cryptography', 'onnxruntime', 'tokenizers')  # fmt: skip
+         'cryptography', 'onnxruntime', 'securesystemslib', 'tokenizers', 'tuf')  # fmt: skip
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 

@@ -34,7 +34,7 @@ ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 MAILBOXES = 'sensor-data/_requests'
 """What is asked of robots: a robot reads its own."""
 POLICIES = 'lerobot/policies'
-"""What every robot reads of the training's bucket: policies, which are signed, and lists of revoked keys."""
+"""What every robot reads of the training's bucket: policies, and the signed metadata that say which of them may run."""
 ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 """A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""

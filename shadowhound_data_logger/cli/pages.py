@@ -219,6 +219,12 @@ VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
 OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('SHADOWHOUND_PARAMETERS', '', 'The parameter file: read by the systemd unit and the doctor, not by the node itself.'),
     ('SHADOWHOUND_POLICY', '', 'The registered model that `policy sync` and `policy run` follow.'),
+    ('SHADOWHOUND_POLICY_KEYS', '`policy-keys` in SHADOWHOUND_HOME', 'The folder of keys of who publishes policies.'),
+    (
+        'SHADOWHOUND_KEY_PASSPHRASE',
+        '',
+        'The passphrase of keys that `policy keys --encrypt` made; without it, the terminal is asked.',
+    ),
     ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens: read by its systemd unit.'),
     (
         'AWS_SHARED_CREDENTIALS_FILE',

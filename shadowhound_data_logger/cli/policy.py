@@ -1,4 +1,4 @@
-"""``shadowhound-data policy``: packs, signs and publishes policies; on the robot fetches, verifies, activates and rolls back."""
+"""``shadowhound-data policy``: keys, packs and publishes policies; on the robot fetches, verifies, activates and rolls back."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ from shadowhound_data_logger.errors import DataLoggerError, PolicyError, PolicyR
 from shadowhound_data_logger.missions.active import MissionFinder
 from shadowhound_data_logger.mlflow_rest import MlflowRest
 from shadowhound_data_logger.options import GIBI
-from shadowhound_data_logger.policies import packing, running, signing
+from shadowhound_data_logger.policies import packing, running
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.registry import CANARY, CHAMPION, MlflowRegistry
 from shadowhound_data_logger.policies.smoke import ISOLATIONS, SANDBOX, is_enough
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync, SyncResult
+from shadowhound_data_logger.policies.trust import FRESH_DAYS, MISSING_PACKAGE, ROOT, target_of, why_stale
 
 JITTER: Final = 0.2
 """Of the time between two looks: a fleet that was switched on together does not ask together."""
@@ -47,24 +48,143 @@ _file = click.Path(path_type=Path, dir_okay=False, exists=True)
 def policy() -> None:
     """Bring trained policies to robots, signed.
 
-    MLflow's registry says which version runs (alias champion), the store has its bytes, and a signature says whether it may run.
+    MLflow's registry says which version runs (alias champion), the store has its bytes, and The Update Framework says whether it
+    may run: a robot trusts the root.json that was installed on it, and the keys that this names.
     """
 
 
 # -- on Spark ------------------------------------------------------------------------------------------------------------------
 
 
-@policy.command(epilog=examples('policy keygen spark.key'))
-@click.argument('path', type=click.Path(path_type=Path, dir_okay=False))
-@as_json
-def keygen(*, path: Path, as_json: bool) -> ExitCode:
-    """Make a key that signs policies.
+def _signs(verb: _Verb) -> _Verb:
+    """The option of where a signer works."""
+    return click.option('--keys', 'folder', type=click.Path(path_type=Path, file_okay=False), envvar='SHADOWHOUND_POLICY_KEYS',
+                        help='Folder of keys  [default: $SHADOWHOUND_POLICY_KEYS, or policy-keys in SHADOWHOUND_HOME]'
+                        )(verb)  # fmt: skip
 
-    It stays on the machine that publishes; PATH.pub goes to policies/keys in SHADOWHOUND_HOME of each robot.
+
+_key = click.option('--key', type=_file, help='Private key to sign with  [default: targets.key in the folder of keys]')
+_root_keys = click.option('--root-key', 'publics', type=_file, multiple=True, metavar='PUB',
+                          help='Public key of a person who keeps a part of the root; may be repeated.')  # fmt: skip
+_encrypt = click.option('--encrypt', is_flag=True, help='Ask for a passphrase for the keys that are made, except online.key.')
+
+
+@policy.command(epilog=examples('policy keys', 'policy keys --only alice',
+                                'policy keys --threshold 2 --root-key alice.pub --root-key bob.pub'))  # fmt: skip
+@_root_keys
+@click.option('--threshold', type=click.IntRange(1), default=1, show_default=True, help='How many of them must sign a root.')
+@click.option('--only', metavar='NAME', help='One key for one person: NAME.key to keep, NAME.pub to hand out.')
+@_encrypt
+@_signs
+@as_json
+def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt: bool, folder: Path | None, as_json: bool
+         ) -> ExitCode:  # fmt: skip
+    """Make the keys that say which policies may run.
+
+    A team of one gets root.key, which goes offline, targets.key, which signs versions, online.key, which dates them, and
+    root.json for robots. With --root-key, several people keep the root: each signs root.json by policy sign-root.
     """
-    name = signing.keygen(path)
-    told = {'key': name, 'private': str(path), 'public': f'{path}.pub'}
-    print_json(told) if as_json else click.echo(f'key {name}: {path} (keep it), {path}.pub (for robots)')
+    place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
+    files, repository = _signers()
+    if only:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private = place / f'{only}{files.PRIVATE}'
+        keyid, public = files.make_key(private, passphrase).public_key.keyid, private.with_suffix(files.PUBLIC)
+        told: dict[str, object] = {'key': keyid, 'private': str(private), 'public': str(public)}
+        lines = [f'{private}: keep it', f'{public}: for who runs policy keys or policy delegate']
+    else:
+        found = repository.create(place, [files.load_public(path) for path in publics], threshold, passphrase)
+        told = {'folder': str(place), 'root': str(place / ROOT), 'missing_signatures': found.missing}
+        lines = [
+            f'{place / repository.TARGETS_KEY}: signs versions; stays with who publishes',
+            f'{place / repository.ONLINE_KEY}: dates what is signed, for policy publish and a daily policy refresh',
+            f'{place / ROOT}: ' + (f'lacks {found.missing} signatures (policy sign-root)' if found.missing else
+                                   'for each robot, as policies/root.json in its SHADOWHOUND_HOME'),
+        ]  # fmt: skip
+        if not publics:
+            lines.insert(0, f'{place / repository.ROOT_KEY}: move it offline, to two places; it replaces all other keys')
+    print_json(told) if as_json else click.echo('\n'.join(lines))
+    return ExitCode.FINE
+
+
+@policy.command(name='sign-root', epilog=examples('policy sign-root root.json --key alice.key'))
+@click.argument('root', type=_file)
+@click.option('--key', type=_file, required=True, help='Private key of a person who keeps a part of the root.')
+def sign_root(*, root: Path, key: Path) -> ExitCode:
+    """Sign a root that policy keys or policy rotate made."""
+    repository = _signers()[1]
+    for line in repository.described(root):
+        click.echo(line)
+    found = repository.sign_root(root, key, _passphrase)
+    click.echo(f'{found.signed} signatures, {found.missing} missing' if found.missing else f'{found.signed} signatures: complete')
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy rotate', 'policy rotate root --root-secret /media/usb/root.key', 'policy rotate online'))
+@click.argument('roles', nargs=-1, type=click.Choice(['root', 'targets', 'online']))
+@click.option('--root-secret', 'secrets', type=_file, multiple=True, metavar='KEY',
+              help='Private key of the root; may be repeated  [default: root.key in the folder of keys]')  # fmt: skip
+@_root_keys
+@click.option('--threshold', type=click.IntRange(1), help='How many keys of a new root must sign  [default: as before]')
+@_encrypt
+@_signs
+def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[Path, ...], threshold: int | None, encrypt: bool,
+           folder: Path | None) -> ExitCode:  # fmt: skip
+    """Replace keys that may have been stolen, or have grown old; by default targets.key and online.key.
+
+    Robots learn of it from the store. What somebody else signed with the old keys is no longer listed.
+    """
+    place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
+    files, repository = _signers()
+    new_root = [files.load_public(path) for path in publics]
+    with _signing(folder) as signing:
+        found = signing.rotate(roles or ('targets', 'online'), secrets, new_root, threshold, passphrase)
+        listed = [] if found.missing else signing.listed()
+    if found.missing:
+        click.echo(f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh')
+        return ExitCode.FINE
+    click.echo(f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}')
+    if not (place / repository.ONLINE_KEY).is_file():
+        click.echo('run policy refresh on the machine that has online.key')
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples("policy delegate alice.pub --for 'go2/go2_patrol/*'", 'policy delegate alice --end'))
+@click.argument('who', metavar='PUB|NAME')
+@click.option('--for', 'paths', multiple=True, metavar='PATTERN', help='ROBOT_TYPE/POLICY/VERSION, * for any; may be repeated.')
+@click.option('--end', is_flag=True, help='Take the right from NAME: no robot runs any longer what only that key listed.')
+@_key
+@_signs
+def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, folder: Path | None) -> ExitCode:
+    """Let another key list versions of some policies."""
+    if end == bool(paths):
+        raise BadUsage('either --for or --end', "policy delegate alice.pub --for 'go2/go2_patrol/*'")
+    with _signing(folder) as signing:
+        if end:
+            click.echo(f'no longer may sign: {", ".join(signing.end_delegation(who, key))}')
+        else:
+            click.echo(f'{signing.delegate(_signers()[0].load_public(Path(who)), paths, key)} may sign {", ".join(paths)}')
+    return ExitCode.FINE
+
+
+@policy.command(epilog=examples('policy refresh', 'policy refresh --days 3'))
+@click.option('--days', type=click.FloatRange(0.01, 365.0), default=FRESH_DAYS, show_default=True,
+              help='How long robots take new versions without another one.')  # fmt: skip
+@_signs
+@as_json
+def refresh(*, days: float, folder: Path | None, as_json: bool) -> ExitCode:
+    """Date what is signed anew, with online.key: once a day, from cron.
+
+    It takes in what other signers have published, and puts a root in force that has all its signatures by now.
+    """
+    with _signing(folder, days) as signing:
+        state = signing.refresh()
+        listed = signing.listed()
+    told = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
+            'listed': listed}  # fmt: skip
+    print_json(told) if as_json else click.echo(
+        f'fresh until {told["expires"]}; the root until {told["root_expires"]}; {len(listed)} versions are listed'
+    )
     return ExitCode.FINE
 
 
@@ -72,7 +192,6 @@ def keygen(*, path: Path, as_json: bool) -> ExitCode:
 @click.argument('folder', metavar='DIR', type=_folder)
 @click.option('--name', required=True, help='Name of the registered model.')
 @click.option('--version', type=click.IntRange(1), help="Its version  [default: the registry's next one]")
-@click.option('--serial', type=click.IntRange(1), help='Robots take no new version with a lower one  [default: the version]')
 @click.option('--smoke', type=_file, required=True, metavar='NPZ', help='An array for each input, for the smoke run.')
 @click.option('--dataset', default='', metavar='DIGEST', help='Digest of the training set.')
 @click.option('--run', 'run_id', default='', metavar='ID', help='MLflow run that trained it.')
@@ -101,46 +220,47 @@ def pack(*, folder: Path, name: str, version: int | None, smoke: Path, output: P
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples('policy sign packed --key spark.key'))
-@click.argument('packed', type=_folder)
-@click.option('--key', type=_file, required=True, help='Private key of policy keygen.')
-def sign(*, packed: Path, key: Path) -> ExitCode:
-    """Sign what was packed."""
-    click.echo(f'signed with the key {packing.sign(packed, key)}')
-    return ExitCode.FINE
-
-
 @policy.command(
     epilog=examples('policy publish packed --alias champion', 'policy publish packed --alias canary --robots thor,tachi')
 )
 @click.argument('packed', type=_folder)
 @click.option('--alias', 'aliases', multiple=True, help=f'Such as {CHAMPION}, {CANARY} or robot-NAME; may be repeated.')
 @click.option('--robots', default='', metavar='NAMES', help=f'The robots that take it as {CANARY}, with commas between.')
+@_key
+@_signs
 @as_json
-def publish(*, packed: Path, aliases: tuple[str, ...], robots: str, as_json: bool) -> ExitCode:
-    """Upload a signed policy and register it.
+def publish(
+    *, packed: Path, aliases: tuple[str, ...], robots: str, key: Path | None, folder: Path | None, as_json: bool
+) -> ExitCode:
+    """Upload what was packed, register it, and sign that it may run.
 
     May be repeated, also to give a version that is there another alias. Nothing is overwritten.
     """
     names = [robot.strip() for robot in robots.split(',') if robot.strip()]
     with the_store() as store:
-        manifest = packing.publish(packed, store, _registry(), aliases, names)
-    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': names}
-    print_json(told) if as_json else click.echo(f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}')
+        signing = _signers()[1].Repository(_keys_folder(folder), store, _passphrase)
+        manifest, is_told = packing.publish(packed, store, _registry(), signing, key=key, aliases=aliases, robots=names)
+    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': names, 'refreshed': is_told}
+    text = f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}'
+    print_json(told) if as_json else click.echo(
+        text if is_told else f'{text}; robots take it after policy refresh, where online.key is'
+    )
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples('policy revoke 0123456789abcdef --key other.key'))
-@click.argument('keys', nargs=-1, required=True)
-@click.option('--key', type=_file, required=True, help='Private key that signs the list; none of those that it revokes.')
-def revoke(*, keys: tuple[str, ...], key: Path) -> ExitCode:
-    """Tell all robots that keys are revoked.
-
-    A robot that runs a policy signed with one of them goes back to one that is not.
-    """
-    with the_store() as store:
-        number = packing.revoke(key, keys, store)
-    click.echo(f'list {number}: {", ".join(keys)}')
+@policy.command(epilog=examples('policy withdraw go2_patrol@7'))
+@click.argument('name', metavar='NAME@VERSION')
+@click.option('--robot-type', 'robot_types', multiple=True, default=('go2',), show_default=True, help='Robots it was for.')
+@_key
+@_signs
+def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folder: Path | None) -> ExitCode:
+    """Sign that a version may no longer run: robots go back to the last good one."""
+    policy_name, _, version = name.partition('@')
+    if not version.isdecimal():
+        raise BadUsage(f'{name!r} is not a version', 'such as go2_patrol@7')
+    with _signing(folder) as signing:
+        is_told = signing.withdraw([target_of(kind, policy_name, int(version)) for kind in robot_types], key)
+    click.echo(f'{name} is no longer listed{"" if is_told else "; robots learn of it after policy refresh, where online.key is"}')
     return ExitCode.FINE
 
 
@@ -192,6 +312,7 @@ def run(*, every: float, **given: Any) -> ExitCode:
     active version as ~/policy (std_msgs/String, latched), and takes word of its health on ~/health.
     """
     logging.basicConfig(level=logging.INFO, format='%(message)s')
+    logging.getLogger('tuf').setLevel(logging.WARNING)
     for number in (signal.SIGINT, signal.SIGTERM):  # also in the middle of a download: whatever is cut off is done again
         signal.signal(number, signal.default_int_handler)
     said = ''
@@ -214,17 +335,21 @@ def list_(*, as_json: bool) -> ExitCode:
     """List the versions on this robot."""
     folder = _policies()
     state, now = folder.state(), folder.current()
-    rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': state.bad.get(name, ''),
+    why_not = {**state.bad, **dict.fromkeys(state.withdrawn, 'no signer lists it any longer')}
+    rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': why_not.get(name, ''),
              'isolation': state.verified.get(name)}
             for name in folder.installed()]  # fmt: skip
+    stale = why_stale(folder.path, time.time_ns())
     if as_json:
-        print_json(rows)
+        print_json({'policies': rows, 'stale': stale})
     else:
         table = plain_table('', ('policy', '', 'tried in', 'why not'), ('policy', '', 'tried in', 'why not'))
         for row in rows:
             marks = [word for word in ('active', 'pinned') if row[word]]
             table.add_row(str(row['policy']), ' '.join(marks), str(row['isolation'] or '-'), str(row['why_not']))
         print_page(table)
+        if stale:
+            click.echo(f'no new version is taken: {stale}')
     return ExitCode.FINE
 
 
@@ -242,9 +367,9 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
     except PolicyRefused as error:
         manifest, why = None, f'{error.reason}: {error.what}'
     told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions / found), 'refused': why,
-            'isolation': folder.state().verified.get(found)}  # fmt: skip
+            'isolation': folder.state().verified.get(found), 'stale': why_stale(folder.path, time.time_ns())}  # fmt: skip
     if manifest is not None:
-        told |= {'serial': manifest.serial, 'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
+        told |= {'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
                  'inputs': [spec.name for spec in manifest.inputs], 'outputs': [spec.name for spec in manifest.outputs],
                  'dataset': manifest.dataset, 'run': manifest.run, 'p99_ms': manifest.p99_ms, 'bytes': manifest.size}  # fmt: skip
     if as_json:
@@ -319,6 +444,35 @@ def report(*, failures: int, p99_ms: float) -> ExitCode:
     return ExitCode.FINDING
 
 
+def _keys_folder(folder: Path | None) -> Path:
+    return folder or the_home() / 'policy-keys'
+
+
+@contextmanager
+def _signing(folder: Path | None, days: float = FRESH_DAYS) -> Iterator[Any]:
+    with the_store() as store:
+        yield _signers()[1].Repository(_keys_folder(folder), store, _passphrase, days=days)
+
+
+def _signers() -> tuple[Any, Any]:
+    """The modules ``keys`` and ``repository``, which need packages of the extra."""
+    try:
+        from shadowhound_data_logger.policies import keys, repository  # noqa: PLC0415 - see above
+    except ImportError as error:
+        raise PolicyError(f'signatures need a package that is missing: {error}', remedy=MISSING_PACKAGE) from error
+    return keys, repository
+
+
+def _passphrase(path: Path) -> str:
+    """Of a key that is encrypted."""
+    return os.environ.get('SHADOWHOUND_KEY_PASSPHRASE') or str(click.prompt(f'passphrase of {path}', hide_input=True, err=True))
+
+
+def _new_passphrase() -> str:
+    told = os.environ.get('SHADOWHOUND_KEY_PASSPHRASE')
+    return told or str(click.prompt('passphrase of the new keys', hide_input=True, confirmation_prompt=True, err=True))
+
+
 def _policies() -> PolicyFolder:
     folder = PolicyFolder(the_home())
     folder.make()
@@ -367,14 +521,14 @@ def _registry() -> MlflowRegistry:
 
 def _told(result: SyncResult) -> dict[str, object]:
     return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms,
-            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew}  # fmt: skip
+            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew, 'stale': result.stale}  # fmt: skip
 
 
 def _sentence(result: SyncResult) -> str:
     words: dict[str, Sequence[str]] = {
         'unchanged': ('active, as before: ', result.wanted), 'activated': ('active now: ', result.wanted),
         'waiting': ('waits for the end of the mission: ', result.wanted), 'pinned': ('pinned: ', result.wanted),
-        'rolled_back': ('its key was revoked; active now: ', result.active or 'none'),
+        'withdrawn': ('no signer lists the active version any longer; active now: ', result.active or 'none'),
         'none': ('the registry names no version for this robot; active: ', result.active or 'none'),
     }  # fmt: skip
-    return ''.join(words[result.done])
+    return ''.join(words[result.done]) + (f'; no new version is taken: {result.stale}' if result.stale else '')

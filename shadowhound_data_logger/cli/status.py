@@ -14,7 +14,16 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, spool_folder, the_spool
+from shadowhound_data_logger.cli.common import (
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    robot_name,
+    spool_folder,
+    the_home,
+    the_spool,
+)
 from shadowhound_data_logger.cli.output import (
     duration,
     figure,
@@ -30,6 +39,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
+from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 from shadowhound_data_logger.spool.gaps import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, robots
 from shadowhound_data_logger.spool.status import read as read_status
@@ -78,6 +88,9 @@ def _look(spool: Path, robot: str | None, clock: Clock) -> dict[str, Any]:
     names = [robot] if robot else robots(spool) or ['thor']
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each['running']), found[0])
+    policies = the_home() / 'policies'
+    if follows_signers(policies) and (stale := why_stale(policies, clock.wall_ns())):
+        chosen['findings'].append(f'No new version of a policy is taken: {stale}.')
     return {**chosen, 'others': [each['robot'] for each in found if each['running'] and each is not chosen]}
 
 

@@ -18,6 +18,7 @@ from shadowhound_data_logger.doctor import (
     missions,
     mlflow,
     network,
+    policies,
     ros,
     ros_environment,
     s3,
@@ -47,6 +48,7 @@ CHECKS: Final = (
     Check(name='disk', run=disk.check, roles=THOR, deadline_s=8.0, apart=True),
     Check(name='spool', run=spool.check, roles=THOR, deadline_s=6.0, after=('s3',)),
     Check(name='missions', run=missions.check, roles=THOR),
+    Check(name='policies', run=policies.check, roles=THOR),
 )
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import PolicyRefused
-from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
+from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, from_strict_json
 
 MOST_HEADER_BYTES: Final = 1 << 20
@@ -51,7 +51,7 @@ def check_files(folder: Path, manifest: PolicyManifest, *, hashes: bool = True) 
     """
     named = {file.path: file for file in manifest.files}
     found = set(files_of(folder))
-    if odd := sorted(found ^ {*named, MANIFEST, SIGNATURE}):
+    if odd := sorted(found ^ {*named, MANIFEST}):
         what = 'is in its folder, and not in the manifest' if odd[0] in found else 'is not there'
         raise PolicyRefused('files', f'{odd[0]!r} of {manifest.id} {what}')
     for path, file in named.items():

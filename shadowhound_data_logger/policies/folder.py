@@ -1,7 +1,8 @@
 """The policies of a robot on its disk, which of them is active, and how that changes.
 
     policies/
-      keys/*.pub        the keys that are trusted
+      root.json         what this robot trusts, installed by a person (``trust.py``)
+      metadata/         what was verified since then, by python-tuf
       versions/ID/      whole, verified versions, read-only; ID is go2_patrol@7#0123456789abcdef
       incoming/ID/      a version that is being downloaded
       current           the link to the active version; renaming another one over it is the activation
@@ -13,10 +14,11 @@ between the two leaves the version of before. ``lock`` is held only while both c
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,16 +28,15 @@ import orjson
 
 from shadowhound_data_logger import durable_files
 from shadowhound_data_logger.errors import PolicyError, PolicyRefused
-from shadowhound_data_logger.policies import signing
 from shadowhound_data_logger.policies.content import check_files
 from shadowhound_data_logger.policies.manifest import (
     MANIFEST,
     MOST_MANIFEST_BYTES,
-    SIGNATURE,
     PolicyManifest,
     parse_manifest,
     split_id,
 )
+from shadowhound_data_logger.policies.trust import ROOT
 from shadowhound_data_logger.untrusted import from_strict_json
 
 MOST_STATE_BYTES: Final = 4 << 20
@@ -52,17 +53,13 @@ class PolicyState:
     """The id that stays active, whatever the registry says."""
     history: list[str] = field(default_factory=list)
     """Ids that were active before, the newest last."""
-    serials: dict[str, int] = field(default_factory=dict)
-    """Policy name -> the greatest serial that was active here."""
     verified: dict[str, str] = field(default_factory=dict)
     """Id -> the isolation of its smoke run, of all versions that passed every check here, also of those that are gone from the
     disk."""
     bad: dict[str, str] = field(default_factory=dict)
     """Id -> why it was taken out; such a version comes back by ``use`` alone."""
-    revoked: list[str] = field(default_factory=list)
-    """Keys that were revoked."""
-    revocations: int = 0
-    """How many lists of them were read, the first ones, without a gap."""
+    withdrawn: list[str] = field(default_factory=list)
+    """Ids of versions that were verified here and that no signer lists any longer: they do not run."""
 
 
 class PolicyFolder:
@@ -79,22 +76,21 @@ class PolicyFolder:
 
     def make(self) -> None:
         """Make what is missing. Raises PolicyError for a folder in which others may write."""
-        for folder in (self.path, self.path / 'keys', self.versions, self.incoming):
+        for folder in (self.path, self.path / 'metadata', self.versions, self.incoming):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.check_owner()
 
     def check_owner(self) -> None:
         """Raises PolicyError for a folder that is a link, or in which others may write: they could change what was verified.
 
-        So could they with a key that they may write, or that is a link, and where anybody may rename the folder itself.
+        So could they with a root that they may write, or that is a link, and where anybody may rename the folder itself.
         """
         for parent in self.path.parents:
             if parent.stat().st_mode & (stat.S_IWOTH | stat.S_ISVTX) == stat.S_IWOTH:
                 raise PolicyError(f'{parent} is a folder in which others may write', remedy=f'chmod o-w {parent}')
-        keys = self.path / 'keys'
-        for place in (self.path, keys, self.versions, self.incoming, *keys.glob('*.pub')):
+        for place in (self.path, self.path / 'metadata', self.versions, self.incoming, *self.path.glob(ROOT)):
             found = place.lstat()
-            is_right = stat.S_ISDIR(found.st_mode) if place.suffix != '.pub' else stat.S_ISREG(found.st_mode)
+            is_right = stat.S_ISDIR(found.st_mode) if place.name != ROOT else stat.S_ISREG(found.st_mode)
             if not is_right or found.st_uid not in {os.getuid(), 0} or found.st_mode & 0o022:
                 what = f'{place} is a link, belongs to another user, or others may write in it'
                 raise PolicyError(what, remedy=f'ls -ld {place}; chmod go-w {place}')
@@ -122,19 +118,18 @@ class PolicyFolder:
         return found[0]
 
     def check(self, name: str, state: PolicyState, *, folder: Path | None = None, hashes: bool = True) -> PolicyManifest:
-        """The manifest of a version: signed by a key that is trusted now, with exactly its files. Raises PolicyRefused."""
+        """The manifest of a version that was verified and is still listed, with exactly its files. Raises PolicyRefused."""
         place = folder or self.versions / name
-        content, signature = (_read(place / file, most) for file, most in (
-            (MANIFEST, MOST_MANIFEST_BYTES), (SIGNATURE, signing.MOST_SIGNATURE_BYTES)))  # fmt: skip
-        signing.check_signature(content, signature, signing.FOR_POLICY, self.keys(), state.revoked)
+        content = _read(place / MANIFEST, MOST_MANIFEST_BYTES)
+        if not hashlib.sha256(content).hexdigest().startswith(name.partition('#')[2]):
+            raise PolicyRefused('damaged', f'{MANIFEST} of {name} has another SHA-256 than its id says')
         manifest = parse_manifest(content)
         if manifest.id != name:
             raise PolicyRefused('damaged', f'the folder of {name} has the policy {manifest.id}')
+        if name in state.withdrawn:
+            raise PolicyRefused('withdrawn', f'{name} was verified here, and no signer lists it any longer')
         check_files(place, manifest, hashes=hashes)
         return manifest
-
-    def keys(self) -> signing.Trusted:
-        return signing.trusted(self.path / 'keys')
 
     def state(self) -> PolicyState:
         """Raises PolicyError for one that is damaged: nothing changes then, and what runs goes on."""
@@ -223,6 +218,26 @@ class PolicyFolder:
                 self._link(target)
             return target
 
+    def withdraw(self, names: Collection[str]) -> bool:
+        """These may no longer run, all others may. Whether the active one was among them: the last good one is active then."""
+        with durable_files.flock(self.path / 'lock'):
+            state, now = self.state(), self.current()
+            if sorted(names) == state.withdrawn and now not in state.withdrawn:
+                return False
+            state.withdrawn = sorted(names)
+            if state.pin in state.withdrawn:
+                state.pin = None
+            if now not in state.withdrawn:
+                self._write(state)
+                return False
+            target = self._last_good(state, str(now))
+            state.history = [name for name in state.history if name != now]
+            try:
+                self._write(state)
+            finally:  # also where the disk is full: the next look writes it down
+                self._link(target)
+            return True
+
     def pin(self) -> str:
         """Stay with the active version. Raises PolicyError where there is none."""
         with self.changing() as state:
@@ -271,7 +286,6 @@ class PolicyFolder:
             raise PolicyRefused('bad', f'{manifest.id} was taken out here: {state.bad[manifest.id]}', remedy=remedy)
         if now != manifest.id:
             state.history = [*(name for name in state.history if name not in {now, manifest.id}), *([now] if now else [])]
-        state.serials[manifest.name] = max(manifest.serial, state.serials.get(manifest.name, 0))
         self._write(state)
         if now != manifest.id:
             self._link(manifest.id)
@@ -304,16 +318,17 @@ class PolicyFolder:
         durable_files.sync(self.path)
 
 
-def id_refused_as_old(state: PolicyState, manifest: PolicyManifest) -> bool:
-    """Whether a version that was never verified here is older than one that was active here."""
-    return manifest.id not in state.verified and manifest.serial < state.serials.get(manifest.name, 0)
+def newest_of(state: PolicyState, name: str) -> int:
+    """The highest version of a policy that was verified here and may still run; 0 for none."""
+    known = (split_id(each) for each in state.verified if each not in state.withdrawn)
+    return max((each[1] for each in known if each and each[0] == name), default=0)
 
 
 def _state(told: Mapping[str, Any]) -> PolicyState:
     if told['format'] != 1:
         raise ValueError('it is of another version of this package')
     state = PolicyState(**{name: told[name] for name in PolicyState.__slots__})
-    kinds: dict[str, Any] = {'history': list, 'serials': dict, 'verified': dict, 'bad': dict, 'revoked': list, 'revocations': int}
+    kinds: dict[str, Any] = {'history': list, 'verified': dict, 'bad': dict, 'withdrawn': list}
     if any(not isinstance(getattr(state, name), kind) for name, kind in kinds.items()):
         raise ValueError('its fields have other types')
     return state

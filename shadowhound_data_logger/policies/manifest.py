@@ -1,7 +1,7 @@
 """What a policy is: ``manifest.json``, which names every file of it, what it takes and gives, and what it promises.
 
-The format is of this package (docs/policies.md). A manifest is believed after its signature was checked (``signing.py``), and its
-fields are checked all the same: a key can sign nonsense.
+The format is of this package (docs/policies.md). A manifest is believed after its hash was found in signed metadata
+(``trust.py``), and its fields are checked all the same: a key can sign nonsense. The hashes of the other files are in it alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from shadowhound_data_logger.untrusted import from_strict_json, is_path
 
 FORMAT: Final = 1
 MANIFEST: Final = 'manifest.json'
-SIGNATURE: Final = 'manifest.json.sig'
 MOST_MANIFEST_BYTES: Final = 1 << 20
 MOST_FILES: Final = 100
 MOST_POLICY_BYTES: Final = 16 << 30
@@ -73,8 +72,6 @@ class PolicyManifest:
 
     name: str
     version: int
-    serial: int
-    """Grows with each version; a robot takes none below the greatest that ran on it (``folder.py``)."""
     kind: str
     model: str
     robot_types: tuple[str, ...]
@@ -126,7 +123,7 @@ def _manifest(given: Any, sha256: str) -> PolicyManifest:
         raise ValueError(f'it has not the format {FORMAT}')
     smoke, limits = given['smoke'], given['limits']
     manifest = PolicyManifest(
-        name=_name(given['name']), version=_count(given['version'], 999_999_999), serial=_count(given['serial'], 1 << 53),
+        name=_name(given['name']), version=_count(given['version'], 999_999_999),
         kind=_one_of(given['kind'], (ONNX,)), model=_text(given['model']), robot_types=_tuple(given['robot_types'], _name, 100),
         fps=_number(given['fps'], 1e4), inputs=_tuple(given['inputs'], _tensor, 100),
         outputs=_tuple(given['outputs'], _tensor, 100), dataset=_text(given['dataset']), run=_text(given['run']),
@@ -141,7 +138,7 @@ def _manifest(given: Any, sha256: str) -> PolicyManifest:
 def _check_files(manifest: PolicyManifest) -> None:
     """Each name once, all that is referred to there, none that is a folder of another."""
     paths = [file.path for file in manifest.files]
-    lower = [path.lower() for path in (*paths, MANIFEST, SIGNATURE)]
+    lower = [path.lower() for path in (*paths, MANIFEST)]
     if len(set(lower)) < len(lower):
         raise PolicyRefused('twice', f'{MANIFEST} of {manifest.id} names a file twice')
     folders = {str(parent) for path in paths for parent in PurePosixPath(path).parents}

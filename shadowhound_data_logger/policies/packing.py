@@ -1,37 +1,38 @@
-"""A policy on its way out of the machine that trained it: packed with a manifest, signed, and published."""
+"""A policy on its way out of the machine that trained it: packed with a manifest, and published."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import ForeignObject, PolicyError, PolicyRefused
 from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.policies import signing
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.manifest import (
     FORMAT,
     MANIFEST,
     MOST_MANIFEST_BYTES,
     ONNX,
-    SIGNATURE,
     PolicyManifest,
     check_file_name,
     parse_manifest,
 )
-from shadowhound_data_logger.policies.registry import BUCKET, ID_TAG, PREFIX, ROBOTS_TAG, MlflowRegistry, source_of
+from shadowhound_data_logger.policies.registry import BUCKET, ID_TAG, ROBOTS_TAG, MlflowRegistry, source_of
 from shadowhound_data_logger.policies.smoke import open_model, worst_difference
+from shadowhound_data_logger.policies.trust import MISSING_PACKAGE, target_of
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.untrusted import from_json
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.policies.repository import Repository
 
 MODEL: Final = 'model.onnx'
 CONFIG: Final = 'config.json'
@@ -44,8 +45,6 @@ class Packing:
 
     name: str
     version: int
-    serial: int | None = None
-    """None: the version."""
     robot_types: Sequence[str] = ROBOT_TYPES
     fps: float = 10.0
     dataset: str = ''
@@ -78,7 +77,7 @@ def pack(folder: Path, smoke: Path, packed: Path, packing: Packing) -> PolicyMan
         size, sha256 = fingerprint(part / name)
         listed.append({'path': name, 'bytes': size, 'sha256': sha256})
     manifest = {
-        'format': FORMAT, 'name': packing.name, 'version': packing.version, 'serial': packing.serial or packing.version,
+        'format': FORMAT, 'name': packing.name, 'version': packing.version,
         'kind': ONNX, 'model': MODEL, 'robot_types': list(packing.robot_types), 'fps': packing.fps,
         'inputs': told['inputs'], 'outputs': told['outputs'], 'dataset': packing.dataset, 'run': packing.run,
         'smoke': {**told['smoke'], 'tolerance': packing.tolerance},
@@ -115,7 +114,7 @@ def _tried(part: Path, smoke: Path) -> dict[str, Any]:
     try:
         session = open_model(part / MODEL)
     except ImportError as error:
-        raise PolicyError(f'packing runs the model: {error}', remedy=signing.REMEDY) from error
+        raise PolicyError(f'packing runs the model: {error}', remedy=MISSING_PACKAGE) from error
     with np.load(smoke, allow_pickle=False) as arrays:
         given = {spec.name: arrays[spec.name] for spec in session.get_inputs() if spec.name in arrays}
     if missing := [spec.name for spec in session.get_inputs() if spec.name not in given]:
@@ -143,34 +142,25 @@ def _told(name: str, array: Any, config: Mapping[str, Any], key: str) -> dict[st
             'units': feature.get('units', [])}  # fmt: skip
 
 
-def sign(packed: Path, key: Path) -> str:
-    """Sign what was packed, after a look at all of its files; returns the id of the key."""
+def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, repository: Repository, *, key: Path | None = None,
+            aliases: Sequence[str] = (), robots: Sequence[str] = ()) -> tuple[PolicyManifest, bool]:  # fmt: skip
+    """Upload a policy, register it, list it in the signed metadata, and then give it its aliases; may be repeated.
+
+    ``robots`` are those that take it as a canary. Nothing is ever overwritten: a version is published once. Also returned is
+    whether robots learn of it now; otherwise ``policy refresh`` elsewhere has to run first. Raises PolicyError, StoreError.
+    """
     content = _content(packed)
     manifest = parse_manifest(content)
-    (packed / SIGNATURE).write_bytes(signature := signing.sign(signing.load_key(key), signing.FOR_POLICY, content))
-    check_files(packed, manifest)
-    return str(json.loads(signature)['key'])
-
-
-def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, aliases: Sequence[str], robots: Sequence[str] = ()
-            ) -> PolicyManifest:  # fmt: skip
-    """Upload a signed policy, register it, and then give it its aliases; may be repeated. Raises PolicyError, StoreError.
-
-    ``robots`` are those that take it as a canary. Nothing is ever overwritten: a version is published once.
-    """
-    if not (packed / SIGNATURE).is_file():
-        raise PolicyError(f'{packed} is not signed', remedy=f'shadowhound-data policy sign {packed} --key KEY')
-    manifest = parse_manifest(_content(packed))
     check_files(packed, manifest)
     source = source_of(manifest.robot_types[0], manifest.name, manifest.version)
     known = registry.versions(manifest.name)
     following = 1 + max((each.version for each in known), default=0)
-    remedy = f'pack it with --version {following}, and sign that'
+    remedy = f'pack it with --version {following}'
     if all(each.source != source for each in known):
         _check_number(manifest, following)
         remedy = f'publish the folder whose publication was cut off, or remove {source}/, which the registry does not name'
     folder = source.removeprefix(f's3://{BUCKET}/')
-    for name in (*(file.path for file in manifest.files), SIGNATURE, MANIFEST):  # the manifest last: with it, all is there
+    for name in (*(file.path for file in manifest.files), MANIFEST):  # the manifest last: with it, all is there
         size, sha256 = fingerprint(packed / name)
         item = _item(f'{folder}/{name}', packed / name, size, sha256)
         try:
@@ -181,35 +171,21 @@ def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, aliases:
     tags = {ID_TAG: manifest.id, 'shadowhound.dataset': manifest.dataset}
     number = registry.register(manifest.name, source, {key: value for key, value in tags.items() if value}, manifest.run)
     _check_number(manifest, number)
+    is_told = repository.publish(
+        {target_of(kind, manifest.name, manifest.version): content for kind in manifest.robot_types}, key
+    )
     if robots:
         registry.tag(manifest.name, number, ROBOTS_TAG, ','.join(robots))
     for alias in aliases:
         registry.set_alias(manifest.name, alias, number)
-    return manifest
-
-
-def revoke(key: Path, keys: Sequence[str], store: ObjectStore) -> int:
-    """Publish the next signed list of revoked keys; returns its number."""
-    signer, number = signing.load_key(key), 1
-    while steadily(lambda number=number: store.head(BUCKET, revocation_key(number))) is not None:  # type: ignore[misc]
-        number += 1
-    content = signing.revocation(signer, number, keys)
-    path = key.with_name(f'revoked_{number}.json')
-    path.write_bytes(content)
-    steadily(lambda: store.put(_item(revocation_key(number), path, len(content), hashlib.sha256(content).hexdigest())))
-    return number
-
-
-def revocation_key(number: int) -> str:
-    """Where the ``number``-th list is, 1, 2, ...: a robot may list nothing, and asks for the next one."""
-    return f'{PREFIX}/revoked/{number}.json'
+    return manifest, is_told
 
 
 def _check_number(manifest: PolicyManifest, number: int) -> None:
     """Raises PolicyError where the registry gives the version another number than its manifest has."""
     if number != manifest.version:
         raise PolicyError(f'in the registry this is version {number} of {manifest.name}, and it is packed as {manifest.version}',
-                          remedy=f'pack it with --version {number}, and sign that')  # fmt: skip
+                          remedy=f'pack it with --version {number}')  # fmt: skip
 
 
 def _content(packed: Path) -> bytes:
@@ -218,6 +194,6 @@ def _content(packed: Path) -> bytes:
 
 
 def _item(key: str, path: Path, size: int, sha256: str) -> SpooledObject:
-    kind = 'application/json' if path.suffix in {'.json', '.sig'} else 'application/octet-stream'
+    kind = 'application/json' if path.suffix == '.json' else 'application/octet-stream'
     return SpooledObject(id=0, bucket=BUCKET, key=key, path=path, size=size, sha256=sha256, content_type=kind,
                          metadata={words.SENSOR: 'policy'}, priority=5, created_ns=time.time_ns())  # fmt: skip

@@ -5,31 +5,25 @@ Whatever fails leaves what is active as it is. One process does this at a time (
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import durable_files
 from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT
-from shadowhound_data_logger.errors import ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
+from shadowhound_data_logger.errors import DataLoggerError, ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.options import GIBI
-from shadowhound_data_logger.policies import signing
+from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.content import files_of
-from shadowhound_data_logger.policies.folder import PolicyFolder, id_refused_as_old
-from shadowhound_data_logger.policies.manifest import (
-    MANIFEST,
-    MOST_MANIFEST_BYTES,
-    SIGNATURE,
-    PolicyManifest,
-    parse_manifest,
-)
-from shadowhound_data_logger.policies.packing import revocation_key
+from shadowhound_data_logger.policies.folder import PolicyFolder, newest_of
+from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, parse_manifest, split_id
 from shadowhound_data_logger.policies.registry import BUCKET, PolicyRegistry, RegisteredVersion, choose, folder_of
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, is_enough, run_smoke
 from shadowhound_data_logger.retry import steadily
@@ -40,9 +34,8 @@ log = logging.getLogger(__name__)
 
 REFUSED_AGAIN_S: Final = 3600.0
 """A version that was refused is not fetched again sooner: a smoke run may have been slow because the machine was busy."""
-MOST_LISTS: Final = 1000
-MOST_EXCHANGED: Final = 5
-"""Lists that are none: behind so many no other is asked for, else they would cost bandwidth at each look."""
+ASKED_AGAIN: Final = frozenset({'unlisted', 'untrusted', 'expired', 'clock'})
+"""Reasons that end when a signer does something, and cost no download."""
 LATE_S: Final = 0.1
 """So much of the cap, and the time of two pieces, may be caught up with: while one arrives, no other is asked for."""
 
@@ -74,13 +67,16 @@ class SyncResult:
     """``NAME@7``, or an id where it is known; empty where nobody says."""
     active: str | None
     done: str
-    """``unchanged`` ``activated`` ``waiting`` (a mission is active) ``rolled_back`` (a key was revoked) ``pinned`` ``none``."""
+    """``unchanged`` ``activated`` ``waiting`` (a mission is active) ``pinned`` ``none``, or ``withdrawn``: no signer lists any
+    longer what was active, and it is not active now."""
     p99_ms: float | None = None
     """Of the smoke run, where there was one."""
     fetched_bytes: int = 0
     """That arrived, repeats among them."""
     begun_anew: int = 0
     """Files of which what had arrived was thrown away: it was damaged, or the object changed meanwhile."""
+    stale: str = ''
+    """Why no new version is taken now; empty where one would be."""
 
 
 @dataclass(slots=True)
@@ -95,6 +91,7 @@ class PolicySync:
     """Whether no mission is active."""
     pause: Callable[[float], object] = time.sleep
     monotonic: Callable[[], float] = time.monotonic
+    wall_ns: Callable[[], int] = time.time_ns
     _refused: dict[str, tuple[float, PolicyRefused]] = field(default_factory=dict)
 
     def run(self, *, again: bool = True) -> SyncResult:
@@ -106,21 +103,56 @@ class PolicySync:
         with durable_files.flock(self.folder.path / 'sync.lock', wait=False) as is_ours:
             if not is_ours:
                 raise PolicyError('another process is looking for policies here', remedy='wait until it is done')
-            if self._revoke():
-                return SyncResult('', self.folder.current(), 'rolled_back')
             self._end_rollback()
-            state = self.folder.state()
-            if state.pin is not None:
-                if state.pin != self.folder.current():
-                    if not self.may_activate():
-                        return SyncResult(state.pin, self.folder.current(), 'waiting')
-                    self._ensure_tried(state.pin)
-                    self.folder.activate(state.pin)
-                return SyncResult(state.pin, self.folder.current(), 'pinned')
-            chosen = choose(self.registry, self.settings.name, self.settings.robot)
-            if chosen is None:
-                return SyncResult('', self.folder.current(), 'none')
-            return self._follow(chosen, again=again)
+            traffic = _Traffic(self.settings.max_mbps, self.pause, self.monotonic)
+            listing = self._listing(traffic)
+            if isinstance(listing, trust.Trust):
+                if self.folder.withdraw(self._withdrawn(listing)):
+                    log.warning('no signer lists the policy that was active any longer; active is %s', self.folder.current())
+                    return SyncResult('', self.folder.current(), 'withdrawn')
+                if why := trust.why_stale(self.folder.path, self.wall_ns()):
+                    listing = PolicyRefused('clock', why)
+            result = self._followed(listing, traffic, again=again)
+            return result if isinstance(listing, trust.Trust) else replace(result, stale=f'{listing}')
+
+    def _listing(self, traffic: _Traffic) -> trust.Trust | DataLoggerError:
+        """What signers list, or why that cannot be verified: then no new version is taken."""
+        try:
+            return trust.refresh(self.folder.path, self.store, traffic.count, self.pause)
+        except PolicyRefused as error:
+            why = trust.why_stale(self.folder.path, self.wall_ns()) if error.reason == 'expired' else ''
+            return PolicyRefused('expired', why) if why else error
+        except DataLoggerError as error:
+            return error
+
+    def _withdrawn(self, listing: trust.Trust) -> list[str]:
+        """What was verified here and is listed no longer. Where that cannot be said, all stays as it is."""
+        state = self.folder.state()
+        return [name for name in sorted({*state.verified, *self.folder.installed()})
+                if not self._is_listed(listing, name, unknown=name not in state.withdrawn)]  # fmt: skip
+
+    def _is_listed(self, listing: trust.Trust, name: str, *, unknown: bool) -> bool:
+        policy, version, sha256 = split_id(name) or ('', 0, '')
+        try:
+            target = listing.listed(trust.target_of(self.settings.robot_type, policy, version))
+        except DataLoggerError as error:
+            log.warning('whether %s is listed is unknown: %s', name, error)
+            return unknown
+        return target is not None and target.hashes.get('sha256', '').startswith(sha256)
+
+    def _followed(self, listing: trust.Trust | DataLoggerError, traffic: _Traffic, *, again: bool) -> SyncResult:
+        state = self.folder.state()
+        if state.pin is not None:
+            if state.pin != self.folder.current():
+                if not self.may_activate():
+                    return SyncResult(state.pin, self.folder.current(), 'waiting')
+                self._ensure_tried(state.pin)
+                self.folder.activate(state.pin)
+            return SyncResult(state.pin, self.folder.current(), 'pinned')
+        chosen = choose(self.registry, self.settings.name, self.settings.robot)
+        if chosen is None:
+            return SyncResult('', self.folder.current(), 'none')
+        return self._follow(chosen, listing, traffic, again=again)
 
     def _end_rollback(self) -> None:
         """What was rolled back and is active all the same: that was cut off."""
@@ -128,7 +160,8 @@ class PolicySync:
         if now in state.bad:
             self.folder.roll_back(state.bad[now], of=now)
 
-    def _follow(self, chosen: RegisteredVersion, *, again: bool) -> SyncResult:
+    def _follow(self, chosen: RegisteredVersion, listing: trust.Trust | DataLoggerError, traffic: _Traffic, *, again: bool
+                ) -> SyncResult:  # fmt: skip
         wanted = f'{chosen.name}@{chosen.version}'
         prefix = folder_of(chosen, self.settings.name)
         now = self.folder.current()
@@ -138,20 +171,24 @@ class PolicySync:
         since, refusal = self._refused.get(wanted, (float('-inf'), None))
         if refusal is not None and not again and self.monotonic() - since < REFUSED_AGAIN_S:
             raise refusal
+        known = [name for name in self.folder.installed() if name.partition('#')[0] == wanted]
         try:
-            return self._take(wanted, prefix)
+            return self._take(chosen, prefix, known, listing, traffic)
         except PolicyRefused as error:
-            self._refused[wanted] = self.monotonic(), error
+            if error.reason not in ASKED_AGAIN:
+                self._refused[wanted] = self.monotonic(), error
             raise
 
-    def _take(self, wanted: str, prefix: str) -> SyncResult:
-        known = [name for name in self.folder.installed() if name.partition('#')[0] == wanted]
-        p99_ms, traffic = None, _Traffic(self.settings.max_mbps, self.pause, self.monotonic)
+    def _take(self, chosen: RegisteredVersion, prefix: str, known: Sequence[str], listing: trust.Trust | DataLoggerError,
+              traffic: _Traffic) -> SyncResult:  # fmt: skip
+        p99_ms = None
         if known:
             name = known[0]
             self._ensure_tried(name)
+        elif isinstance(listing, DataLoggerError):
+            raise listing
         else:
-            manifest = self._fetch(wanted, prefix, traffic)
+            manifest = self._fetch(chosen, prefix, listing, traffic)
             name = manifest.id
             run = self._try(manifest)
             p99_ms = run.p99_ms
@@ -166,20 +203,24 @@ class PolicySync:
 
     # -- what came -------------------------------------------------------------------------------------------------
 
-    def _fetch(self, wanted: str, prefix: str, traffic: _Traffic) -> PolicyManifest:
+    def _fetch(self, chosen: RegisteredVersion, prefix: str, listing: trust.Trust, traffic: _Traffic) -> PolicyManifest:
         """The whole version into ``incoming``, verified as far as it can be without running it."""
-        state = self.folder.state()
-        signature = self._get(f'{prefix}/{SIGNATURE}', signing.MOST_SIGNATURE_BYTES, traffic)
-        content = self._get(f'{prefix}/{MANIFEST}', MOST_MANIFEST_BYTES, traffic)
-        signing.check_signature(content, signature, signing.FOR_POLICY, self.folder.keys(), state.revoked)
+        state, wanted = self.folder.state(), f'{chosen.name}@{chosen.version}'
+        target = listing.listed(trust.target_of(self.settings.robot_type, chosen.name, chosen.version))
+        if target is None:
+            raise PolicyRefused('unlisted', f'no signer who may lists {wanted} for a {self.settings.robot_type}',
+                                remedy='policy publish lists it, then policy refresh, where online.key is')  # fmt: skip
+        content = self._get(f'{prefix}/{MANIFEST}', min(target.length, MOST_MANIFEST_BYTES), traffic)
+        if len(content) != target.length or hashlib.sha256(content).hexdigest() != target.hashes.get('sha256'):
+            raise PolicyRefused('damaged', f'{prefix}/{MANIFEST} is not the one that was signed')
         manifest = parse_manifest(content)
         if f'{manifest.name}@{manifest.version}' != wanted:
             raise PolicyRefused('source', f'the registry says that {wanted} is at {prefix}, and {manifest.id} is there')
         if self.settings.robot_type not in manifest.robot_types:
             types = ', '.join(manifest.robot_types)
             raise PolicyRefused('robot_type', f'{manifest.id} is for {types}, and this is a {self.settings.robot_type}')
-        if id_refused_as_old(state, manifest):
-            raise PolicyRefused('serial', f'{manifest.id} has the serial {manifest.serial}, and a newer one ran here already',
+        if manifest.id not in state.verified and manifest.version < newest_of(state, manifest.name):
+            raise PolicyRefused('old', f'{manifest.id} was never verified here, and {newest_of(state, manifest.name)} was',
                                 remedy='a version that was on this robot comes back by policy use or rollback')  # fmt: skip
         if manifest.id in state.bad:
             raise PolicyRefused('bad', f'{manifest.id} was taken out here: {state.bad[manifest.id]}')
@@ -188,7 +229,6 @@ class PolicySync:
         for file in manifest.files:
             self._download(ObjectInfo(BUCKET, f'{prefix}/{file.path}', file.size, file.sha256), place / file.path, traffic)
         (place / MANIFEST).write_bytes(content)
-        (place / SIGNATURE).write_bytes(signature)
         return self.folder.check(manifest.id, state, folder=place)
 
     def _get(self, key: str, most: int, traffic: _Traffic) -> bytes:
@@ -255,48 +295,6 @@ class PolicySync:
             shutil.rmtree(self.folder.incoming / manifest.id)
             raise
 
-    # -- keys ------------------------------------------------------------------------------------------------------
-
-    def _revoke(self) -> bool:
-        """Read the lists of revoked keys that are new; whether the active version went because of them."""
-        exchanged = 0  # lists that were exchanged on their way are asked for again, and so are all after them
-        for number in range(self.folder.state().revocations + 1, MOST_LISTS + 1):
-            key = revocation_key(number)
-            try:
-                content = steadily(lambda key=key: self.store.get(BUCKET, key, signing.MOST_REVOCATION_BYTES),  # type: ignore[misc]
-                                   pause=self.pause)  # fmt: skip
-            except ObjectRefused as error:
-                if error.data.get('reason') != 'missing':
-                    raise
-                break
-            try:
-                found = signing.read_revocation(content, number, self.folder.keys(), self.folder.state().revoked)
-            except PolicyRefused as error:
-                log.warning('a list of revoked keys counts for nothing: %s', error)
-                exchanged += 1
-                if exchanged < MOST_EXCHANGED:
-                    continue
-                break
-            with self.folder.changing() as state:
-                state.revoked = sorted({*state.revoked, *found})
-                state.revocations = state.revocations if exchanged else number
-        return self._drop_revoked()
-
-    def _drop_revoked(self) -> bool:
-        now = self.folder.current()
-        if now is None:
-            return False
-        try:
-            self.folder.check(now, self.folder.state(), hashes=False)
-        except PolicyRefused as error:
-            if error.reason != 'revoked':  # whoever runs it is told; a newer version may be on its way
-                log.warning('the active policy %s is refused: %s', now, error)
-                return False
-            log.warning('the policy %s goes: %s', now, error)
-            self.folder.roll_back(f'{error.what}', of=now)
-            return True
-        return False
-
 
 def _is_folder(path: Path) -> bool:
     """And no link to one."""
@@ -314,7 +312,7 @@ def _remove(path: Path) -> None:
 def _is_begun(place: Path, manifest: PolicyManifest) -> bool:
     """Whether what is there is of this download and nothing else."""
     names = {file.path for file in manifest.files}
-    names |= {MANIFEST, SIGNATURE, *(f'{name}{UNFINISHED}' for name in names)}
+    names |= {MANIFEST, *(f'{name}{UNFINISHED}' for name in names)}
     try:
         return _is_folder(place) and names.issuperset(files_of(place)) and not any((place / name).is_dir() for name in names)
     except PolicyRefused:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 from uuid import uuid4
 
-import boto3
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -22,6 +21,7 @@ from e2e.station import Station
 from geometry_msgs.msg import Twist
 from missions.server import Server, complete
 from nav_msgs.msg import Odometry
+from policies.models import bucket_of
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.lake.training import digest_of
@@ -88,11 +88,7 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
         monkeypatch.setenv(name, value)
     robot = processes.robot
     policy = f'loop_{uuid4().hex[:8]}'
-    client = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
-                          aws_access_key_id=environ['AWS_ACCESS_KEY_ID'],
-                          aws_secret_access_key=environ['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
-    if 'lerobot' not in {bucket['Name'] for bucket in client.list_buckets()['Buckets']}:
-        client.create_bucket(Bucket='lerobot')
+    bucket_of(tower)
     spark = {**os.environ, **tower.environment('spark'), **tower.tracking('spark'), 'PYTHONPATH': str(ROOT),
              'SHADOWHOUND_HOME': str(tmp_path / 'spark')}  # fmt: skip
 
@@ -150,12 +146,11 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
         '--codec', 'h264')  # fmt: skip
     assert (exported / 'meta/info.json').is_file(), said
     digest = fitted(exported, tmp_path / 'trained')
-    key, packed = tmp_path / 'spark.key', str(tmp_path / 'packed')
-    run('policy', 'keygen', str(key))
+    packed = str(tmp_path / 'packed')
+    root = run('policy', 'keys', '--json')['root']
     sample = str(tmp_path / 'trained.npz')
     pack = ('policy', 'pack', str(tmp_path / 'trained'), '--name', policy, '--smoke', sample, '--dataset', digest)
     made = run(*pack, '--fps', '10', '--p99-ms', '10000', '-o', packed, '--json')['policy']
-    run('policy', 'sign', packed, '--key', str(key))
     run('policy', 'publish', packed, '--alias', 'canary', '--robots', robot)
     # The canary takes it; another robot does not.
     thor = (
@@ -163,10 +158,8 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
         | tower.tracking('thor')
         | {'SHADOWHOUND_HOME': str(node.home), 'SHADOWHOUND_POLICY': policy, 'SHADOWHOUND_ROBOT': robot}
     )
-    keys = node.home / 'policies' / 'keys'
     run('policy', 'list', '--json', **thor)
-    keys.mkdir(parents=True, exist_ok=True)
-    shutil.copy(f'{key}.pub', keys)
+    shutil.copy(root, node.home / 'policies')
     assert run('policy', 'sync', '--json', **thor)['active'] == made
     other = {**thor, 'SHADOWHOUND_HOME': str(tmp_path / 'other'), 'SHADOWHOUND_ROBOT': 'other'}
     assert run('policy', 'sync', '--json', **other)['active'] is None

@@ -18,25 +18,30 @@ from onnx import TensorProto, helper, numpy_helper
 
 from shadowhound_data_logger.errors import PolicyRefused
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.policies import packing, signing
+from shadowhound_data_logger.policies import packing, repository
 from shadowhound_data_logger.policies.folder import PolicyFolder
-from shadowhound_data_logger.policies.manifest import MANIFEST, SIGNATURE, PolicyManifest
+from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
 from shadowhound_data_logger.policies.registry import RegisteredVersion, source_of
+from shadowhound_data_logger.policies.repository import Repository
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync
+from shadowhound_data_logger.policies.trust import ROOT, target_of
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
 
 STATE, ACTION = 'observation.state', 'action'
 
 
 def bucket_of(tower: Tower) -> Any:
-    """The administrator's client of a Tower that has the bucket of policies, as one that was prepared."""
+    """The administrator's client of a Tower that has the bucket of policies, as one that was prepared, and is of no team yet."""
     keys = tower.environment()
     client = boto3.client('s3', endpoint_url=tower.endpoint_url, region_name='us-east-1',
                           aws_access_key_id=keys['AWS_ACCESS_KEY_ID'],
                           aws_secret_access_key=keys['AWS_SECRET_ACCESS_KEY'])  # fmt: skip
     with suppress(client.exceptions.BucketAlreadyOwnedByYou, client.exceptions.BucketAlreadyExists):
         client.create_bucket(Bucket='lerobot')
+    for entry in client.list_objects_v2(Bucket='lerobot', Prefix='policies/_tuf/').get('Contents', ()):
+        client.delete_object(Bucket='lerobot', Key=entry['Key'])
     return client
 
 
@@ -68,27 +73,36 @@ def trained(folder: Path, model: onnx.ModelProto | None = None) -> Path:
 
 @dataclass
 class Spark:
-    """Who packs and signs: a folder with a key."""
+    """A team of one, which packs and signs: a folder with its keys."""
 
     folder: Path
     name: str = 'go2_patrol'
 
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.key = self.folder / 'spark.key'
-        self.key_id = signing.keygen(self.key)
+        self.keys = self.folder / 'keys'
+        repository.create(self.keys)
 
     @property
-    def public(self) -> Path:
-        return self.folder / 'spark.key.pub'
+    def root(self) -> Path:
+        """What robots trust."""
+        return self.keys / ROOT
+
+    def signing(self, store: ObjectStore, **given: Any) -> Repository:
+        """Where it signs."""
+        return Repository(self.keys, store, lambda _: '', **given)
+
+    def trusted_by(self, folder: PolicyFolder) -> None:
+        """Install the root on a robot, as a person does."""
+        folder.make()
+        shutil.copy(self.root, folder.path / ROOT)
 
     def packed(self, version: int, model: onnx.ModelProto | None = None, **given: Any) -> tuple[Path, PolicyManifest]:
-        """A version, signed."""
+        """A version."""
         folder = trained(self.folder / f'trained_{version}', model or linear(0.1 * version))
         packed = self.folder / f'packed_{version}'
         packing.pack(folder, folder.with_suffix('.npz'), packed, packing.Packing(
             **{'name': self.name, 'version': version, 'p99_ms': 5000.0, 'dataset': 'd' * 64, **given}))  # fmt: skip
-        packing.sign(packed, self.key)
         return packed, packing.parse_manifest((packed / 'manifest.json').read_bytes())
 
 
@@ -121,8 +135,7 @@ class Scene:
 
     def new_robot(self, name: str, **given: Any) -> PolicySync:
         folder = PolicyFolder(self.path / name)
-        folder.make()
-        shutil.copy(self.spark.public, folder.path / 'keys' / 'spark.pub')
+        self.spark.trusted_by(folder)
         settings = PolicySettings(**{'name': 'go2_patrol', 'robot': name, 'min_free_bytes': 0, **given})
         return PolicySync(folder, self.store, self.registry, settings, pause=lambda _: None)
 
@@ -132,20 +145,22 @@ class Scene:
     def publish(self, version: int, model: onnx.ModelProto | None = None, alias: str = 'champion', **given: Any) -> str:
         packed, manifest = self.spark.packed(version, model, **given)
         shutil.copytree(packed, self.place(version))
+        self.sign(version)
         self.registry.say(alias, version)
         return manifest.id
 
     def forge(self, version: int, change: Callable[[dict[str, Any]], object]) -> None:
         """A manifest that says something else, well signed."""
-        path = self.place(version) / MANIFEST
-        told = json.loads(path.read_bytes())
+        told = json.loads((self.place(version) / MANIFEST).read_bytes())
         change(told)
-        self.sign(version, json.dumps(told).encode(), self.spark.key)
+        self.sign(version, json.dumps(told).encode())
 
-    def sign(self, version: int, content: bytes, key: Path) -> None:
-        (self.place(version) / MANIFEST).write_bytes(content)
-        signature = signing.sign(signing.load_key(key), signing.FOR_POLICY, content)
-        (self.place(version) / SIGNATURE).write_bytes(signature)
+    def sign(self, version: int, content: bytes | None = None) -> None:
+        """List what is in the store as this version, or this manifest instead."""
+        path = self.place(version) / MANIFEST
+        if content is not None:
+            path.write_bytes(content)
+        self.spark.signing(self.store).publish({target_of('go2', 'go2_patrol', version): path.read_bytes()})
 
     def refused(self) -> str:
         before = self.folder.current()

@@ -38,9 +38,9 @@ class Robot:
 
     def __init__(self, name: str, home: Path, spark: Spark, environ: dict[str, str]) -> None:
         self.environ = {**environ, 'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': name, 'SHADOWHOUND_POLICY': spark.name}
+        self.environ['SHADOWHOUND_POLICY_KEYS'] = str(spark.keys)
         self.folder = PolicyFolder(home)
-        self.folder.make()
-        (self.folder.path / 'keys' / 'spark.pub').write_bytes(spark.public.read_bytes())
+        spark.trusted_by(self.folder)
 
     def verb(self, *arguments: str, code: int = 0) -> Any:
         """What it prints, of JSON what that says."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import threading
 import time
@@ -20,6 +19,7 @@ from shadowhound_data_logger.errors import PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.policies import sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
+from shadowhound_data_logger.policies.trust import target_of
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -100,23 +100,26 @@ def spark(seaweed: Tower, tmp_path: Path) -> Iterator[Spark]:
     """Version 1 of 100 MB and version 2 of 10 MB, in the bucket."""
     spark = Spark(tmp_path / 'spark')
     client = bucket_of(seaweed)
-    keys = []
+    manifests = {}
     for version, floats in ((1, 25_000_000), (2, 2_500_000)):
         packed, _ = spark.packed(version, linear(0.1 * version, extra=floats))
+        manifests[target_of('go2', 'go2_patrol', version)] = (packed / 'manifest.json').read_bytes()
         for path in packed.rglob('*'):
             if path.is_file():
-                keys.append(f'policies/go2/go2_patrol_v{version}/{path.relative_to(packed).as_posix()}')
-                client.put_object(Bucket='lerobot', Key=keys[-1], Body=path.read_bytes())
+                key = f'policies/go2/go2_patrol_v{version}/{path.relative_to(packed).as_posix()}'
+                client.put_object(Bucket='lerobot', Key=key, Body=path.read_bytes())
+    with closing(S3Store(seaweed.store_settings(), UploadSettings())) as store:
+        store.open()
+        spark.signing(store).publish(manifests)
     yield spark
-    for key in keys:
-        client.delete_object(Bucket='lerobot', Key=key)
+    for entry in client.list_objects_v2(Bucket='lerobot', Prefix='policies/')['Contents']:
+        client.delete_object(Bucket='lerobot', Key=entry['Key'])
 
 
 def follow(seaweed: Tower, spark: Spark, home: Path, version: int, port: int | None = None, max_mbps: float = 0.0) -> None:
     """A robot takes a version, its smoke run aside."""
     folder = PolicyFolder(home)
-    folder.make()
-    shutil.copy(spark.public, folder.path / 'keys')
+    spark.trusted_by(folder)
     registry = Aliases()
     registry.say('champion', version)
     url = f'http://127.0.0.1:{port}' if port else seaweed.endpoint_url

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a p
 
 
 def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keygen, pack, sign and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
+    """Keys, pack and publish on Spark; sync, list, show, rollback, use, pin and unpin on Thor; all by the verbs."""
     monkeypatch.setattr(registry, 'PAGE', 1)  # as many answers as there are versions
     client = bucket_of(tower)
     name = f'patrol_{uuid4().hex[:8]}'
@@ -35,11 +35,10 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
         return json.loads(done.output) if '--json' in arguments else done.output
 
     def packed(folder: str, gain: float, *arguments: str) -> str:
-        """The id of what is in the folder then, signed."""
+        """The id of what is in the folder then."""
         of_training = trained(tmp_path / f'trained_{folder}', linear(gain))
         made = run(spark, 'pack', str(of_training), '--name', name, '--smoke', f'{of_training}.npz', '--p99-ms', '5000',
                    '-o', str(tmp_path / folder), '--json', *arguments)  # fmt: skip
-        run(spark, 'sign', str(tmp_path / folder), '--key', str(key))
         return str(made['policy'])
 
     def publish(version: int) -> str:
@@ -47,12 +46,11 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
         run(spark, 'publish', str(tmp_path / f'packed_{version}'), '--alias', 'champion')
         return made
 
-    key = tmp_path / 'spark.key'
-    run(spark, 'keygen', str(key))
+    made = run(spark, 'keys', '--json')
     first = publish(1)
     assert first.startswith(f'{name}@1#')
     run(thor, 'list', '--json')
-    shutil.copy(tmp_path / 'spark.key.pub', tmp_path / 'thor' / 'policies' / 'keys')
+    shutil.copy(made['root'], tmp_path / 'thor' / 'policies')
     assert run(thor, 'sync', '--json')['done'] == 'activated'
     of_another = {'Bucket': 'lerobot', 'Key': f'policies/go2/{name}_v2/model.onnx'}
     client.put_object(Body=b'of a publication that was cut off', **of_another)
@@ -70,11 +68,11 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     assert run(thor, 'sync', '--json')['active'] == second
     assert run(thor, 'sync', '--json')['done'] == 'unchanged'
     assert first in run(thor, 'rollback')
-    assert [(row['policy'], row['active'], bool(row['why_not'])) for row in run(thor, 'list', '--json')] == [
+    assert [(row['policy'], row['active'], bool(row['why_not'])) for row in run(thor, 'list', '--json')['policies']] == [
         (first, True, False), (second, False, True)]  # fmt: skip
     run(thor, 'use', f'{name}@2')
     assert run(thor, 'sync', '--json') == {'wanted': second, 'active': second, 'done': 'pinned', 'p99_ms': None,
-                                           'fetched_bytes': 0, 'begun_anew': 0}  # fmt: skip
+                                           'fetched_bytes': 0, 'begun_anew': 0, 'stale': ''}  # fmt: skip
     assert run(thor, 'unpin') == 'follows the registry again\n'
     run(thor, 'pin')
     assert run(thor, 'show', '--json')['policy'] == second

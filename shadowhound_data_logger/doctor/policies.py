@@ -1,0 +1,29 @@
+"""Policies of this robot: whether what signers say is fresh, so that new versions are taken and stolen keys are replaced."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Final
+
+from shadowhound_data_logger.doctor.model import Context, Result, ok, warning
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.trust import follows_signers, why_stale
+
+NAME: Final = 'policies'
+
+
+def check(context: Context) -> Iterator[Result]:
+    """Asks neither the store nor the registry: what was verified last is on the disk."""
+    folder = PolicyFolder(context.settings.home)
+    if not follows_signers(folder.path):
+        yield ok(NAME, 'no policies are followed here')
+    elif why := why_stale(folder.path, time.time_ns()):
+        yield warning(
+            'policies.stale',
+            f'no new version is taken: {why}',
+            'nobody signs any more, somebody keeps it from this robot, policy run does not run, or a clock is wrong',
+            'shadowhound-data policy sync ; shadowhound-data doctor --only clock',
+        )
+    else:
+        yield ok(NAME, f'what signers say is fresh; active is {folder.current() or "no policy"}')
