@@ -118,8 +118,9 @@ def asked(root: Path) -> dict[str, object]:
     spool: Spool = opened(root)
     with spool._index.transaction():
         spool._index._db.executemany(
-            'INSERT INTO objects (bucket, key, state, priority, protected, sensor, topic, type, samples, bytes, sha256,'
-            " content_type, metadata, t_start_ns, t_end_ns, created_ns) VALUES ('sensor-data', ?, 'kept', 5, 0, 'camera',"
+            'INSERT INTO objects (bucket, key, state, priority, protected, waits_for, on_request, event, mission, sensor, topic,'
+            " type, samples, bytes, sha256, content_type, metadata, t_start_ns, t_end_ns, created_ns)"
+            " VALUES ('sensor-data', ?, 'kept', 5, 0, 'upload.when', 1, 0, '', 'camera',"
             " '/camera', 't', 1, 50000, '0', 'image/jpeg', '{}', 1, 1, 1)",
             ((f'thor/camera/{number:08d}.jpg',) for number in range(ASKED)),
         )  # fmt: skip

@@ -224,7 +224,7 @@ class FullDisk:
         evicted = {each['file'] for each in bag.manifest['missing'] if each['what'] == EVICTED}
         with closing(Index(self._home / 'spool' / 'index.db', read_only=True)) as index:
             index.open()
-            states = {row['key']: row['state'] for row in index.with_prefix(BUCKET, f'{ROBOT}/rosbags/')}
+            states = {row['key']: row['state'] for row in index.objects.with_prefix(BUCKET, f'{ROBOT}/rosbags/')}
         others = {path.name: states.get(f'{ROBOT}/rosbags/{bag.folder.name}/{path.name}') for path in bag.slices
                   if path.name not in told}  # fmt: skip
         fine = all(name in evicted and state == 'evicted' for name, state in others.items())

@@ -166,7 +166,7 @@ def began(node: Node) -> dict[str, int]:
     """By topic, the number of the first message that was heard; DDS counts from 1."""
     with closing(Index(node.home / 'spool' / 'index.db', read_only=True)) as index:
         index.open()
-        return {row.topic: (row.first or 1) - 1 for row in reversed(index.publishers()) if row.publisher != WRONG_TYPE}
+        return {row.topic: (row.first or 1) - 1 for row in reversed(index.accounts.publishers()) if row.publisher != WRONG_TYPE}
 
 
 Came = dict[str, dict[int, int]]

@@ -342,7 +342,7 @@ class Weeks:
             self.now_s += 60.0
             self.spool.commit(self.catalogue.due())
             self._send()
-            if not self._query('SELECT 1 FROM untold LIMIT 1') and not self._query(
+            if not self._query('SELECT 1 FROM unreported LIMIT 1') and not self._query(
                 "SELECT 1 FROM objects WHERE state = 'pending' LIMIT 1"
             ):
                 return True

@@ -87,7 +87,7 @@ def _rows(spool: Path, robot: str, *states: State) -> Iterator[tuple[str, str, s
     index = Index(spool / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        rows = index.with_prefix(BUCKET, prefix, states)
+        rows = index.objects.with_prefix(BUCKET, prefix, states)
     for row in rows:
         bag, _, name = row['key'][len(prefix) :].partition('/')
         yield bag, name or bag, row

@@ -178,7 +178,7 @@ def _rows(spool: Spool, plan: UploadPlan) -> dict[str, sqlite3.Row]:
     index = Index(spool.root / 'index.db', read_only=True)
     index.open()
     with closing(index):
-        return {file.key: row for file in plan.files if (row := index.row(BUCKET, file.key)) is not None}
+        return {file.key: row for file in plan.files if (row := index.objects.row(BUCKET, file.key)) is not None}
 
 
 def _check_names(spool: Spool, plan: UploadPlan) -> None:

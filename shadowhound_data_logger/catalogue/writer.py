@@ -93,11 +93,12 @@ class CatalogueWriter:
         if not self._settings.enabled:
             with closing(Index(self._spool / 'index.db')) as index:
                 index.open()
-                index.clear_uncatalogued()
+                with index.transaction():
+                    index.catalog.clear()
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            listed = index.uncatalogued(MOST_ROWS)
+            listed = index.catalog.uncatalogued(MOST_ROWS)
         there = {item.id for item in listed}
         # A part takes all its rows at once: where one has gone without the others, another process's part has it, not ours.
         self._handed = [numbers for numbers in self._handed if numbers <= there]
@@ -126,7 +127,7 @@ class CatalogueWriter:
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            listed = index.untold(MOST_ROWS)
+            listed = index.catalog.unreported(MOST_ROWS)
         there = {(item.id, state) for state, _, item in listed}
         self._told = [told for told in self._told if told <= there]
         handed = frozenset[tuple[int, str]]().union(*self._told)
@@ -196,7 +197,7 @@ class _GapParts:
                 is_dated_now = not self._boots.issuperset(offsets) and index.gaps.has_undated()
                 self._boots = frozenset(offsets)
                 before = self._missing
-                self._missing = index.missing(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR)
+                self._missing = index.catalog.missing(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR)
                 is_new_index = self._version > newest
                 if is_dated_now or is_new_index or again != self._again or not self._missing <= before:
                     self._version, self._again = 0, again
@@ -204,7 +205,7 @@ class _GapParts:
                 found = index.gaps.changed(self._version, MOST_ROWS, offsets)
                 self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
                 # A watermark must not be in the store before a part with gaps that is told before it.
-                is_waiting = index.has_waiting(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR, priority=PRIORITY)
+                is_waiting = index.catalog.has_waiting(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR, priority=PRIORITY)
                 marks = [] if self.has_more or is_waiting else index.gaps.watermarks()
         if found:
             self._version = found[-1].version

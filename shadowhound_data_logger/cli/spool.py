@@ -35,9 +35,10 @@ from shadowhound_data_logger.config import Settings
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus, delivering
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, tell_gaps_again, usage_by_sensor
 from shadowhound_data_logger.spool.listing import retry as retry_objects
+from shadowhound_data_logger.spool.object_table import MISSING
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits, robots, targets
 from shadowhound_data_logger.spool.status import read as read_status

@@ -64,7 +64,7 @@ def _index(path: Path) -> tuple[SpoolUsage, dict[str, int]]:
     try:
         index.open()
         index.check()
-        return usage_of(index, path.parent, time.time_ns()), index.quarantine_reasons()
+        return usage_of(index, path.parent, time.time_ns()), index.overview.quarantine_reasons()
     finally:
         index.close()
 

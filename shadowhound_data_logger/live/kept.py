@@ -79,7 +79,7 @@ class SpoolKept:
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
         """Those that are kept. Raises SpoolError."""
         want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
-        found = self._read(lambda index: list(index.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns)))
+        found = self._read(lambda index: list(index.overview.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns)))
         return [
             {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
              'where': ON_ROBOT}

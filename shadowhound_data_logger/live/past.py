@@ -232,7 +232,7 @@ class SpoolPast:
     def days(self, robot: str) -> list[str]:
         """Raises SpoolError."""
         with closing(self._index()) as index, _reading(self._spool):
-            numbers, folders = index.recorded_days(robot), index.folders(robot)
+            numbers, folders = index.overview.recorded_days(robot), index.overview.folders(robot)
         found = {f'{utc(number * DAY_NS):%Y-%m-%d}' for number in numbers}
         for folder in folders:
             at_ns = _stamp(f'{folder}000000_') or _bag_begin(folder.rstrip('/'))
@@ -250,9 +250,9 @@ class SpoolPast:
             row.get('sensor'): topic for topic, row in read_status(self._spool, robot, self._clock).get('topics', {}).items()
         }
         with closing(self._index()) as index, _reading(self._spool):
-            found = [self._of_row(row) for row in index.recorded(robot, begin_ns, begin_ns + DAY_NS)]
+            found = [self._of_row(row) for row in index.overview.recorded(robot, begin_ns, begin_ns + DAY_NS)]
             topics |= {one.sensor: one.topic for one in found if one.topic}
-            for bucket, key, sensor, size, settled_s in index.recorded_compact(robot, date.replace('-', '')):
+            for bucket, key, sensor, size, settled_s in index.overview.recorded_compact(robot, date.replace('-', '')):
                 bag = key.partition('/rosbags/')[2].partition('/')[0]
                 at_ns = (_bag_begin(bag) if bag else _stamp(key)) or 0
                 if begin_ns <= at_ns < begin_ns + DAY_NS:

@@ -215,6 +215,6 @@ def _has(index: Index, item: DataObject) -> bool:
     folder, slash, name = item.key.rpartition('/')
     stem, dot, extension = name.partition('.')
     first = f'{folder}{slash}{stem}'
-    found = index.with_content(item.bucket, first, content_sha256(item.body))
+    found = index.objects.with_content(item.bucket, first, content_sha256(item.body))
     numbered = re.compile(rf'{re.escape(first)}(_[1-9][0-9]*)?{re.escape(dot + extension)}')
     return any(numbered.fullmatch(row['key']) for row in found)

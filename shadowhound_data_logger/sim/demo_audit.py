@@ -81,8 +81,8 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     index = Index(spool / 'index.db', read_only=True)
     index.open()
     try:
-        rows = index.rows()
-        publishers = index.publishers()
+        rows = index.objects.rows()
+        publishers = index.accounts.publishers()
     finally:
         index.close()
     before: Counter[str] = Counter()

@@ -23,7 +23,8 @@ from shadowhound_data_logger.keys import check_key
 from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State, waits_for
 from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, content_sha256, describe, description, facts
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.object_table import MISSING
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.retention import NO_ROOM
 
@@ -141,7 +142,7 @@ class Adding:
         if state in _STAYS and isinstance(item.body, bytes):
             item = self._staged(item)  # it looked like a repeat, of what another process has evicted meanwhile
             self._sync()
-        number = self._index.insert(item, key, sha256, state, reason, metadata, self._now_ns)
+        number = self._index.objects.insert(item, key, sha256, state, reason, metadata, self._now_ns)
         if words.GAP_VERSION in item.metadata:
             self._index.gaps.set_told(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
         path = self._tree.part(number)
@@ -215,5 +216,5 @@ class Adding:
     def _add_repeat(self, item: DataObject, key: str, metadata: Mapping[str, str]) -> None:
         sha256 = content_sha256(item.body)
         said = {**metadata, words.SHA256: sha256}
-        number = self._index.insert(item, key, sha256, State.PENDING, None, said, self._now_ns)
-        self._index.move([number], State.DEDUPLICATED, None, self._now_ns)
+        number = self._index.objects.insert(item, key, sha256, State.PENDING, None, said, self._now_ns)
+        self._index.objects.move([number], State.DEDUPLICATED, None, self._now_ns)

@@ -22,7 +22,8 @@ from shadowhound_data_logger.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.files import Tree, description_of
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.object_table import MISSING
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ class Adoption:
             if not _can_be_named(bucket, key):
                 self._foreign(path)
                 continue
-            row = self._index.row(bucket, key)
+            row = self._index.objects.row(bucket, key)
             if row is not None and row['state'] in _IN_SPOOL and row['reason'] != MISSING:
                 continue
             try:
@@ -98,7 +99,7 @@ class Adoption:
         """Keys of objects in the spool that begin so. A query a file would make a start with 100,000 of them take seconds."""
         if not _can_be_named(bucket, f'{prefix}x'):
             return frozenset()
-        return self._index.keys_in_spool(bucket, prefix)
+        return self._index.objects.keys_in_spool(bucket, prefix)
 
     def _known(self, row: sqlite3.Row, sha256: str, path: Path, ready: Path) -> None:
         """A file whose object is missing or has left the spool."""
@@ -107,7 +108,7 @@ class Adoption:
         elif row['state'] in _IN_SPOOL:
             if path == ready or self._tree.place(path, ready):
                 with self._index.transaction():
-                    self._index.set_found(row['id'])
+                    self._index.objects.set_found(row['id'])
                 self._report.counts['missing files back'] += 1
         else:
             self._tree.remove(path)  # delivered, but the process died before it removed the file
@@ -122,18 +123,18 @@ class Adoption:
         if not self._group:
             return
         with self._index.transaction():
-            self._session = self._session or self._index.begin_session('recovered', '', 0, self._now_ns)
+            self._session = self._session or self._index.accounts.begin_session('recovered', '', 0, self._now_ns)
             for found in self._group:
                 item = found.item
-                if self._index.has(item.bucket, item.key):
+                if self._index.objects.has(item.bucket, item.key):
                     self._foreign(found.path)  # the same key lies in two folders: the first one counts
                     continue
-                self._index.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
+                self._index.objects.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
                 for account, count in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
                     self._topics[account] = _more(self._topics.get(account), account, count, item)
                 self._report.counts['files adopted'] += 1
-            self._index.write(self._session, AccountSnapshot(tuple(self._topics.values()), ()))
-            self._index.end_session(self._session, self._now_ns)
+            self._index.accounts.write(self._session, AccountSnapshot(tuple(self._topics.values()), ()))
+            self._index.accounts.end_session(self._session, self._now_ns)
         self._group.clear()
 
 

@@ -18,7 +18,8 @@ from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.keys import check_key, unique
 from shadowhound_data_logger.model import Binding, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
-from shadowhound_data_logger.spool.index import MISSING, Index, spooled
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.object_table import MISSING, spooled
 
 _Row = Mapping[str, Any]
 """As of ``Index.full_row``."""
@@ -35,7 +36,7 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
     before: list[_Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for binding in bindings:
-            row = index.full_row(binding.id)
+            row = index.objects.full_row(binding.id)
             if row is not None and row['state'] == State.HELD.value and _to_part(tree, row):
                 before.append(row)
                 _change(index, row, binding, now_ns)
@@ -50,10 +51,10 @@ def release(index: Index, tree: Tree, wanted: Sequence[tuple[int, int]]) -> list
     before: list[_Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for number, priority in wanted:
-            row = index.full_row(number)
+            row = index.objects.full_row(number)
             if row is not None and row['state'] == State.KEPT.value and _to_part(tree, row):
                 before.append(row)
-                index.release(number, priority)
+                index.objects.release(number, priority)
                 renew(index, number, tree.part(number))
         if before:
             tree.sync_incoming()
@@ -63,7 +64,7 @@ def release(index: Index, tree: Tree, wanted: Sequence[tuple[int, int]]) -> list
 def _placed(index: Index, tree: Tree, before: Sequence[_Row]) -> list[SpooledObject]:
     """It is durable: give the files their names; returns what may be shipped."""
     pending = []
-    for row in (row for old in before if (row := index.full_row(old['id'])) is not None):
+    for row in (row for old in before if (row := index.objects.full_row(old['id'])) is not None):
         if row['state'] == State.KEPT.value:
             tree.place(tree.part(row['id']), tree.path(State.KEPT, None, row['bucket'], row['key']))
         elif row['state'] == State.PENDING.value:
@@ -73,7 +74,7 @@ def _placed(index: Index, tree: Tree, before: Sequence[_Row]) -> list[SpooledObj
 
 def renew(index: Index, number: int, path: Path) -> None:
     """Have a file say what its row says now. A file that is gone says nothing; raises OSError when the disk fails."""
-    row = index.full_row(number)
+    row = index.objects.full_row(number)
     if row is not None:
         _describe(path, row)
 
@@ -85,7 +86,7 @@ def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> 
     """
 
     def is_free(attempt: int) -> bool:
-        return (key := unique(wanted, attempt)) == own or not index.has(bucket, key)
+        return (key := unique(wanted, attempt)) == own or not index.objects.has(bucket, key)
 
     if is_free(0):
         return wanted
@@ -101,7 +102,7 @@ def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> 
 def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
     """Whether this content was given the wanted key, or one of its ``_1``, ``_2``, ..., and its file is not missing."""
     attempt = 0
-    while (row := index.row(bucket, unique(wanted, attempt))) is not None:
+    while (row := index.objects.row(bucket, unique(wanted, attempt))) is not None:
         if row['sha256'] == sha256 and row['reason'] != MISSING:
             return True
         attempt += 1
@@ -125,7 +126,7 @@ def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
     state = State.KEPT if metadata.get(words.SHIP) == words.ON_REQUEST else State.PENDING
-    index.set_bound(key, binding, metadata, created_ns, state)
+    index.objects.set_bound(row, key, binding, metadata, created_ns, state)
 
 
 def _put_back(tree: Tree, before: Sequence[_Row]) -> None:

@@ -58,7 +58,7 @@ class Deliveries:
             connection.execute('PRAGMA locking_mode = EXCLUSIVE')
             connection.execute('PRAGMA synchronous = NORMAL')
             connection.executescript(_SCHEMA)
-            name = f'{audit} {self._index.first_session()}'
+            name = f'{audit} {self._index.accounts.first_session()}'
             if connection.execute('SELECT name FROM audit').fetchall() != [(name,)]:
                 connection.executescript('BEGIN; DELETE FROM audit; DELETE FROM sound; COMMIT')
                 connection.execute('INSERT INTO audit VALUES (?)', (name,))
@@ -82,13 +82,13 @@ class Deliveries:
         """
         last = 0
         asked: set[int] = set()
-        while page := self._of_index(partial(self._index.delivered, last, PAGE)):
+        while page := self._of_index(partial(self._index.history.delivered, last, PAGE)):
             last = page[-1][0]
             asked.update(number for number, _ in page)
             yield from self._not_noted(page)
         place = (0, '')
         while True:
-            page, place = self._of_index(partial(self._index.delivered_compact, place, PAGE))
+            page, place = self._of_index(partial(self._index.history.delivered_compact, place, PAGE))
             if not page:
                 return
             yield from self._not_noted([(number, item) for number, item in page if number not in asked])
@@ -111,15 +111,15 @@ class Deliveries:
 
     def known(self) -> int:
         """Delivered objects that the index remembers; those of longer ago are forgotten (``spool.remember_days``)."""
-        return self._of_index(self._index.delivered_count)
+        return self._of_index(self._index.history.delivered_count)
 
     def forgotten(self) -> int:
         """Delivered objects of longer ago, which the index counts but cannot name any more; parts of the catalogue among them."""
-        return self._of_index(self._index.forgotten_count)
+        return self._of_index(self._index.history.forgotten_count)
 
     def since_ns(self) -> int | None:
         """When the first of those that the index remembers was delivered; None without any."""
-        return self._of_index(self._index.delivered_since_ns)
+        return self._of_index(self._index.history.delivered_since_ns)
 
     @property
     def _db(self) -> sqlite3.Connection:

@@ -1,15 +1,14 @@
-"""The table of the gap journal (gaps.py): every statement that reads or writes it, but for the triggers in schema.py."""
+"""The table of the gap journal (gaps.py): every statement that reads or writes it, except the triggers in schema.sql."""
 
 from __future__ import annotations
 
-import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, UNTIMED, Gap, GapRow, TakenBack, Watermark, split
-from shadowhound_data_logger.spool.schema import MERGE, NEXT_VERSION
+from shadowhound_data_logger.spool.table import Table
 
 MOST_WAITING: Final = 5_000
 """Objects of a bucket that are looked at for the first stamp of each account: some 20 ms."""
@@ -21,6 +20,12 @@ SELECT session, robot, started_ns, received = skipped + stored
 FROM accounts JOIN sessions ON id = session
 WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
 ORDER BY robot, topic, session"""
+NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
+MERGE: Final = """
+  ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
+    from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
+    to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END"""
+"""What an INSERT does if the row exists; the triggers of schema.sql do the same."""
 MOST_ROWS: Final = 500_000
 """Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
 _TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_told) ELSE ifnull((
@@ -43,14 +48,8 @@ FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNTOLD}) = 
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 
-class GapTable:
-    """The table of the gap journal.
-
-    Part of an open index, on its connection. Methods that write belong in one of its transactions.
-    """
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
+class GapTable(Table):
+    """The table of the gap journal."""
 
     def write(self, session: int, rows: Iterable[GapRow], taken_back: Iterable[TakenBack]) -> None:
         """Change the journal, in the transaction that writes the accounts."""

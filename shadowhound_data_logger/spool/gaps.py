@@ -4,7 +4,7 @@ The accounts say how many; a row says when. Whoever counts a loss adds its times
 ``TopicGaps.settle`` compares what was added with the accounts: losses without times get those of the newest messages at this
 commit and at the one before, and counts that the accounts took back leave the newest rows. So for each topic, kind and cause
 the rows add up to the account at every commit, in the same transaction. Objects that are evicted or quarantined have theirs
-by triggers (schema.py).
+by triggers (schema.sql).
 
 Changed rows get a new version, and a row that says nothing any more stays with the count 0 until it is forgotten: whoever
 copies the journal asks for what is newer than the last version that it saw.

@@ -12,7 +12,7 @@ from typing import Any, Final
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import State
 from shadowhound_data_logger.spool import act_record, clock_record
-from shadowhound_data_logger.spool.account_rows import BY_ARRIVAL, CORRECTED, OtherTypeRow
+from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
@@ -28,7 +28,7 @@ def read(spool: Path, robot: str) -> dict[str, Any]:
     with _reading(spool) as index:
         known = clock_record.read(spool, robot)
         del known['offsets']
-        clock = {**known, 'held': index.held_count('clock')}
+        clock = {**known, 'held': index.objects.held_count('clock')}
         return {**of_index(index, robot), 'clock': clock, 'acts': act_record.read(spool, robot)}
 
 
@@ -66,13 +66,12 @@ def _reading(spool: Path) -> Iterator[Index]:
 def of_index(index: Index, robot: str) -> dict[str, Any]:
     """The ledger of an open index, all of one instant."""
     with index.snapshot():
-        topics, publishers, tally, others = index.topics(), index.publishers(), index.tally(), index.other_types()
-        journal, remarks = index.gaps.sums(), index.remarks()
+        topics, publishers, others = index.accounts.topics(), index.accounts.publishers(), index.accounts.other_types()
+        tally, journal = index.overview.tally(), index.gaps.sums()
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
     accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
     for topic, row in accounts.items():
         row['gaps'] = _journaled(topic, journal)
-        row |= {kind: remarks.get((topic, kind), {}) for kind in (BY_ARRIVAL, CORRECTED)}
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip
@@ -155,6 +154,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         **(_whole(received, grades) if heard and heard[-1] != RECEIVED_ONLY else {**_UNKNOWN, 'received': received}),
         'by_grade': grades,
         'skipped': sum(row.skipped for row in rows),
+        'by_arrival': _sum(row.by_arrival for row in rows),
         'rejected': _sum(row.rejected for row in rows),
         'other_types': _other_types(row for row in others if row.topic == topic),
         'dropped': _sum(row.dropped for row in rows),

@@ -59,14 +59,14 @@ class Retried:
 
 def usage_by_sensor(index: Index) -> list[SensorUsage]:
     """Of an open index, the most important first. Raises sqlite3.Error."""
-    return [SensorUsage(*row) for row in index.usage_by_sensor()]
+    return [SensorUsage(*row) for row in index.overview.by_sensor()]
 
 
 def objects(index: Index, root: Path, *, state: State | None = None, sensor: str | None = None,
             prefix: str = '') -> Iterator[Listed]:  # fmt: skip
     """Of an open index, as they were spooled; ``prefix`` is how ``bucket/key`` begins. Raises sqlite3.Error."""
     tree = Tree(root)
-    for bucket, key, of, now, reason, size, created_ns in index.listed(state, sensor, prefix):
+    for bucket, key, of, now, reason, size, created_ns in index.overview.objects(state, sensor, prefix):
         path = tree.path(State(now), reason, bucket, key).relative_to(root)
         yield Listed(bucket, key, of, now, reason, size, created_ns, str(path))
 
@@ -83,11 +83,11 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
     with flock(root / 'recovery.lock'):
         index.open()
         try:
-            wanted = [row for row in index.quarantined(reason) if not names or f'{row["bucket"]}/{row["key"]}' in names]
+            wanted = [row for row in index.objects.quarantined(reason) if not names or f'{row["bucket"]}/{row["key"]}' in names]
             moved = [row for row in wanted if _moved(tree, row['reason'], row['bucket'], row['key'])]
             with index.transaction():
                 for row in moved:
-                    index.set_found(row['id'])
+                    index.objects.set_found(row['id'])
         finally:
             index.close()
     return Retried(len(moved), sum(row['bytes'] for row in moved), len(wanted) - len(moved))

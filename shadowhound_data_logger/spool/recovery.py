@@ -32,8 +32,9 @@ from shadowhound_data_logger.spool.ballast import says_full
 from shadowhound_data_logger.spool.binding import renew
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import DROPPED, EXACT, GapRow, TopicGaps
-from shadowhound_data_logger.spool.index import MISSING, Index
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.ledger import imbalances, of_index
+from shadowhound_data_logger.spool.object_table import MISSING, STATES_IN_SPOOL
 
 log = logging.getLogger(__name__)
 
@@ -102,10 +103,10 @@ def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log
     _follow_rows(tree, index, now_ns, report)
     _settle_parts(tree, index, report, adopt=_went_back(tree, index, has_log=has_log))
     Adoption(tree, index, now_ns, report).run()
-    for session in index.sessions(ended=False):
+    for session in index.accounts.sessions(ended=False):
         if _is_dead(tree, session):
             _settle_session(index, session, now_ns, report)
-    for session in set(tree.sessions()).difference(index.sessions(ended=False)):
+    for session in set(tree.sessions()).difference(index.accounts.sessions(ended=False)):
         if _is_dead(tree, session):
             tree.remove(tree.session(session))
     for session, body in tree.staged():
@@ -124,10 +125,11 @@ def _stay_apart(tree: Tree, index: Index, now_ns: int) -> None:
     Numbers begin with the time in microseconds: a recovery adopts more than one file a millisecond, so with milliseconds two
     indexes that were rebuilt shortly after each other could give out the same number.
     """
-    known = {*index.sessions(ended=False), *index.sessions(ended=True)}
+    known = {*index.accounts.sessions(ended=False), *index.accounts.sessions(ended=True)}
     strangers = set(tree.sessions()).difference(known)
     if strangers:
-        index.begin_after(max(strangers), now_ns // MICROSECOND)
+        with index.transaction():
+            index.accounts.begin_after(max(strangers), now_ns // MICROSECOND)
 
 
 def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
@@ -135,7 +137,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
     missing: list[int] = []
     damaged: list[tuple[sqlite3.Row, Path]] = []
     staged = _Staged(tree)
-    for row in index.in_spool():
+    for row in index.objects.in_spool():
         state = State(row['state'])
         if state is State.QUARANTINED and row['reason'] == MISSING:
             continue
@@ -157,7 +159,7 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
             if state is State.QUARANTINED and found == ready and tree.size(found) == row['bytes']:
                 # Moved there by hand, to be tried again; or quarantined when the power went, and then a try costs nothing.
                 with index.transaction():
-                    index.set_found(row['id'])
+                    index.objects.set_found(row['id'])
                 report.counts['quarantined files to be tried again'] += 1
             elif found != path and tree.place(found, path):
                 where = path
@@ -167,8 +169,8 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
             damaged.append((row, where))
     if missing or damaged:
         with index.transaction():
-            report.counts['files missing'] += index.set_missing(missing, now_ns)
-            index.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
+            report.counts['files missing'] += index.objects.set_missing(missing, now_ns)
+            index.objects.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
     for row, where in damaged:
         tree.place(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
         report.counts['files damaged'] += 1
@@ -191,8 +193,8 @@ class _Staged:
 
 def _went_back(tree: Tree, index: Index, *, has_log: bool) -> bool:
     """Whether commits may have been lost with the index, or with the log beside it."""
-    dead = [session for session in index.sessions(ended=False) if _is_dead(tree, session)]
-    known = {*index.sessions(ended=False), *index.sessions(ended=True)}
+    dead = [session for session in index.accounts.sessions(ended=False) if _is_dead(tree, session)]
+    known = {*index.accounts.sessions(ended=False), *index.accounts.sessions(ended=True)}
     return not known or not known.issuperset(tree.sessions()) or (bool(dead) and not has_log)
 
 
@@ -201,7 +203,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
     # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
-            if index.is_in_spool(number):
+            if index.objects.state(number) in STATES_IN_SPOOL:
                 _remove_unthinned(tree, index, number, part, report)
                 continue
             place = place_said(tree, part) if adopt else None
@@ -212,7 +214,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
 
 def _remove_unthinned(tree: Tree, index: Index, number: int, part: Path, report: Recovery) -> None:
     """Remove a part beside the whole file of a kept object: the smaller content that it did not get."""
-    row = index.full_row(number)
+    row = index.objects.full_row(number)
     if (
         row is not None
         and row['state'] == State.KEPT.value
@@ -243,7 +245,7 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
     """Close the accounts of a process that died: what was open is lost, and the ledger says so."""
     rows: list[TopicRow] = []
     lost: list[GapRow] = []
-    for row in index.topics(session):
+    for row in index.accounts.topics(session):
         if row.topic.startswith(SINKS):  # what is open there is in files, which the node looks for (Spool.carry)
             continue
         dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + row.open}
@@ -254,5 +256,5 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
             gaps.add(DROPPED, 'restart', row.open, row.last_kept_ns or row.heard_ns, row.heard_ns)
             lost += gaps.settle(row.topic, {(DROPPED, 'restart', EXACT): row.open})[0]
     with index.transaction():
-        index.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))
-        index.end_session(session, now_ns)
+        index.accounts.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))
+        index.accounts.end_session(session, now_ns)

@@ -76,10 +76,10 @@ class Repeats:
         last = self._next.get(_source(item))
         if not item.dedup or item.held or last is None or last.sha256 != sha256:
             return None
-        row = index.row(item.bucket, last.key)
+        row = index.objects.row(item.bucket, last.key)
         if row is None or row['state'] not in _HOLDS or row['sha256'] != last.sha256:
             return None  # evicted, say
-        index.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
+        index.objects.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
         return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), {words.CONTENT_KEY: last.key})
 

@@ -1,20 +1,19 @@
 """The rows of what was asked for: each request with what it found among the kept objects, and what became of that.
 
-An object that an open request waits for is not evicted (``Index.may_go``). What became of each is written by a trigger, in the
-transaction that changes the object (schema.py). Of a slice that is cut a request counts fewer bytes than it has: an estimate,
+An object that an open request waits for is not evicted (``KeptTable.evictable``). What became of each is written in the
+transaction that changes the object (``follow``). Of a slice that is cut a request counts fewer bytes than it has: an estimate,
 until the cut takes its place. Requests may be of very many objects, so nothing here changes more than ``PIECE`` rows at a time.
 """
 
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.spool.table import Table
 
 ACTIVE, DONE, EXPIRED, CANCELLED, REFUSED = 'active', 'done', 'expired', 'cancelled', 'refused'
 """States of a request; all but the first are final."""
@@ -111,11 +110,16 @@ class Progress(NamedTuple):
     """Keys of the manifests of the first bags that were cut for it."""
 
 
-class RequestTable:
-    """The requests in the index; the connection is the index's."""
+class RequestTable(Table):
+    """The requests, and the objects that each of them found."""
 
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
+    def follow(self, ids: Iterable[int]) -> None:
+        """These objects have a new state: what became of them is the outcome for each request that found them."""
+        self._db.executemany(
+            'UPDATE requested SET (outcome, bytes) = (SELECT state, bytes FROM objects WHERE objects.id = requested.id)'
+            ' WHERE id = ?',
+            ((number,) for number in ids),
+        )
 
     def rows(self) -> list[RequestRow]:
         """The oldest first."""
@@ -155,12 +159,11 @@ class RequestTable:
             'id, bucket, key, bytes, sensor, topic, t_start_ns, t_end_ns, metadata, state, ifnull(reason, state),'
             ' ifnull(settled_ns, 0)'
         )
-        is_on_request = f"CASE WHEN json_valid(metadata) THEN json_extract(metadata, '$.{words.SHIP}') = '{words.ON_REQUEST}' END"
         of_robot = 'key >= :first AND key < :after'
         query = (
             f"SELECT {columns} FROM objects WHERE state = 'kept' AND {of_robot} UNION SELECT {columns} FROM objects"  # noqa: S608
             f" WHERE state = 'pending' AND id IN (SELECT id FROM requested WHERE outcome = 'pending') AND {of_robot}"
-            f" UNION SELECT {columns} FROM objects WHERE state IN ('evicted', 'quarantined') AND {is_on_request}"
+            f" UNION SELECT {columns} FROM objects WHERE state IN ('evicted', 'quarantined') AND on_request"
             f' AND {of_robot} ORDER BY id'
         )
         for (number, bucket, key, size, sensor, topic, start_ns, end_ns, said, state, reason,

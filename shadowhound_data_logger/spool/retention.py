@@ -67,7 +67,7 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, keep: KeepSetti
     there -= sum(len(objects[place].body) for place in unkept if isinstance(objects[place].body, FileBody))
     if not rest or (over := _over(index, tree, settings, needed - leaving, there - beside)) <= 0:
         return RoomNeeded(frozenset(unkept), 0, len(unkept))
-    free, evictable = needed - over, index.evictable_bytes()
+    free, evictable = needed - over, index.objects.evictable_bytes()
     taken, given_up = 0, set[int]()
     for place in sorted(rest, key=lambda place: (not objects[place].protected, objects[place].priority, -place)):
         item = objects[place]
@@ -92,9 +92,9 @@ def _make_room_to_keep(index: Index, tree: Tree, settings: SpoolSettings, keep: 
     def over() -> tuple[int, int]:
         """By the disk, and by the limit."""
         short = settings.min_free_bytes + needed - leaving - tree.free_bytes() - there
-        return short, index.kept_bytes() + asked - keep.max_bytes if kept else 0
+        return short, index.kept.bytes() + asked - keep.max_bytes if kept else 0
 
-    while max(by := over()) > 0 and (rows := index.may_go(EVICTION_STEP)):
+    while max(by := over()) > 0 and (rows := index.kept.evictable(EVICTION_STEP)):
         left, count = max(by), 0
         while count < len(rows) and left > 0:
             left -= rows[count]['bytes']
@@ -114,7 +114,7 @@ def _make_room_to_keep(index: Index, tree: Tree, settings: SpoolSettings, keep: 
 
 def evict_old(index: Index, tree: Tree, keep: KeepSettings, now_ns: int) -> int:
     """Evict what has been kept for ``keep.days``, some of it at a time; returns how many objects. As of ``make_room``."""
-    rows = index.may_go(EVICTION_STEP, now_ns - round(keep.days * 24 * 3600 * SECOND))
+    rows = index.kept.evictable(EVICTION_STEP, now_ns - round(keep.days * 24 * 3600 * SECOND))
     if rows:
         _remove(index, tree, rows, KEEP_DAYS, now_ns)
     return len(rows)
@@ -122,14 +122,14 @@ def evict_old(index: Index, tree: Tree, keep: KeepSettings, now_ns: int) -> int:
 
 def thin_out(index: Index, tree: Tree, sha256_of: Mapping[int, str], now_ns: int) -> int:
     """Evict these where they are kept as they were and nobody asked for them; returns how many. As of ``make_room``."""
-    rows = [row for number, sha256 in sha256_of.items() if (row := index.may_thin(number, sha256)) is not None]
+    rows = [row for number, sha256 in sha256_of.items() if (row := index.kept.thinnable_row(number, sha256)) is not None]
     _remove(index, tree, rows, THINNED, now_ns)
     return len(rows)
 
 
 def _remove(index: Index, tree: Tree, rows: Sequence[Row | Mapping[str, Any]], reason: str, now_ns: int) -> None:
     with index.transaction():
-        index.move([row['id'] for row in rows], State.EVICTED, reason, now_ns)
+        index.objects.move([row['id'] for row in rows], State.EVICTED, reason, now_ns)
     for row in rows:
         tree.remove(tree.path(State(row['state']), row['reason'], row['bucket'], row['key']))
         tree.remove(tree.part(row['id']))
@@ -148,7 +148,7 @@ def is_short(tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject])
 def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:
     """Evict the least important, of these the oldest, until ``needed`` bytes fit; returns how many objects that took."""
     evicted = 0
-    while (over := _over(index, tree, settings, needed, there)) > 0 and (rows := index.evictable(EVICTION_STEP)):
+    while (over := _over(index, tree, settings, needed, there)) > 0 and (rows := index.objects.evictable(EVICTION_STEP)):
         count = 0
         while count < len(rows) and over > 0:
             over -= rows[count]['bytes']
@@ -165,7 +165,7 @@ def _cost(item: DataObject) -> int:
 def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int) -> int:
     """Bytes too many with ``needed`` more, by quota or file system, whichever is worse; ``there`` lie in it already."""
     free = tree.free_bytes() + there
-    return max(index.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - free)
+    return max(index.objects.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - free)
 
 
 class Shortage:

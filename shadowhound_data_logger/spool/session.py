@@ -32,15 +32,15 @@ class Session:
     def begin(cls, index: Index, tree: Tree, robot: str, clock: Clock) -> Session:
         """The caller holds the recovery lock: between row and file nobody may take it for dead."""
         with index.transaction():
-            number = index.begin_session(robot, clock.boot_id, os.getpid(), clock.wall_ns())
+            number = index.accounts.begin_session(robot, clock.boot_id, os.getpid(), clock.wall_ns())
         return cls(number, tree)
 
     def end(self, index: Index, snapshot: AccountSnapshot | None, now_ns: int) -> None:
         """Write the last accounts and close them, in one transaction."""
         with index.transaction():
             if snapshot:
-                index.write(self.number, snapshot)
-            index.end_session(self.number, now_ns)
+                index.accounts.write(self.number, snapshot)
+            index.accounts.end_session(self.number, now_ns)
 
     def leave(self) -> None:
         """Let go of the file."""
@@ -51,8 +51,8 @@ class Session:
 def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
     """Move what a robot's ended sessions left open to this one; its new rows. In a transaction, before it has any of the sink."""
     moved: dict[str, TopicRow] = {}
-    for number in index.sessions_with_open(robot, sink):
-        for row in index.topics(number):
+    for number in index.accounts.sessions_with_open(robot, sink):
+        for row in index.accounts.topics(number):
             if row.topic.startswith(sink) and row.open > 0:
                 before = moved.get(row.topic) or TopicRow(row.topic, '', '', 0, 0, 0, {}, {}, 0)
                 unknown = min(row.unknown, row.open)
@@ -62,6 +62,6 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
                     estimated=before.estimated + estimated, unknown=before.unknown + unknown,
                     last_kept_ns=max(before.last_kept_ns, row.last_kept_ns), heard_ns=max(before.heard_ns, row.heard_ns),
                 )  # fmt: skip
-                index.take_over(number, row.topic, row.open, estimated, unknown)
-    index.write(session, AccountSnapshot(tuple(moved.values()), ()))
+                index.accounts.take_over(number, row.topic, row.open, estimated, unknown)
+    index.accounts.write(session, AccountSnapshot(tuple(moved.values()), ()))
     return list(moved.values())

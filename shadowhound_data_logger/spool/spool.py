@@ -32,7 +32,8 @@ from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast, says_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
-from shadowhound_data_logger.spool.index import Index, lost, spooled
+from shadowhound_data_logger.spool.index import Index, lost
+from shadowhound_data_logger.spool.object_table import spooled
 from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.request_table import (
@@ -190,7 +191,7 @@ class Spool:
         settings that do not hold (``model.waits_for``).
         """
         with self._lock:
-            rows = self._index.pending(limit + len(exclude), oldest=oldest, without=without, waiting_for=waiting_for)
+            rows = self._index.objects.pending(limit + len(exclude), oldest=oldest, without=without, waiting_for=waiting_for)
         parts = frozenset(self._tree.incoming.iterdir())  # one question for all, because nearly none is there
         found: list[SpooledObject] = []
         for row in rows:
@@ -203,7 +204,7 @@ class Spool:
 
     def has(self, bucket: str, key: str) -> bool:
         """Whether the name is taken. Waits for no commit; raises sqlite3.Error."""
-        return self._view.has(bucket, key)
+        return self._view.objects.has(bucket, key)
 
     @property
     def evicted(self) -> int:
@@ -212,7 +213,7 @@ class Spool:
 
     def states(self, bucket: str, prefix: str) -> dict[str, State]:
         """What became of every object whose key begins so, by key. Waits for no commit; raises sqlite3.Error."""
-        return {row['key']: State(row['state']) for row in self._view.with_prefix(bucket, prefix)}
+        return {row['key']: State(row['state']) for row in self._view.objects.with_prefix(bucket, prefix)}
 
     def gaps_after(self, version: int, limit: int, offsets: Mapping[str, int]) -> tuple[list[Gap], list[Watermark]]:
         """What changed in the gap journal since this version, and up to when that is complete, both of one instant.
@@ -232,7 +233,7 @@ class Spool:
 
     def recordings(self) -> list[RecordingRows]:
         """Bags of this owner that are not whole yet. Waits for no commit; raises sqlite3.Error."""
-        return self._view.recordings(self._robot)
+        return self._view.recordings.rows(self._robot)
 
     def free_bytes(self) -> int:
         """What this user may still write to the spool's file system. Raises OSError."""
@@ -252,7 +253,7 @@ class Spool:
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
         """What has no final name yet for this reason, the oldest first; waits for no commit. Raises sqlite3.Error."""
-        return self._view.held(reason, limit)
+        return self._view.objects.held(reason, limit)
 
     def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
         """Give held objects their final (made unique) keys, all or none; returns those that may be shipped now.
@@ -272,7 +273,7 @@ class Spool:
 
     def has_kept(self) -> bool:
         """Whether anything is kept, or anybody waits for an answer; waits for no commit. Raises sqlite3.Error."""
-        return self._view.kept_bytes() > 0 or bool(self._view.requests.open_ids())
+        return self._view.kept.bytes() > 0 or bool(self._view.requests.open_ids())
 
     def requests(self) -> list[RequestRow]:
         """All that is known of what was asked for; waits for no commit. Raises sqlite3.Error."""
@@ -345,7 +346,7 @@ class Spool:
         Raises as ``commit``.
         """
         with self._lock, self._index.transaction():
-            rows = [row for bucket, key in places if (row := self._index.row(bucket, key)) is not None]
+            rows = [row for bucket, key in places if (row := self._index.objects.row(bucket, key)) is not None]
             self._index.requests.set_cut(request, ids, [(row['id'], row['bytes'], row['state']) for row in rows])
         return sum(row['bytes'] for row in rows)
 
@@ -379,13 +380,13 @@ class Spool:
 
     def is_short_to_keep(self) -> bool:
         """Whether little room is left for what is kept, by its limit or by the disk: so much as to thin what is there in time."""
-        kept = self._view.kept_bytes()
+        kept = self._view.kept.bytes()
         most = min(self._keep.max_bytes, kept + self._tree.free_bytes() - self._settings.min_free_bytes)
         return kept > 0 and kept > most - min(max(most // SHORT_PART, SHORT_BYTES), most // 4)
 
     def thinnable(self, after: int, limit: int) -> list[ThinnableObject]:
         """What is kept and nobody asked for, with a larger number than ``after``, in their order; waits for no commit."""
-        return [ThinnableObject.of(row, self._tree) for row in self._view.thinnable(after, limit)]
+        return [ThinnableObject.of(row, self._tree) for row in self._view.kept.thinnable(after, limit)]
 
     def thin(self, item: ThinnableObject, thinned: Thinned) -> ThinnableObject | None:
         """Give a kept object less content; it, or None where it went or was asked for meanwhile. Raises as ``commit``."""
@@ -400,7 +401,7 @@ class Spool:
 
     def pending_count(self) -> int:
         """Waits for no commit."""
-        return sum(row[2] for row in self._view.tally() if row[1] == State.PENDING.value)
+        return sum(row[2] for row in self._view.overview.tally() if row[1] == State.PENDING.value)
 
     def usage(self) -> SpoolUsage:
         """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
@@ -432,12 +433,12 @@ class Spool:
             path = self.root / 'index.db'
             copy, view = Index(path), Index(path, read_only=True)
             try:
-                first = self._index.first_session()
+                first = self._index.accounts.first_session()
                 if not path.exists():
                     self._index.put_back()
                     log.error('the spool index %s was deleted: it is put back', path)
                 copy.open()
-                is_copy = copy.first_session() == first and session.number in copy.sessions(ended=False)
+                is_copy = copy.accounts.first_session() == first and session.number in copy.accounts.sessions(ended=False)
                 view.open()
             except sqlite3.Error as error:
                 copy.close()
@@ -509,11 +510,11 @@ class Spool:
                         if self._takes(item):
                             adding.add(item, fits=place not in room.given_up)
                     for outcome in outcomes:
-                        self._index.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                        self._index.objects.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
-                        self._index.record(self._robot, each)
+                        self._index.recordings.write(self._robot, each)
                     if snapshot is not None and self._session is not None:
-                        self._index.write(self._session.number, snapshot)
+                        self._index.accounts.write(self._session.number, snapshot)
                     self._tidy(now_ns)
                     adding.take()
             except BaseException:
@@ -527,7 +528,7 @@ class Spool:
         index = self._index
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
-        return index.take_uncatalogued(item.catalogues) and index.take_untold(item.tells)
+        return index.catalog.take_uncatalogued(item.catalogues) and index.catalog.take_unreported(item.tells)
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
         """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it.
@@ -536,7 +537,7 @@ class Spool:
         """
         try:
             with flock(self.root / 'recovery.lock', wait=False) as mine, self._lock:
-                if mine and self._index.is_quarantined(item.id):
+                if mine and self._index.objects.state(item.id) is State.QUARANTINED:
                     source = self._tree.waiting(item.id, item.bucket, item.key)
                     self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:
@@ -548,27 +549,27 @@ class Spool:
         While there is more to do, each commit does a step of it.
         """
         if not 0 <= now_ns - self._compacted_ns < 60 * SECOND:
-            self._compacted_ns = now_ns if self._index.compact(now_ns - FULL_ROWS_NS) else 0
+            self._compacted_ns = now_ns if self._index.history.compact(now_ns - FULL_ROWS_NS) else 0
         if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND:
-            done = self._index.forget(now_ns - round(self._settings.remember_days * DAY_NS))
+            done = self._index.history.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
 
 
 def _continued(index: Index, robot: str, clock: Clock) -> Accounts:
     """Accounts of a session that goes on where the earlier ones ended."""
     last: dict[tuple[str, str], PublisherRow] = {}
-    for row in index.publishers(robot=robot):
+    for row in index.accounts.publishers(robot=robot):
         last.pop((row.topic, row.publisher), None)  # so that the newest are the last
         last[row.topic, row.publisher] = row
     kept: dict[str, int] = {}
     grades: dict[str, str] = {}
     heard: dict[str, int] = {}
-    for account in index.topics(robot=robot):
+    for account in index.accounts.topics(robot=robot):
         kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
         heard[account.topic] = account.heard_ns or account.last_kept_ns or heard.get(account.topic, 0)
         if account.received:
             grades[account.topic] = account.accounting
-    return Accounts(last.values(), kept, index.rhythms(), grades, clock, heard)
+    return Accounts(last.values(), kept, index.accounts.rhythms(), grades, clock, heard)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:

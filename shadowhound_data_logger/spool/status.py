@@ -159,7 +159,7 @@ def _session(index: Index, robot: str, pid: int) -> dict[str, Any] | None:
 
     Who sends missions or bags has sessions as well: the node's is that of the process that wrote the status, where one did.
     """
-    row = index.last_session(robot, pid)
+    row = index.accounts.last_session(robot, pid)
     return {'started': iso(row[0]), 'ended': iso(row[1]) if row[1] is not None else None} if row else None
 
 

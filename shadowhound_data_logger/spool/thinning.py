@@ -79,11 +79,11 @@ def thin(index: Index, tree: Tree, session: int, item: ThinnableObject, thinned:
             link_or_copy(thinned.body.path, body)
         tree.sync_incoming()
         with index.transaction(undo=lambda: _undo(tree, item.id)):
-            row = index.may_thin(item.id, item.sha256)
+            row = index.kept.thinnable_row(item.id, item.sha256)
             if row is None:
                 return None
             key = free_key(index, row['bucket'], f'{row["key"]}.{THINNED}')
-            index.thin(row, FileBody(body, size, sha256), thinned.samples, thinned.lost, key, THINNED, now_ns)
+            index.kept.thin(row, FileBody(body, size, sha256), thinned.samples, thinned.lost, key, THINNED, now_ns)
             tree.take_part(item.id, body, None)
             renew(index, item.id, tree.part(item.id))
             tree.sync_incoming()

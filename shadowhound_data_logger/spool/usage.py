@@ -31,11 +31,11 @@ class SpoolUsage:
 
 def usage_of(index: Index, folder: Path, now_ns: int) -> SpoolUsage:
     """Read it from an open index. Raises OSError or sqlite3.Error."""
-    tally, oldest_ns = index.tally(), index.oldest_pending_ns()
+    tally, oldest_ns = index.overview.tally(), index.objects.oldest_pending_ns()
     count = {state: sum(row[2] for row in tally if row[1] == state.value) for state in State}
     unknown = oldest_ns is not None and oldest_ns < EARLIEST_SANE_NS <= now_ns  # spooled before the clock was set
     age_s = None if oldest_ns is None or unknown else max(0.0, round((now_ns - oldest_ns) / SECOND, 1))
     disk = os.statvfs(folder)
-    return SpoolUsage(count[State.PENDING], count[State.HELD], count[State.QUARANTINED], index.payload_bytes(),
+    return SpoolUsage(count[State.PENDING], count[State.HELD], count[State.QUARANTINED], index.objects.payload_bytes(),
                  disk.f_bavail * disk.f_frsize, age_s, count[State.KEPT],
                  sum(row[3] for row in tally if row[1] == State.KEPT.value))  # fmt: skip

@@ -155,9 +155,9 @@ def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path)
     finally:
         spool.close()
     with index_of(tmp_path / 'spool') as index:
-        index.clear_uncatalogued()
+        index.catalog.clear()
         with index.transaction():
-            index.compact(clock.wall_ns() + 1)
+            index.history.compact(clock.wall_ns() + 1)
     history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
     assert history.answer({'do': 'days', 'robot': 'thor'})[0] == {'days': ['2025-10-18']}
     for second, where in enumerate(('the store', 'the store', 'the spool')):

@@ -151,6 +151,6 @@ def test_a_spool_that_is_full_evicts_while_objects_wait(tmp_path: Path, store: M
         spool.close()
     index = Index(tmp_path / 'spool' / 'index.db', read_only=True)
     index.open()
-    objects = {state: count for _, state, count, _, _ in index.tally() if count}
+    objects = {state: count for _, state, count, _, _ in index.overview.tally() if count}
     index.close()
     assert objects == {'spooled': 300, 'delivered': left, 'evicted': 300 - left}

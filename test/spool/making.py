@@ -15,7 +15,8 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.index import Index, UncataloguedObject
+from shadowhound_data_logger.spool.catalog_table import UncataloguedObject
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
 NOON_NS = 1_760_788_800 * SECOND
@@ -86,12 +87,12 @@ def index_of(root: Path) -> Iterator[Index]:
 def uncatalogued(root: Path, limit: int = 99) -> list[UncataloguedObject]:
     """The oldest of what no part of the catalogue has a row of yet."""
     with index_of(root) as index:
-        return index.uncatalogued(limit)
+        return index.catalog.uncatalogued(limit)
 
 
 def clear_uncatalogued(root: Path) -> None:
     with index_of(root) as index:
-        index.clear_uncatalogued()
+        index.catalog.clear()
 
 
 def rows(root: Path) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from shadowhound_data_logger.errors import NameRefused
 from shadowhound_data_logger.model import Binding, State
 from shadowhound_data_logger.spool import recovery
 from shadowhound_data_logger.spool.files import Tree, description_of
-from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.object_table import ObjectTable
 from shadowhound_data_logger.spool.recovery import _follow_rows
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -90,13 +90,13 @@ def test_final_names_are_unique(spool: Spool) -> None:
 def test_a_name_that_was_given_out_often_is_found_in_few_questions(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In turn, without a gap: an agent that numbers none of its frames must not keep the index from others."""
     asked: list[str] = []
-    has = Index.has
+    has = ObjectTable.has
 
-    def counting(index: Index, bucket: str, key: str) -> bool:
+    def counting(table: ObjectTable, bucket: str, key: str) -> bool:
         asked.append(key)
-        return has(index, bucket, key)
+        return has(table, bucket, key)
 
-    monkeypatch.setattr(Index, 'has', counting)
+    monkeypatch.setattr(ObjectTable, 'has', counting)
     keys = [item.key for item in put(spool, *(make('thor/a.jpg', b'%d' % number) for number in range(300)))]
     assert keys == ['thor/a.jpg', *(f'thor/a_{number}.jpg' for number in range(1, 300))]
     assert len(asked) < 300 * 20

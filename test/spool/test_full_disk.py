@@ -17,8 +17,9 @@ from spool.making import FakeClock, assert_whole, files, make, put, receive, row
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.errors import SpoolError
 from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.spool.account_table import AccountTable
 from shadowhound_data_logger.spool.files import Tree
-from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.object_table import ObjectTable
 from shadowhound_data_logger.spool.spool import Spool
 
 MEBI = 1 << 20
@@ -206,8 +207,8 @@ def test_a_part_that_cannot_be_removed(spool: Spool, root: Path, monkeypatch: py
     assert_whole(root)
 
 
-@pytest.mark.parametrize('step', ['insert', 'write', 'move'])
-def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+@pytest.mark.parametrize(('table', 'step'), [(ObjectTable, 'insert'), (AccountTable, 'write'), (ObjectTable, 'move')])
+def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch, table: type, step: str) -> None:
     """A transaction that fails takes its payloads with it, keeps the deliveries pending, and can be tried again."""
     (delivered,) = put(spool, make('old'))
     outcome = [Outcome(delivered, State.DELIVERED)]
@@ -216,7 +217,7 @@ def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.Mo
         def fail(*_: Any) -> None:
             raise sqlite3.OperationalError('database or disk is full')
 
-        patch.setattr(Index, step, fail)
+        patch.setattr(table, step, fail)
         with pytest.raises(sqlite3.OperationalError, match='disk is full'):
             spool.commit([make('new')], outcome)
     assert list(files(root)) == ['ready/sensor-data/old']
@@ -296,7 +297,7 @@ def test_a_failed_close_can_be_repeated(opened: Open, root: Path, monkeypatch: p
         account.receive('p', 1)
         account.skipped += 1
     with monkeypatch.context() as patch:
-        patch.setattr(Index, 'end_session', full)
+        patch.setattr(AccountTable, 'end_session', full)
         with pytest.raises(SpoolError, match='cannot be written: No space'):
             spool.close()
     spool.close()

@@ -30,7 +30,7 @@ CAMERA = '/camera'
 def journal(root: Path) -> list[Gap]:
     """All of it, read by somebody else."""
     with closing(sqlite3.connect(root / 'index.db')) as db:
-        return GapTable(db).known({})
+        return GapTable(lambda: db).known({})
 
 
 def short(root: Path) -> list[tuple[str, str, int | None, float | None, float | None]]:
@@ -45,7 +45,7 @@ def tell(root: Path) -> None:
     """As after a part that tells all."""
     with closing(Index(root / 'index.db')) as index:
         index.open()
-        index.clear_uncatalogued()
+        index.catalog.clear()
 
 
 def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA, period_ns: int = 100 * MS) -> None:

@@ -15,6 +15,7 @@ from spool.making import NOON_NS, FakeClock, make
 from shadowhound_data_logger.config import SpoolSettings
 from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow, State
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.recording_table import RecordingTable
 from shadowhound_data_logger.spool.spool import Spool
 
 FEW, MANY = 300, 15_000
@@ -34,7 +35,7 @@ def add(index: Index, numbers: range, bucket: str) -> None:
     with index.transaction():
         for number in numbers:
             item = make(f'{number}', bucket=bucket, priority=number % 9)
-            index.insert(item, item.key, '0' * 64, State.PENDING, None, {}, NOON_NS + number)
+            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {}, NOON_NS + number)
 
 
 def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
@@ -47,7 +48,7 @@ def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:
         return 0
 
     index._db.set_progress_handler(count, STEP)
-    found = index.pending(40, oldest=oldest, without=without)
+    found = index.objects.pending(40, oldest=oldest, without=without)
     index._db.set_progress_handler(None, STEP)
     assert len(found) == (20 if without else 40)
     return steps
@@ -70,10 +71,10 @@ def test_the_order_holds_across_buckets(index: Index, oldest: bool) -> None:
     """Objects of several buckets come as if they were in one."""
     for place in range(30):
         add(index, range(place, place + 1), 'abc'[place % 3])
-    found = [(row['priority'], row['id']) for row in index.pending(20, oldest=oldest, without=('c',))]
+    found = [(row['priority'], row['id']) for row in index.objects.pending(20, oldest=oldest, without=('c',))]
     expected = [(place % 9, place + 1) for place in range(30) if place % 3 != 2]
     assert found == (expected if oldest else sorted(expected))[:20]
-    assert index.oldest_pending_ns() == NOON_NS
+    assert index.objects.oldest_pending_ns() == NOON_NS
 
 
 SLICE = SliceRow(0, 10, 'ab', 1, 2, 3, '[3]')
@@ -101,7 +102,7 @@ def test_a_slice_and_its_row_are_one_transaction(opened: Open, monkeypatch: pyte
     """Where the one cannot be written, the other is not there either."""
     spool = opened()
     with monkeypatch.context() as patch:
-        patch.setattr(Index, 'record', Mock(side_effect=sqlite3.OperationalError('disk I/O error')))
+        patch.setattr(RecordingTable, 'write', Mock(side_effect=sqlite3.OperationalError('disk I/O error')))
         with pytest.raises(sqlite3.OperationalError):
             spool.commit([make('one')], rows=[RecordingRows('a', '{}', '[]', (SLICE,))])
     assert (spool.pending(1), spool.recordings()) == ([], [])

@@ -53,7 +53,7 @@ def test_what_cannot_be_ours_is_found(index: Path, opened: Open, change: str) ->
     with closing(sqlite3.connect(index)) as db:
         db.execute(f'UPDATE {change}')
         db.commit()
-    with index_of(index.parent) as damaged, pytest.raises(sqlite3.DatabaseError, match='cannot be'):
+    with index_of(index.parent) as damaged, pytest.raises(sqlite3.DatabaseError, match='impossible value'):
         damaged.check_values()
     assert opened().recovery.counts['damaged index rebuilt'] == 1
 

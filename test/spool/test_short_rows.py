@@ -20,7 +20,8 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.model import DataObject, Outcome, State
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.files import content_sha256
-from shadowhound_data_logger.spool.index import COMPACT_STATES, Index
+from shadowhound_data_logger.spool.history_table import COMPACT_STATES
+from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 
 HOUR_NS = 3600 * SECOND
@@ -45,7 +46,7 @@ def leave(spool: Spool, *objects: DataObject, state: State = State.DELIVERED) ->
 def catalogue(spool: Spool) -> None:
     with closing(Index(spool.root / 'index.db')) as index:
         index.open()
-        index.clear_uncatalogued()
+        index.catalog.clear()
 
 
 def age(spool: Spool, by_ns: int = 2 * HOUR_NS) -> None:
@@ -166,7 +167,7 @@ def test_rows_are_made_short_step_by_step(opened: Open, root: Path, monkeypatch:
     spool = opened()
     leave(spool, *(frame(second) for second in range(5)))
     spool.close()
-    monkeypatch.setattr('shadowhound_data_logger.spool.index.COMPACT_STEP', 2)
+    monkeypatch.setattr('shadowhound_data_logger.spool.history_table.COMPACT_STEP', 2)
     spool = opened()
     left = [len(rows(root))]
     clock = spool._clock
@@ -221,13 +222,13 @@ def test_keys_that_begin_so_are_the_same_with_short_rows(
         index._db.executescript('DELETE FROM objects; DELETE FROM compact_objects')
         with index.transaction():
             for place, name in enumerate(names):
-                number = index.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
-                index.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
+                number = index.objects.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
+                index.objects.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
             index._db.execute('DELETE FROM uncatalogued')
-            index.compact(before_ns)
-        assert [index.has(BUCKET, name) for name in names] == [True] * len(names)
+            index.history.compact(before_ns)
+        assert [index.objects.has(BUCKET, name) for name in names] == [True] * len(names)
         found.append((
-            [row['key'] for row in index.with_prefix(BUCKET, prefix, states)],
-            sorted(row['key'] for row in index.with_content(BUCKET, prefix, f'{1:064x}')),
+            [row['key'] for row in index.objects.with_prefix(BUCKET, prefix, states)],
+            sorted(row['key'] for row in index.objects.with_content(BUCKET, prefix, f'{1:064x}')),
         ))  # fmt: skip
     assert found[0] == found[1]

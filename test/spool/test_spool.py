@@ -185,7 +185,7 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
 
 def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """While more than one step is to be forgotten, each commit forgets one, not one an hour."""
-    monkeypatch.setattr('shadowhound_data_logger.spool.index.FORGET_STEP', 2)
+    monkeypatch.setattr('shadowhound_data_logger.spool.history_table.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
     clear_uncatalogued(root)

@@ -1,0 +1,267 @@
+"""Objects: their rows and states.
+
+A change of state and everything that follows from it are one step here: totals and lost messages follow by the triggers of
+schema.sql, the lists of what the catalog and requests must still be told by ``CatalogTable`` and ``RequestTable``.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from heapq import merge
+from itertools import islice
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.model import (
+    EVENTS_WHEN,
+    UPLOAD_WHEN,
+    Binding,
+    DataObject,
+    HeldObject,
+    SpooledObject,
+    State,
+    waits_for,
+)
+from shadowhound_data_logger.spool.catalog_table import CatalogTable
+from shadowhound_data_logger.spool.history_table import HistoryTable
+from shadowhound_data_logger.spool.request_table import RequestTable
+from shadowhound_data_logger.spool.table import Table, after, marks, split
+
+MISSING: Final = 'missing'
+"""Reason of a quarantined object whose file is gone."""
+STATES_IN_SPOOL: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
+IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined', 'kept')"
+_COLUMNS: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason, sensor, waits_for'
+_PROTECTED: Final = "protected = 1, waits_for = CASE WHEN waits_for <> '' AND event THEN 'events.when' ELSE '' END"
+"""Of an object that must not be evicted from now on (``model.waits_for``)."""
+
+
+class ObjectTable(Table):
+    """The rows of objects."""
+
+    def __init__(self, connection: Callable[[], sqlite3.Connection], history: HistoryTable, catalog: CatalogTable,
+                 requests: RequestTable) -> None:  # fmt: skip
+        super().__init__(connection)
+        self._history = history
+        self._catalog = catalog
+        self._requests = requests
+
+    # -- by key or number ------------------------------------------------------------------------------------------
+
+    def has(self, bucket: str, key: str) -> bool:
+        return self.row(bucket, key) is not None
+
+    def row(self, bucket: str, key: str) -> sqlite3.Row | None:
+        """The row of a key: of what left the spool an hour ago without ``content_type``, ``metadata`` and ``priority``."""
+        path, name = split(key)
+        found = self.select('bucket = ? AND key = ?', (bucket, key))
+        return next(iter(found or self._history.select('bucket = ? AND path = ? AND name = ?', (bucket, path, name))), None)
+
+    def full_row(self, number: int) -> Mapping[str, Any] | None:
+        """All columns of an object, with ``counts``: messages by account if it holds those of several."""
+        cursor = self._db.execute('SELECT * FROM objects WHERE id = ?', (number,))
+        cursor.row_factory = sqlite3.Row
+        row: sqlite3.Row | None = cursor.fetchone()
+        if row is None:
+            return None
+        counts = dict(self._db.execute('SELECT topic, samples FROM contents WHERE id = ?', (number,)).fetchall())
+        return {**dict(row), 'counts': counts}
+
+    def state(self, number: int) -> State | None:
+        """None for an object without a full row: it left the spool an hour ago, or never existed."""
+        found = self._db.execute('SELECT state FROM objects WHERE id = ?', (number,)).fetchone()
+        return State(found[0]) if found else None
+
+    def rows(self) -> list[sqlite3.Row]:
+        """Of all objects, in the order in which they were spooled."""
+        return sorted(self.select('1') + self._history.select('1'), key=itemgetter('id'))
+
+    def with_prefix(self, bucket: str, prefix: str, states: Collection[State] = tuple(State)) -> list[sqlite3.Row]:
+        """Rows in these states whose keys start with ``prefix``, in the order in which they were spooled."""
+        values = (bucket, prefix, after(prefix), *(state.value for state in states))
+        found = self.select(f'bucket = ? AND key >= ? AND key < ? AND state IN ({marks(len(states))})', values)
+        found += [row for row in self._history.with_prefix(bucket, prefix) if State(row['state']) in states]
+        return sorted(found, key=itemgetter('id'))
+
+    def with_content(self, bucket: str, prefix: str, sha256: str) -> list[sqlite3.Row]:
+        """Rows of this content whose keys start with ``prefix``."""
+        found = self.select('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, after(prefix), sha256))
+        return found + self._history.with_prefix(bucket, prefix, sha256)
+
+    def in_spool(self) -> list[sqlite3.Row]:
+        """Rows of what is pending, held, kept or quarantined, in the order in which it was spooled."""
+        return self.select(f'{IN_SPOOL} ORDER BY id')
+
+    def keys_in_spool(self, bucket: str, prefix: str) -> frozenset[str]:
+        """Keys with this prefix of what is pending, held, kept or quarantined and whose file is not known to be gone."""
+        rows = self._db.execute(
+            f'SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND {IN_SPOOL} AND reason IS NOT ?',  # noqa: S608
+            (bucket, prefix, after(prefix), MISSING),
+        )
+        return frozenset(key for (key,) in rows)
+
+    def quarantined(self, reason: str | None = None) -> list[sqlite3.Row]:
+        """Rows of quarantined objects whose files are there, for this reason or any."""
+        return self.select("state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING))
+
+    def held(self, reason: str, limit: int) -> list[HeldObject]:
+        """What has no final name yet for this reason, the oldest first."""
+        rows = self._db.execute(
+            "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"
+            ' ORDER BY id LIMIT ?', (reason, limit),
+        )  # fmt: skip
+        return [HeldObject(number, bucket, key, json.loads(metadata), start_ns, end_ns, created_ns)
+                for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
+
+    def held_count(self, reason: str) -> int:
+        """How many objects have no final name yet for this reason."""
+        query = "SELECT count(*) FROM objects WHERE state = 'held' AND reason = ?"
+        return int(self._db.execute(query, (reason,)).fetchone()[0])
+
+    # -- what to upload, what to evict -----------------------------------------------------------------------------
+
+    def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = (),
+                waiting_for: Collection[str] = ()) -> list[sqlite3.Row]:  # fmt: skip
+        """Objects to upload: most important first or oldest first, not of buckets ``without``, none that ``waiting_for`` delays.
+
+        Each bucket has its own query, so that the backlog of those that are left out costs nothing.
+        """
+        order = ('id',) if oldest else ('priority', 'id')
+        rules = ''.join(f" AND waits_for <> '{setting}'" for setting in (UPLOAD_WHEN, EVENTS_WHEN) if setting in waiting_for)
+        condition = f"state = 'pending' AND bucket = ?{rules} ORDER BY {', '.join(order)} LIMIT ?"
+        table = 'objects INDEXED BY exempt' if UPLOAD_WHEN in waiting_for else 'objects'
+        found = [self.select(condition, (bucket, limit), table) for bucket in self._pending_buckets() if bucket not in without]
+        return list(islice(merge(*found, key=itemgetter(*order)), limit))
+
+    def _pending_buckets(self) -> Iterator[str]:
+        """The buckets of all pending objects: one step in the index for each."""
+        query = "SELECT bucket FROM objects WHERE state = 'pending' AND bucket > ? ORDER BY bucket LIMIT 1"
+        bucket = ''
+        while row := self._db.execute(query, (bucket,)).fetchone():
+            bucket = row[0]
+            yield bucket
+
+    def oldest_pending_ns(self) -> int | None:
+        """When the object that has waited longest for delivery was spooled; None if none waits."""
+        return next((row['created_ns'] for row in self.pending(1, oldest=True)), None)
+
+    def evictable(self, limit: int) -> list[sqlite3.Row]:
+        """What a full disk evicts first: lowest priority, then oldest; never a protected object."""
+        return self.select("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
+
+    def evictable_bytes(self) -> dict[int, int]:
+        """What evicting everything that may be evicted would free, by priority."""
+        where = "state IN ('pending', 'held') AND NOT protected"
+        return dict(self._db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
+
+    def payload_bytes(self) -> int:
+        """Bytes of all payload in the spool except what is kept; files that are gone take no room."""
+        present = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
+        missing = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state = 'quarantined' AND reason = 'missing'"
+        return int(self._db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
+
+    # -- changes ---------------------------------------------------------------------------------------------------
+
+    def insert(self, item: DataObject, key: str, sha256: str, state: State, reason: str | None,
+               metadata: Mapping[str, str], now_ns: int) -> int:  # fmt: skip
+        """Add a row under the final key; returns its id. What decides the object's fate later are columns, written here."""
+        row = {
+            'bucket': item.bucket, 'key': key, 'state': state.value, 'reason': reason, 'priority': item.priority,
+            'protected': item.protected, **_fate(item.sensor, metadata, protected=item.protected), 'sensor': item.sensor,
+            'topic': item.topic, 'type': item.type, 'samples': item.samples, 'bytes': len(item.body), 'sha256': sha256,
+            'content_type': item.content_type, 'metadata': json.dumps(dict(metadata)), 't_start_ns': item.t_start_ns,
+            't_end_ns': item.t_end_ns, 'created_ns': now_ns, 'settled_ns': now_ns if state is State.EVICTED else None,
+        }  # fmt: skip
+        query = f'INSERT INTO objects ({", ".join(row)}) VALUES ({marks(len(row))})'  # noqa: S608 - own constants only
+        number = int(self._db.execute(query, tuple(row.values())).lastrowid or 0)
+        if item.counts:
+            rows = ((number, account, count) for account, count in item.counts.items())
+            self._db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
+        if item.statistics and state is not State.EVICTED:
+            self._catalog.add_statistics(number, item.statistics)
+        self._catalog.follow([number])
+        return number
+
+    def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
+        """Give objects another state; the totals follow.
+
+        Only what is still in the spool moves, with one exception: an object that was evicted while it was being uploaded, and
+        that the store confirmed anyway, is delivered.
+        """
+        movable = (State.PENDING, State.HELD, State.KEPT, *((State.EVICTED,) if state is State.DELIVERED else ()))
+        self._change(ids, movable, 'state = ?, reason = ?, settled_ns = ?', (state.value, reason, now_ns))
+
+    def set_bound(self, row: Mapping[str, Any], key: str, binding: Binding, metadata: Mapping[str, str], created_ns: int,
+                  state: State) -> None:  # fmt: skip
+        """A held object, of which this is the full row, has its final key: it waits for delivery, or is kept."""
+        values = {
+            'state': state.value, 'reason': None, 'key': key, 'metadata': json.dumps(dict(metadata)),
+            **_fate(row['sensor'], metadata, protected=bool(row['protected'])), 't_start_ns': binding.t_start_ns,
+            't_end_ns': binding.t_end_ns, 'created_ns': created_ns,
+        }  # fmt: skip
+        self._change([binding.id], tuple(State), ', '.join(f'{column} = ?' for column in values), tuple(values.values()))
+
+    def protect(self, bucket: str, key: str) -> None:
+        """Never evict this object from now on."""
+        self._db.execute(f'UPDATE objects SET {_PROTECTED} WHERE bucket = ? AND key = ?', (bucket, key))  # noqa: S608
+
+    def release(self, number: int, priority: int) -> bool:
+        """A kept object waits for delivery, with this priority, and is not evicted any more; whether it was kept."""
+        return self._change([number], (State.KEPT,), f"state = 'pending', priority = ?, {_PROTECTED}", (priority,)) > 0
+
+    def set_missing(self, ids: Iterable[int], now_ns: int) -> int:
+        """The files of these objects are gone; returns how many of them were in the spool."""
+        there = list(ids)
+        change = "state = 'quarantined', reason = 'missing', settled_ns = ?"
+        again = self._change(there, (State.QUARANTINED,), change, (now_ns,), follow=False)
+        return again + self._change(there, (State.PENDING, State.HELD, State.KEPT), change, (now_ns,))
+
+    def set_found(self, number: int) -> None:
+        """The file of a quarantined object is back where it waits for delivery."""
+        self._change([number], (State.QUARANTINED,), "state = 'pending', reason = NULL, settled_ns = NULL", ())
+
+    def set_thinned(self, number: int, values: Mapping[str, object]) -> None:
+        """A kept object has less content (``KeptTable.thin``)."""
+        columns = ', '.join(f'{column} = ?' for column in values)
+        self._db.execute(f'UPDATE objects SET {columns} WHERE id = ?', (*values.values(), number))  # noqa: S608
+
+    def _change(
+        self, ids: Iterable[int], of: Sequence[State], change: str, values: Sequence[object], *, follow: bool = True
+    ) -> int:
+        """Update the rows that are in one of the states ``of``, and the lists that depend on the state; returns how many."""
+        query = f'UPDATE objects SET {change} WHERE id = ? AND state IN ({marks(len(of))})'  # noqa: S608 - own constants only
+        states = [state.value for state in of]
+        changed = [number for number in ids if self._db.execute(query, (*values, number, *states)).rowcount]
+        if changed and follow:
+            self._catalog.follow(changed)
+            self._requests.follow(changed)
+        return len(changed)
+
+    def select(self, where: str, values: Sequence[object] = (), table: str = 'objects') -> list[sqlite3.Row]:
+        """Rows by a condition of the spool's own."""
+        cursor = self._db.execute(f'SELECT {_COLUMNS} FROM {table} WHERE {where}', tuple(values))  # noqa: S608
+        cursor.row_factory = sqlite3.Row
+        return cursor.fetchall()
+
+
+def _fate(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> dict[str, object]:
+    """What decides when an object is uploaded, and what its loss means."""
+    return {
+        'waits_for': waits_for(sensor, metadata, protected=protected),
+        'on_request': metadata.get(words.SHIP) == words.ON_REQUEST,
+        'event': words.EVENT in metadata,
+        'mission': metadata.get(words.MISSION_ID, ''),
+    }
+
+
+def spooled(row: sqlite3.Row | Mapping[str, Any], path: Path) -> SpooledObject:
+    """The object of a row."""
+    return SpooledObject(
+        id=row['id'], bucket=row['bucket'], key=row['key'], path=path, size=row['bytes'], sha256=row['sha256'],
+        content_type=row['content_type'], metadata=json.loads(row['metadata']), priority=row['priority'],
+        created_ns=row['created_ns'], waits_for=row['waits_for'],
+    )  # fmt: skip

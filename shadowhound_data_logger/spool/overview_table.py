@@ -1,0 +1,86 @@
+"""Listings and totals of the spool for people: the command line, the live page and the doctor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.model import State
+from shadowhound_data_logger.spool.history_table import CATALOG
+from shadowhound_data_logger.spool.object_table import IN_SPOOL
+from shadowhound_data_logger.spool.table import Table, after
+
+_DESCRIBED: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
+
+
+class OverviewTable(Table):
+    """Only reads."""
+
+    def tally(self) -> list[tuple[str, str, int, int, int]]:
+        """(topic or '', state or 'spooled', objects, bytes, samples)."""
+        return self._db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
+
+    def by_sensor(self) -> list[tuple[Any, ...]]:
+        """(sensor, state, reason, objects, bytes, oldest created_ns) of what is in the spool, the most important first."""
+        return self._db.execute(
+            f'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects WHERE {IN_SPOOL}'  # noqa: S608
+            ' GROUP BY sensor, state, reason ORDER BY min(priority), sensor, state, reason'
+        ).fetchall()
+
+    def quarantine_reasons(self) -> dict[str, int]:
+        """Reason -> quarantined objects."""
+        query = "SELECT reason, count(*) FROM objects WHERE state = 'quarantined' GROUP BY reason"
+        return {str(reason): count for reason, count in self._db.execute(query)}
+
+    def objects(self, state: State | None, sensor: str | None, prefix: str) -> Iterator[tuple[Any, ...]]:
+        """(bucket, key, sensor, state, reason, bytes, created_ns) of what is in the spool, in the order in which it was spooled.
+
+        ``prefix`` is how ``bucket/key`` starts.
+        """
+        return self._db.execute(
+            f'SELECT bucket, key, sensor, state, reason, bytes, created_ns FROM objects WHERE {IN_SPOOL}'  # noqa: S608
+            ' AND state = ifnull(?, state) AND sensor = ifnull(?, sensor)'
+            " AND substr(bucket || '/' || key, 1, length(?)) = ? ORDER BY id",
+            (state and state.value, sensor, prefix, prefix),
+        )
+
+    def recorded(self, robot: str, begin_ns: int, end_ns: int) -> Iterator[tuple[Any, ...]]:
+        """Objects of a robot that are not lost and begin in this time, with what the catalog has of them, by time.
+
+        (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, mission_id, mission_type, pose, battery,
+        content_key); objects with a short row are not included.
+        """
+        described = ', '.join(f"json_extract(metadata, '$.{word}')" for word in _DESCRIBED)
+        return self._db.execute(
+            f'SELECT bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, {described} FROM objects'  # noqa: S608
+            f" WHERE t_start_ns >= ? AND t_start_ns < ? AND key >= ? AND key < ? AND state <> 'evicted'"
+            f" AND sensor <> '{CATALOG}' AND json_valid(metadata) ORDER BY t_start_ns",
+            (begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),
+        )
+
+    def recorded_compact(self, robot: str, date: str) -> Iterator[tuple[str, str, str, int, int]]:
+        """(bucket, key, sensor, bytes, settled_s) of short rows of delivered objects in folders with this ``YYYYMMDD``."""
+        return self._db.execute(
+            'SELECT bucket, path || name, sensor, bytes, settled_s FROM folders JOIN compact_objects ON folder = folders.id'  # noqa: S608
+            f" WHERE path >= ? AND path < ? AND instr(path, ?) AND state <> 2 AND sensor <> '{CATALOG}'",
+            (f'{robot}/', after(f'{robot}/'), date),
+        )
+
+    def recorded_days(self, robot: str) -> list[int]:
+        """Days since 1970 on which objects with full rows begin."""
+        rows = self._db.execute(
+            'SELECT DISTINCT t_start_ns / 86400000000000 FROM objects WHERE key >= ? AND key < ? AND t_start_ns >= ?'  # noqa: S608
+            f" AND sensor <> '{CATALOG}'",
+            (f'{robot}/', after(f'{robot}/'), EARLIEST_SANE_NS),
+        )
+        return [day for (day,) in rows]
+
+    def folders(self, robot: str) -> list[str]:
+        """Folders of keys with short rows."""
+        rows = self._db.execute(
+            f"SELECT DISTINCT path FROM folders WHERE path >= ? AND path < ? AND sensor <> '{CATALOG}'",  # noqa: S608
+            (f'{robot}/', after(f'{robot}/')),
+        )
+        return [path for (path,) in rows]

@@ -1,0 +1,34 @@
+"""What the tables of the index share: the connection, and how their statements choose keys."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+
+
+class Table:
+    """Part of an index. Methods that write belong in one of its transactions, under the lock of the spool."""
+
+    def __init__(self, connection: Callable[[], sqlite3.Connection]) -> None:
+        """``connection`` raises SpoolError while the index is not open."""
+        self._connection = connection
+
+    @property
+    def _db(self) -> sqlite3.Connection:
+        return self._connection()
+
+
+def after(prefix: str) -> str:
+    """The first text after all texts that start with ``prefix``."""
+    return f'{prefix[:-1]}{chr(ord(prefix[-1]) + 1)}' if prefix else '\U0010ffff'
+
+
+def split(key: str) -> tuple[str, str]:
+    """The folder of a key, with its slash, and the rest."""
+    folder, slash, name = key.rpartition('/')
+    return folder + slash, name
+
+
+def marks(count: int) -> str:
+    """Placeholders of a statement."""
+    return ', '.join('?' * count)
