@@ -46,7 +46,8 @@ def kept_slice(folder: Path, number: int, bag: str = BAG, **more: str) -> DataOb
     for one in recorded(number):
         writer.write({each.topic: each for each in (TALK, ECHO)}[one.topic], one.log_ns, one.publish_ns, one.sequence, one.cdr)
     info = writer.close()
-    said = {words.ROBOT: 'thor', words.BAG: bag, words.SLICE: str(number), words.MISSION_ID: 'm1'}
+    said = {words.ROBOT: 'thor', words.BAG: bag, words.SLICE: str(number), words.MISSION_ID: 'm1',
+            words.MISSION_TYPE: 'patrol'}  # fmt: skip
     said |= {words.SHIP: words.ON_REQUEST, **more}
     return make(f'thor/rosbags/{bag}/{bag}_{number}.mcap', FileBody(info.path, info.bytes, info.sha256), sensor='bag',
                 topic=None, type='', samples=0, t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, metadata=said,
