@@ -183,7 +183,8 @@ class ObjectTable(Table):
             self._db.executemany('INSERT INTO contents VALUES (?,?,?)', rows)
         if item.statistics and state is not State.EVICTED:
             self._catalog.add_statistics(number, item.statistics)
-        self._catalog.follow([number])
+        if state not in {State.PENDING, State.HELD}:
+            self._catalog.follow([number])
         return number
 
     def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
