@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -111,48 +110,6 @@ def test_who_imports_what(package: str) -> None:
     """ROS, S3, MLflow and Arrow are known to their own folders alone."""
     importers = {folder(path) for path in MODULES if any(name.partition('.')[0] == package for name in imports(path))}
     assert importers <= ALLOWED[package]
-
-
-def _defined(path: Path) -> Iterator[str]:
-    """The public names that a module defines: classes, type aliases, functions and constants."""
-    for node in tree(path).body:
-        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
-            yield node.name
-        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            yield from (target.id for target in targets if isinstance(target, ast.Name))
-
-
-def _module(path: Path) -> str:
-    return '.'.join((PACKAGE, *path.relative_to(ROOT).with_suffix('').parts)).removesuffix('.__init__')
-
-
-def test_a_public_type_name_stands_for_one_thing() -> None:
-    """No two modules have a class or a type alias of the same public name."""
-    uses = Counter(name for path in MODULES for name in set(_defined(path)) if re.match('[A-Z]', name) and not name.isupper())
-    assert [name for name, count in uses.items() if count > 1 and name != 'T'] == []
-
-
-def test_a_name_that_crosses_folders_stands_for_one_thing() -> None:
-    """No two functions or constants that other folders import have the same name.
-
-    Within its module or folder a name may be ordinary (``main``, ``run``, ``check``, ``CLOSE_S``): a reader has its definition
-    at hand. Where another folder imports it, the reader does not. ``ledger.read`` names its module; ``read as read_ledger`` is
-    counted as ``read_ledger``.
-    """
-    defined = {_module(path): set(_defined(path)) for path in MODULES}
-    origins: dict[str, set[str]] = {}
-    for path in MODULES:
-        for node in nodes(path):
-            if isinstance(node, ast.ImportFrom) and node.module in defined:
-                home = ROOT.joinpath(*node.module.split('.')[1:])
-                if (home if home.is_dir() else home.parent) == path.parent:
-                    continue
-                for name in node.names:
-                    if name.name in defined[node.module]:
-                        origins.setdefault(name.asname or name.name, set()).add(f'{node.module}.{name.name}')
-    assert len(origins) > 300
-    assert {name: sorted(found) for name, found in origins.items() if len(found) > 1} == {}
 
 
 def test_one_file_knows_mlflow() -> None:
