@@ -8,9 +8,6 @@ from typing import Any
 
 from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
 
-BY_ARRIVAL, CORRECTED = 'by_arrival', 'corrected'
-"""Kinds of remarks about messages, in the index and in the ledger."""
-
 
 @dataclass(frozen=True, slots=True)
 class PublisherRow:

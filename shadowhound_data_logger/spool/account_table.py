@@ -65,8 +65,8 @@ class AccountTable(Table):
         self._db.executemany(
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
-              _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected), row.last_kept_ns, row.first_ns,
-              row.heard_ns, row.complete_ns) for row in snapshot.topics),
+              _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected), row.last_kept_ns,
+              row.first_ns, row.heard_ns, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self._db.executemany(
             'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
@@ -99,11 +99,13 @@ class AccountTable(Table):
         """Accounts of one session, of those that a robot goes on with, or of all in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else _continued_by(robot)
         columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped, ifnull(estimated, 0),'
-                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns, by_arrival, corrected")  # fmt: skip
+                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns, by_arrival,"
+                   ' corrected')  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
-                     estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns, json.loads(by_arrival), json.loads(corrected))
+                     estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns,
+                     json.loads(by_arrival), json.loads(corrected))
             for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
             first_ns, heard_ns, complete_ns, by_arrival, corrected in self._db.execute(query, values)
         ]  # fmt: skip

@@ -155,6 +155,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         'by_grade': grades,
         'skipped': sum(row.skipped for row in rows),
         'by_arrival': _sum(row.by_arrival for row in rows),
+        'corrected': _sum(row.corrected for row in rows),
         'rejected': _sum(row.rejected for row in rows),
         'other_types': _other_types(row for row in others if row.topic == topic),
         'dropped': _sum(row.dropped for row in rows),
