@@ -178,7 +178,7 @@ class Manifest:
         return cls(
             top.text('bag'), top.text('robot'), read_mission(mission) if mission else None, state,
             tuple(map(read_missing, top.objects('missing'))),
-            tuple(RecordedTopic(one.text('topic'), one.text('type'), one.count('messages')) for one in top.objects('topics')),
+            tuple(map(_topic, top.objects('topics'))),
             tuple(map(_slice, top.objects('slices'))), read_event(event) if event else None, read_clock(clock) if clock else None,
         )  # fmt: skip
 
@@ -191,6 +191,11 @@ def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
             name = channel.topic, channel.type
             counts[name] = counts.get(name, 0) + count
     return tuple(RecordedTopic(topic, kind, count) for (topic, kind), count in counts.items())
+
+
+def _topic(one: JsonObject) -> RecordedTopic:
+    """Of another recorder's channel without a schema, the type is empty."""
+    return RecordedTopic(one.text('topic', is_any=True), one.text('type', is_any=True), one.count('messages'))
 
 
 def read_missing(one: JsonObject) -> Missing:
