@@ -59,9 +59,14 @@ def check_key(key: str) -> str:
     if len(key.encode(errors='surrogatepass')) > MAX_KEY_BYTES:
         raise NameRefused(f'the key {key[:80]!r}... has more than {MAX_KEY_BYTES} bytes', name=key)
     for segment in segments:
-        if not _SEGMENT.fullmatch(segment) or segment in {'.', '..'} or len(segment) > MAX_SEGMENT_BYTES:
+        if not is_segment(segment):
             raise NameRefused(f'the key {key[:200]!r} has an unsafe part {segment[:80]!r}', name=key)
     return key
+
+
+def is_segment(name: str) -> bool:
+    """Whether ``check_key`` allows it between two slashes."""
+    return bool(_SEGMENT.fullmatch(name)) and name not in {'.', '..'} and len(name) <= MAX_SEGMENT_BYTES
 
 
 def unique(key: str, attempt: int) -> str:

@@ -234,6 +234,7 @@ class BagReader:
             each.file: BagPart(each.file, each.messages, *((each.t_start_ns, each.t_end_ns) if each.messages else (None, None)))
             for each in slices
         }
+        self._names = {name: source.name for name, source in sources.items()}
         self._parts: dict[str, BagFile] = {}
         self._damaged: dict[str, BagDamaged] = {}
         for name, source in sources.items():
@@ -245,23 +246,28 @@ class BagReader:
         self._is_packed = claimed is not None and 'message' in claimed.compression
 
     @property
-    def damaged(self) -> Mapping[str, BagDamaged]:
-        """Files that could not be opened so far."""
-        return self._damaged
+    def damaged(self) -> Mapping[str, str]:
+        """Files that could not be opened so far, and why."""
+        return {name: reason(error, self._names[name]) for name, error in self._damaged.items()}
 
     def describe(self) -> Description:
         """By all files, or by the manifest if it knows all of them. Raises BagDamaged if none can be read."""
         if self.claimed is not None and self._recorded and self._parts.keys() <= self._recorded.keys() and not self._damaged:
             return self._by_manifest(self.claimed)
         infos = self.infos()
-        return of_files(infos, {name: error.what for name, error in self._damaged.items()}, self.claimed)
+        return of_files(infos, self.damaged, self.claimed)
 
     def infos(self) -> Mapping[str, SliceInfo]:
         """What each file holds, of those that can be read. Raises BagDamaged if none can."""
         self._open(list(self._parts))
-        if self._damaged and not self._infos:
-            raise next(iter(self._damaged.values()))
+        if not self._infos:
+            self.check()
         return {name: self._infos[name] for name in self._parts if name in self._infos}
+
+    def check(self) -> None:
+        """Raises BagDamaged if a file could not be opened so far."""
+        for error in self._damaged.values():
+            raise error
 
     def profile(self) -> str:
         """Of the first file that can be read."""
@@ -382,6 +388,12 @@ def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
     """The files with messages: all in the folder itself, and those in folders below it that the metadata names."""
     named = {part.name for part in claimed.parts} if claimed is not None else set()
     return [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
+
+
+def reason(error: BagDamaged, name: str) -> str:
+    """What is wrong with a file, to be read after its name, which is not repeated."""
+    text = error.what.removeprefix(name)
+    return text.strip() if text != error.what else f'is damaged: {error.what}'.replace(f' of {name}', '')
 
 
 def no_bag(path: Path) -> BagError:

@@ -39,6 +39,8 @@ from shadowhound_data_logger.times import moment_in_bag
 
 UNFINISHED: Final = '.part'
 COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'
+ANY_END: Final = 1 << 64
+"""After every time that MCAP has."""
 SOURCE: Final = 'source'
 """Of what has to be downloaded whole."""
 
@@ -124,10 +126,11 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
         raise _nothing(bag, choice, absent, start_ns, start_ns)
     if end_ns <= start_ns:
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
+    least, most = start_ns if choice.start else 0, end_ns if choice.end else ANY_END  # the bag's own times may be incomplete
     writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666, profile=reader.profile())
     try:
-        for first, last in ((start_ns, end_ns),) if choice.spans is None else choice.spans:
-            if (begin := max(first, start_ns)) < (end := min(last, end_ns)):
+        for first, last in ((least, most),) if choice.spans is None else choice.spans:
+            if (begin := max(first, least)) < (end := min(last, most)):
                 for message in reader.messages(MessageFilter(begin, end, lambda channel: channel.topic in chosen)):
                     writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
@@ -137,13 +140,12 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
     if not info.messages:
         if missing:
             raise BagError(f'what was recorded then is in {", ".join(missing)}, which is not there', remedy=COMES)
-        if reader.damaged:
-            raise next(iter(reader.damaged.values()))
+        reader.check()
         raise _nothing(bag, choice, absent, start_ns, end_ns)
     (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro='', custom_data=bag.clock or clock))
     return Cut(
         out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
-        meter.bytes, meter.requests, bag_bytes, absent, missing, {name: error.what for name, error in reader.damaged.items()},
+        meter.bytes, meter.requests, bag_bytes, absent, missing, reader.damaged,
         reader.extras(), bag.remarks,
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ from itertools import count
 from typing import Final
 
 from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, is_name
 from shadowhound_data_logger.missions.folder import safe_type
 
 BUCKET: Final = 'sensor-data'
@@ -20,6 +21,8 @@ UNSYNCED: Final = '_unsynced_'
 METADATA, MANIFEST = 'metadata.yaml', 'manifest.json'
 MCAP, SQLITE, PACKED = '.mcap', '.db3', '.zstd'
 """What the names of files with messages end with; rosbag2 appends the last to one that it compressed."""
+UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
+"""What is replaced in the name of a folder or file that becomes part of a key."""
 SLICES: Final = (MCAP, SQLITE, MCAP + PACKED, SQLITE + PACKED)
 
 
@@ -51,6 +54,13 @@ def _safe(what: str) -> str:
 def _free(wanted: str, is_taken: Callable[[str], bool]) -> str:
     names = (f'{wanted}_{number}' if number else wanted for number in count())
     return next(name for name in names if not is_taken(name))
+
+
+def safe_bag(name: str) -> str:
+    """The nearest name that a bag in a store can have, of a folder that may have any."""
+    if is_name(name, MAX_BAG_BYTES):
+        return name
+    return UNSAFE.sub('_', name.replace('..', '_')).strip('_.-')[:MAX_BAG_BYTES] or 'bag'
 
 
 def slice_file(bag: str, number: int) -> str:

@@ -152,7 +152,7 @@ def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: 
         found = described(sources, of_metadata(document(store, file), file.key, sources), None)
         if found is not None:
             wrong = [f'{name} is not there' for name in found.absent]
-            wrong += [f'{name} cannot be read: {why}' for name, why in found.damaged.items()]
+            wrong += [f'{name} {why}' for name, why in found.damaged.items()]
             return _Facts(found.messages, len({topic.name for topic in found.topics}), found.t_start_ns, found.t_end_ns,
                           '; '.join(wrong), '; '.join(each for each in found.remarks if each != NOT_READ))  # fmt: skip
     try:

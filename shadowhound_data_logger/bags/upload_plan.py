@@ -8,21 +8,24 @@ from __future__ import annotations
 import gzip
 import re
 import tarfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from itertools import count
+from pathlib import Path, PurePosixPath
 from typing import IO, Final, cast
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import files_of, open_folder
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, Manifest, Missing, RecordedTopic, SliceEntry
-from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, prefix_of
+from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, UNSAFE, prefix_of
 from shadowhound_data_logger.bags.remote import ARCHIVE
 from shadowhound_data_logger.durable_files import fingerprint
 from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, MAX_SEGMENT_BYTES, check_key, check_name, is_segment, unique
+from shadowhound_data_logger.mcap.rosbag2_metadata import to_yaml
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.untrusted import from_yaml
 
 CONTENT_TYPES: Final = {'.yaml': 'application/yaml', '.json': 'application/json', '.gz': 'application/gzip'}
 _NUMBER: Final = re.compile(r'_(\d+)\.', re.ASCII)
@@ -60,6 +63,8 @@ class UploadPlan:
     """Where metadata.yaml contradicts the files; the manifest has what these hold."""
     damaged: Mapping[str, str] = field(default_factory=dict)
     """Files that are uploaded although they cannot be read, and why."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Files whose name cannot be part of a key, and the name that they have in the store, also in its metadata.yaml."""
 
     @property
     def size(self) -> int:
@@ -106,16 +111,56 @@ def plan_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
     """Its files as they are; the manifest is made in the folder ``work``. Raises BagError, BagDamaged, NameRefused, OSError."""
     folder, described = found.folder, found.description
     check_name(bag, 'the bag', MAX_BAG_BYTES)
+    paths = {name: path for name, path in files_of(folder).items() if name != MANIFEST}
+    names = _stored_names(list(paths))
+    renamed = {name: stored for name, stored in names.items() if name != stored}
+    if renamed.keys() & found.infos.keys():
+        paths[METADATA] = _renamed_metadata(paths[METADATA], renamed, work)
+    infos = {names[name]: info for name, info in found.infos.items()}
     files = [
-        _marked(_outgoing(path, name, robot, bag), found.infos.get(name), robot, bag)
-        for name, path in files_of(folder).items() if name != MANIFEST
-    ]  # fmt: skip
-    manifest = _manifest(files, found, robot, bag)
+        _marked(_outgoing(path, names[name], robot, bag), infos.get(names[name]), robot, bag) for name, path in paths.items()
+    ]
+    manifest = _manifest(files, replace(found, infos=infos), robot, bag)
     made = work / MANIFEST
     made.write_bytes(manifest.to_json())
     start_ns, end_ns = _kept(described.t_start_ns), _kept(described.t_end_ns)
     files.append(replace(_outgoing(made, MANIFEST, robot, bag), t_start_ns=start_ns, t_end_ns=end_ns))
-    return UploadPlan(robot, bag, folder, tuple(files), described.remarks, described.damaged)
+    return UploadPlan(robot, bag, folder, tuple(files), described.remarks, described.damaged, renamed)
+
+
+def _safe(name: str) -> str:
+    """The nearest name that can be part of a key; the end of a long one stays."""
+    if is_segment(name):
+        return name
+    found = UNSAFE.sub('_', name)
+    half = MAX_SEGMENT_BYTES // 2
+    return found if len(found) <= MAX_SEGMENT_BYTES else found[:half] + found[-half:]
+
+
+def _stored_names(names: Sequence[str]) -> dict[str, str]:
+    """Each file's own, or the nearest that can be part of a key and that no other file of the bag has."""
+    stored = {name: '/'.join(map(_safe, name.split('/'))) for name in names}
+    taken = {name for name in names if stored[name] == name} | {MANIFEST}
+    for name in names:
+        if stored[name] != name:
+            stored[name] = next(each for each in (unique(stored[name], attempt) for attempt in count()) if each not in taken)
+            taken.add(stored[name])
+    return stored
+
+
+def _renamed_metadata(path: Path, renamed: Mapping[str, str], work: Path) -> Path:
+    """A metadata.yaml that names the files as they are in the store, made in ``work``."""
+    told = from_yaml(path.read_text(encoding='utf-8'))
+    bag = told['rosbag2_bagfile_information']
+
+    def stored(name: str) -> str:
+        return renamed.get(name) or renamed.get(PurePosixPath(name).name) or name
+
+    bag['relative_file_paths'] = [stored(each) for each in bag['relative_file_paths']]
+    bag['files'] = [{**each, 'path': stored(each['path'])} for each in bag.get('files') or ()]
+    made = work / METADATA
+    made.write_text(to_yaml(told), encoding='utf-8')
+    return made
 
 
 def archive_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
@@ -171,7 +216,7 @@ def _manifest(files: list[Outgoing], found: FinishedBag, robot: str, bag: str) -
         replace(SliceEntry.of(info, file.key), file=file.name, bytes=file.size, sha256=file.sha256)
         for file in files if (info := found.infos.get(file.name)) is not None
     )  # fmt: skip
-    damaged = tuple(Missing(name, f'cannot be read: {why}', None) for name, why in found.description.damaged.items())
+    damaged = tuple(Missing(name, why, None) for name, why in found.description.damaged.items())
     if earlier is None:
         return Manifest(bag, robot, None, GAPS if damaged else COMPLETE, damaged, topics, entries)
     return replace(earlier, bag=bag, robot=robot, topics=topics, slices=entries, missing=(*earlier.missing, *damaged),

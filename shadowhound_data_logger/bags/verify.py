@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.contents import files_of, no_bag, opened, slices_of
+from shadowhound_data_logger.bags.contents import files_of, no_bag, opened, reason, slices_of
 from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
@@ -196,7 +196,7 @@ def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileChe
     try:
         info = opened(source).check()
     except BagDamaged as error:
-        return FileCheck(expected.name, _finding(error, source), checked)
+        return FileCheck(expected.name, reason(error, source.name), checked)
     if expected.messages not in {None, info.messages}:
         return FileCheck(expected.name, f'has {info.messages:,} messages, {expected.messages:,} were recorded', checked)
     return FileCheck(expected.name, '', checked, info)
@@ -216,7 +216,7 @@ def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Tellin
                 if finding:
                     return FileCheck(expected.name, finding, checked)
         except BagDamaged as error:
-            return FileCheck(expected.name, _finding(error, source), checked)
+            return FileCheck(expected.name, reason(error, source.name), checked)
     found = once.rest()
     if expected.sha256 and found != expected.sha256:
         return FileCheck(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
@@ -235,12 +235,6 @@ def _difference(counted: McapIndex, index: McapIndex, expected: _Expected) -> st
     if (counted.t_start_ns, counted.t_end_ns) != (index.t_start_ns, index.t_end_ns):
         return 'has messages of other times than its summary'
     return ''
-
-
-def _finding(error: BagDamaged, source: Ranged) -> str:
-    """Without the name of the file, which stands before it."""
-    text = error.what.removeprefix(source.name)
-    return text.strip() if text != error.what else f'is damaged: {error.what}'.replace(f' of {source.name}', '')
 
 
 class _Once:

@@ -19,7 +19,7 @@ from stat import S_ISREG
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.fetch import on_disk
-from shadowhound_data_logger.bags.naming import METADATA, SLICES
+from shadowhound_data_logger.bags.naming import METADATA, SLICES, safe_bag
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, planned, spool_upload
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, finished
 from shadowhound_data_logger.clock import SECOND, Clock, iso
@@ -136,7 +136,7 @@ class Watch:
     def _ship(self, path: Path) -> dict[str, Any]:
         settings = self._settings
         look = _look(path)
-        with planned(path, settings.robot, path.name, settings.home, is_archive=False) as sent:
+        with planned(path, settings.robot, safe_bag(path.name), settings.home, is_archive=False) as sent:
             with opened_spool(settings, self._clock) as spool:
                 spool_upload(sent, spool)
             files = [[file.name, file.key, file.size, file.sha256] for file in sent.files]
@@ -150,7 +150,9 @@ class Watch:
             settings = self._settings
             with opened_spool(settings, self._clock) as spool:
                 files = (Outgoing(name, key, path, size, sha256) for name, key, size, sha256 in mark['files'])
-                deliver(settings, spool, UploadPlan(settings.robot, path.name, path, tuple(files)), deadline_s=DELIVER_S)
+                deliver(
+                    settings, spool, UploadPlan(settings.robot, safe_bag(path.name), path, tuple(files)), deadline_s=DELIVER_S
+                )
             if not self._is_stored(mark):
                 return False
         mark['state'], mark['stored'] = STORED, iso(self._clock.wall_ns())

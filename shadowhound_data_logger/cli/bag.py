@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
 from shadowhound_data_logger.bags.manifest import Missing
-from shadowhound_data_logger.bags.naming import SLICES
+from shadowhound_data_logger.bags.naming import SLICES, safe_bag
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
@@ -283,7 +283,11 @@ def _spans(ranges: list[Any]) -> tuple[tuple[int, int], ...]:
 
 @bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --name patrol_2 --tar-gz'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path))
-@click.option('--name', default='', help='The name of the bag in the store  [default: that of DIR]')
+@click.option(
+    '--name',
+    default='',
+    help='The name of the bag in the store  [default: that of DIR, or the nearest valid one]',
+)
 @click.option('--tar-gz', is_flag=True, help='Store one ROBOT/rosbags/NAME.tar.gz instead of the files.')
 @click.option('--now', is_flag=True, help='Bypass the spool: nothing is kept here if Tower does not take it in time.')
 @click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
@@ -301,7 +305,7 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     folder = folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
     with (
-        planned(folder, robot, name or folder.name, the_home(), is_archive=tar_gz) as sent,
+        planned(folder, robot, name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
         progress('sent', of='bytes') as bar,
     ):
         if now:
@@ -312,11 +316,12 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
                 spool_upload(sent, spool)
                 found = deliver(settings, spool, sent, deadline_s=deadline, told=bar)
     if as_json:
-        facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks)}
+        facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks), 'renamed': dict(sent.renamed)}
         print_json({**asdict(found), 'is_delivered': found.is_delivered, **facts})
     else:
-        damaged = (plain(f'{name} was uploaded, but cannot be read: {why}', 'red') for name, why in sent.damaged.items())
-        print_lines(_told_upload(found), *damaged, *_remarks(sent.remarks))
+        damaged = (plain(f'{name} {why}; it was uploaded as it is.', 'red') for name, why in sent.damaged.items())
+        renamed = (f'{name} is {stored} in the store.' for name, stored in sent.renamed.items())
+        print_lines(_told_upload(found), *renamed, *damaged, *_remarks(sent.remarks))
     return exit_code(finding=not found.is_delivered or sent.damaged)
 
 
@@ -429,7 +434,7 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     yield _topics(found)
     yield ''
     yield _files(found)
-    yield from (plain(f'{name} cannot be read and is not counted: {why}', 'red') for name, why in told.damaged.items())
+    yield from (plain(f'{name} {why}; it is not counted.', 'red') for name, why in told.damaged.items())
     if found.missing:
         yield plain(f'{"Not here yet" if found.robot else "Not here"}: {", ".join(found.missing)}', 'yellow')
     yield from _remarks(told.remarks)
@@ -539,7 +544,7 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
         requests = counted(found.read_requests, 'request')
         share = f' ({100 * found.read_bytes / found.bag_bytes:.1f} %)' if found.read_bytes < found.bag_bytes else ''
         yield f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)}{share} in {requests}.'
-    yield from (plain(f'{name} cannot be read, so nothing of it was copied: {why}', 'red') for name, why in found.damaged.items())
+    yield from (plain(f'{name} {why}; nothing of it was copied.', 'red') for name, why in found.damaged.items())
     if found.extras:
         yield f'Not copied: {counted(found.extras, "attachment or metadata record")}.'
     if found.absent:

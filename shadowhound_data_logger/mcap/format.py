@@ -116,10 +116,9 @@ class Contents:
             fields = struct.pack('<H', number), text(channel.type), text(channel.encoding), struct.pack('<I', len(data))
             self.schemas[number] = records = record(Opcode.SCHEMA, *fields, data)
         track = ChannelTrack(len(self.tracks) + 1, channel)
-        ros = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
-        if channel.message_encoding != CDR:
-            ros = {name: value for name, value in ros.items() if value}
-        said = {**ros, **dict(channel.metadata), **({REPEATED: 'true'} if channel.repeated else {})}
+        said = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
+        said = {name: value for name, value in said.items() if value}
+        said |= {**dict(channel.metadata), **({REPEATED: 'true'} if channel.repeated else {})}
         names = text(channel.topic), text(channel.message_encoding)
         declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), *names, mapping(said))
         self.tracks[track.number], self.declared[track.number] = track, declared

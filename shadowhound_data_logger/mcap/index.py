@@ -148,10 +148,10 @@ class Schemas:
     def _add(self, record: ChannelRecord) -> None:
         name, encoding, definition = self._schemas[record.schema_id]
         rest = dict(record.metadata)
-        type_hash, qos = rest.pop('topic_type_hash', ''), in_numbers(rest.pop('offered_qos_profiles', ''))
+        type_hash, qos = (rest.pop(name) if rest.get(name) else '' for name in ('topic_type_hash', 'offered_qos_profiles'))
         repeated = rest.get(REPEATED) == 'true' and bool(rest.pop(REPEATED))
         channel = Channel(
-            topic=record.topic, type=name, encoding=encoding, definition=definition, type_hash=type_hash, qos=qos,
+            topic=record.topic, type=name, encoding=encoding, definition=definition, type_hash=type_hash, qos=in_numbers(qos),
             message_encoding=record.message_encoding, metadata=tuple(sorted(rest.items())), repeated=repeated,
         )  # fmt: skip
         if self.channels.setdefault(record.id, channel) != channel:
@@ -398,8 +398,11 @@ def _index(summary: memoryview, data_end: int, source: Ranged) -> McapIndex | No
         for number, count in chunk.counts.items():
             found[number] = found.get(number, 0) + count
     metadata += [''] * (statistics.metadata_count - len(metadata))
+    filled = [chunk for chunk in chunks if any(chunk.counts.values())]
     are_all = {number: count for number, count in found.items() if count} == counts
     start, end = (statistics.message_start_time, statistics.message_end_time) if messages else (0, 0)
+    if are_all and filled:  # some versions of the Go library have no 0 among the times of the statistics
+        start, end = min(chunk.t_start_ns for chunk in filled), max(chunk.t_end_ns for chunk in filled)
     return McapIndex(
         declared.channels, counts, messages, start, end, tuple(chunks) if are_all else None, statistics.attachment_count,
         tuple(metadata), data_end,

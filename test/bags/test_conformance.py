@@ -67,7 +67,8 @@ def facts(recorded: Recorded) -> tuple[int, int | None, int | None]:
 
 def test_the_matrix_is_complete() -> None:
     """As many variants as the project has of each input. The reference reader reads each whose records are not padded: in chunks
-    it does not skip the extra bytes."""
+    it does not skip the extra bytes.
+    """
     counts: dict[str, int] = {}
     for name, recorded, content in FOUND:
         counts[recorded.name] = counts.get(recorded.name, 0) + 1

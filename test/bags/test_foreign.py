@@ -13,12 +13,18 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from shadowhound_data_logger.bags.cut import Choice, cut_folder
-from shadowhound_data_logger.bags.info import info_folder
-from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
+from shadowhound_data_logger.bags.fetch import fetch
+from shadowhound_data_logger.bags.info import info_folder, info_of
+from shadowhound_data_logger.bags.naming import safe_bag
+from shadowhound_data_logger.bags.remote import find_bag, read_manifest
+from shadowhound_data_logger.bags.upload import planned, upload_now
+from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
 from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.mcap.index import read_index, read_summary
 from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.stores.directory import DirectoryStore
 
 S = 10**9
 STRING = ('std_msgs/msg/String', 'ros2msg', b'string data\n')
@@ -188,3 +194,107 @@ def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: in
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert ran.return_value == 0, ran.output
         assert ran.output.count('etadata.yaml claims') == 1
+
+
+def test_names_that_cannot_be_part_of_a_key(tmp_path: Path) -> None:
+    """A bag in a folder with spaces, its files, and notes next to them: stored under the nearest names, and complete."""
+    folder = write(tmp_path / '-my bäg' / 'my bäg_0.mcap', ten)
+    (folder / 'my_b_g_0.mcap').write_bytes((folder / 'my bäg_0.mcap').read_bytes())
+    (folder / 'field notes.txt').write_text('wet floor')
+    (folder / ('long ' * 45)).write_text('')
+    metadata_yaml(folder, relative_file_paths=['my_b_g_0.mcap', 'my bäg_0.mcap'], message_count=20, version=4, files=None)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    store = DirectoryStore(tmp_path / 'store')
+    with planned(folder, 'thor', safe_bag(folder.name), tmp_path / 'home', is_archive=False) as sent:
+        assert sent.bag == 'my_b_g'
+        assert sent.renamed['field notes.txt'] == 'field_notes.txt'
+        assert sent.renamed['my bäg_0.mcap'] == 'my_b_g_0_1.mcap'
+        upload_now(store, sent, deadline_s=60)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert verify_remote(store, find_bag(store, 'thor', 'my_b_g'), deep=True).is_sound
+    found = fetch(store, find_bag(store, 'thor', 'my_b_g'), tmp_path / 'fetched')
+    assert found.is_complete
+    described = info_folder(found.folder).description
+    assert (described.messages, described.absent, [part.name for part in described.parts]) == (
+        20, (), ['my_b_g_0.mcap', 'my_b_g_0_1.mcap'],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize('name', ['a bag', '-x', 'ä', '..', '.hidden', 'x..y', '_', 'x' * 300])
+def test_every_folder_has_a_name_in_the_store(name: str) -> None:
+    """Also one with nothing but what cannot be part of a key."""
+    assert check_name(safe_bag(name), 'the bag', MAX_BAG_BYTES)
+
+
+def test_a_torn_file_of_a_split_bag(tmp_path: Path) -> None:
+    """The others are shown, cut, verified and uploaded, and each verb says so; the torn one is kept in the store as it is."""
+    for part in range(3):
+        write(tmp_path / 'b' / f'b_{part}.mcap', ten)
+    folder = tmp_path / 'b'
+    metadata_yaml(folder, message_count=30)
+    (folder / 'b_1.mcap').write_bytes((folder / 'b_1.mcap').read_bytes()[:-20])
+    described = info_folder(folder).description
+    assert (described.messages, list(described.damaged), described.remarks) == (20, ['b_1.mcap'], ())
+    cut = cut_folder(folder, tmp_path / 'piece', Choice())
+    assert (cut.messages, list(cut.damaged)) == (20, ['b_1.mcap'])
+    assert [check.name for check in verify_folder(folder, deep=True).findings] == ['b_1.mcap']
+    store = DirectoryStore(tmp_path / 'store')
+    with planned(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+        assert list(sent.damaged) == ['b_1.mcap']
+        upload_now(store, sent, deadline_s=60)
+    remote = find_bag(store, 'thor', 'b')
+    manifest = read_manifest(store, remote)
+    assert manifest is not None
+    assert (manifest.state, [each.file for each in manifest.slices], [each.file for each in manifest.missing]) == (
+        'gaps', ['b_0.mcap', 'b_2.mcap'], ['b_1.mcap'],
+    )  # fmt: skip
+    assert [check.name for check in verify_remote(store, remote).findings] == ['b_1.mcap']
+    assert cut_remote(store, remote, tmp_path / 'remote', Choice()).messages == 20
+    for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
+        ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
+        assert (ran.return_value, 'b_1.mcap' in ran.output) == (1, True)
+        assert ' '.join(ran.output.split()).count('b_1.mcap has no end of an MCAP file') == 1
+
+
+def test_a_message_at_0_that_the_statistics_do_not_have(tmp_path: Path) -> None:
+    """As the Go library writes them, of a bag with simulated time: its chunks have it."""
+
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel('/clock', 'cdr', writer.register_schema(*STRING))
+        for n in range(3):
+            writer.add_message(channel, n, CDR, n)
+
+    for options in ({}, {'use_chunking': False}):
+        folder = write(tmp_path / f'b{len(options)}' / 'b_0.mcap', fill, **options)
+        content = (folder / 'b_0.mcap').read_bytes()
+        statistics = b'\0' * 8 + (2).to_bytes(8, 'little')
+        assert content.count(statistics + b'\x0a\0\0\0\1\0') == 1
+        content = content.replace(statistics + b'\x0a\0\0\0\1\0', (1).to_bytes(8, 'little') + statistics[8:] + b'\x0a\0\0\0\1\0')
+        (folder / 'b_0.mcap').write_bytes(content)
+        cut_folder(folder, tmp_path / f'piece{len(options)}', Choice())
+        assert [one[4] for one in read(tmp_path / f'piece{len(options)}' / f'piece{len(options)}_0.mcap')] == [0, 1, 2]
+    assert info_folder(tmp_path / 'b0').description.t_start_ns == 0
+    assert verify_folder(tmp_path / 'b0', deep=True).is_sound
+
+
+def test_times_of_64_bits(tmp_path: Path) -> None:
+    """Near 0 and near 2^64: through a cut, a cut of that, an upload and a fetch; info shows them."""
+    times = [0, 1, (1 << 63) - 1, 1 << 63, (1 << 64) - 1]
+
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel('/x', 'cdr', writer.register_schema(*STRING))
+        for n in times:
+            writer.add_message(channel, n, CDR, (1 << 64) - 1 - n)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
+    cut_folder(folder, tmp_path / 'piece', Choice())
+    cut_folder(tmp_path / 'piece', tmp_path / 'again', Choice())
+    assert read(tmp_path / 'again' / 'again_0.mcap') == read(folder / 'b_0.mcap')
+    store = DirectoryStore(tmp_path / 'store')
+    with planned(tmp_path / 'again', 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+        upload_now(store, sent, deadline_s=60)
+    fetched = fetch(store, find_bag(store, 'thor', 'b'), tmp_path / 'fetched').folder
+    for found in (info_of(store, 'thor', 'b', tmp_path / 'home'), info_folder(fetched)):
+        assert (found.description.t_start_ns, found.description.t_end_ns) == (0, (1 << 64) - 1)
+    ran = CliRunner().invoke(bag, ['info', f'{fetched}/'], standalone_mode=False)
+    assert '2554-07-21 23:34:33.709' in ran.output
