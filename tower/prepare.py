@@ -31,21 +31,59 @@ ACCOUNT = '000000000000'
 OLD_VERSION_DAYS = 30
 NO_REQUESTS = b'{"format":1,"entries":[]}'
 UNFINISHED_DAYS = 7
+GIB = 1 << 30
 """A robot that stays away for longer begins a large upload anew."""
 
 
-def policy(bucket: str, robots: Sequence[str]) -> str:
-    """These users may not delete, nor may Spark, whatever their actions say: SeaweedFS's ``Write`` includes it."""
-    return json.dumps({
-        'Version': '2012-10-17',
-        'Statement': [{
-            'Sid': 'RobotsDoNotDelete',
-            'Effect': 'Deny',
-            'Principal': {'AWS': [f'arn:aws:iam::{ACCOUNT}:user/{name}' for name in (*robots, 'spark')]},
-            'Action': ['s3:DeleteObject', 's3:DeleteObjectVersion'],
-            'Resource': [f'arn:aws:s3:::{bucket}/*'],
-        }],
-    })  # fmt: skip
+def policy(bucket: str, robots: Sequence[str], full: Sequence[str] = ()) -> str:
+    """What robots and Spark may not do, whatever their actions say: SeaweedFS's ``Write`` includes deleting.
+
+    A URL that a robot's keys signed would let anybody act for it later, without the keys: in the old form (version 2) for
+    years. An object that a robot encrypted with its own key (SSE-C) would be unreadable for everybody else. ``full`` are
+    robots that have stored as much as they may.
+    """
+
+    def deny(sid: str, users: Sequence[str], actions: Sequence[str], **condition: dict[str, str]) -> dict[str, Any]:
+        return {
+            'Sid': sid, 'Effect': 'Deny', 'Principal': {'AWS': [f'arn:aws:iam::{ACCOUNT}:user/{name}' for name in users]},
+            'Action': actions, 'Resource': [f'arn:aws:s3:::{bucket}/*'], **({'Condition': condition} if condition else {}),
+        }  # fmt: skip
+
+    statements = [
+        deny('RobotsDoNotDelete', (*robots, 'spark'), ['s3:DeleteObject', 's3:DeleteObjectVersion']),
+        deny('RobotsSignNoUrls', robots, ['s3:*'], StringNotEquals={'s3:authType': 'REST-HEADER'}),
+        deny('NobodySignsUrlsForYears', ['spark'], ['s3:*'], StringEquals={'s3:authType': 'REST-QUERY-STRING'}),
+        deny('RobotsHideNothing', robots, ['s3:PutObject'],
+             Null={'s3:x-amz-server-side-encryption-customer-algorithm': 'false'}),
+    ]  # fmt: skip
+    if full:
+        statements.append(deny('RobotsOverTheirQuota', full, ['s3:PutObject']))
+    return json.dumps({'Version': '2012-10-17', 'Statement': statements})
+
+
+def stored_bytes(s3: Any, robot: str) -> int:
+    """What a robot has stored: all versions of its objects, and the parts of uploads that it never finished."""
+    size = 0
+    for bucket in ROBOT_BUCKETS:
+        given = {'Bucket': bucket, 'Prefix': f'{robot}/'}
+        for page in s3.get_paginator('list_object_versions').paginate(**given):
+            size += sum(each['Size'] for each in page.get('Versions', ()))
+        for page in s3.get_paginator('list_multipart_uploads').paginate(**given):
+            for upload in page.get('Uploads', ()):
+                parts = s3.get_paginator('list_parts')
+                for part in parts.paginate(Bucket=bucket, Key=upload['Key'], UploadId=upload['UploadId']):
+                    size += sum(each['Size'] for each in part.get('Parts', ()))
+    return size
+
+
+def over_quota(s3: Any, quotas: Sequence[tuple[str, float]]) -> dict[str, str]:
+    """Each robot that has stored as much as it may, or more, and a sentence about it."""
+    found = {}
+    for robot, gib in quotas:
+        size = stored_bytes(s3, robot) / GIB
+        if size >= gib:
+            found[robot] = f'{robot} has stored {size:,.3f} GiB of {gib:g} GiB: it may store nothing more'
+    return found
 
 
 def rules(bucket: str, robots: Sequence[str] = (), expiry: Sequence[tuple[str, int]] = ()) -> dict[str, Any]:
@@ -73,6 +111,14 @@ def expiry_of(text: str) -> tuple[str, int]:
     if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]*', sensor) or not re.fullmatch(r'[1-9][0-9]{0,4}', days):
         raise argparse.ArgumentTypeError(f'{text!r} is not SENSOR=DAYS, such as camera=90')
     return sensor, int(days)
+
+
+def quota_of(text: str) -> tuple[str, float]:
+    """The robot and the GiB of ``thor=500``. Raises ArgumentTypeError."""
+    robot, _, gib = text.partition('=')
+    if not re.fullmatch(r'[A-Za-z0-9][A-Za-z0-9_-]*', robot) or not re.fullmatch(r'[0-9]{1,9}(\.[0-9]{1,9})?', gib):
+        raise argparse.ArgumentTypeError(f'{text!r} is not ROBOT=GIB, such as thor=500')
+    return robot, float(gib)
 
 
 def make_mailbox(s3: Any, robot: str) -> None:
@@ -111,18 +157,24 @@ def wait(s3: Any, seconds: float) -> None:
             return
 
 
-def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = ()) -> list[str]:
-    """Make it so; returns a sentence for each thing that the server does not do. Raises ClientError when there are no buckets."""
+def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = (),
+            quotas: Sequence[tuple[str, float]] = ()) -> list[str]:  # fmt: skip
+    """Make it so; returns a sentence for each thing that the server does not do, and for each robot that is over its quota.
+
+    Raises ClientError when there are no buckets.
+    """
     missing: list[str] = []
     present = {bucket['Name'] for bucket in s3.list_buckets()['Buckets']}
     for bucket in BUCKETS:
         if bucket not in present:
             s3.create_bucket(Bucket=bucket)
+    full = over_quota(s3, quotas)
+    for bucket in BUCKETS:
         lifecycle = rules(bucket, robots, expiry)
         steps = {'lifecycle rules': partial(s3.put_bucket_lifecycle_configuration, LifecycleConfiguration=lifecycle)}
         if bucket in ROBOT_BUCKETS:
             steps['versions'] = partial(s3.put_bucket_versioning, VersioningConfiguration={'Status': 'Enabled'})
-            steps['a policy against deleting'] = partial(s3.put_bucket_policy, Policy=policy(bucket, robots))
+            steps['a policy for robots'] = partial(s3.put_bucket_policy, Policy=policy(bucket, robots, list(full)))
         for what, step in steps.items():
             try:
                 step(Bucket=bucket)
@@ -130,7 +182,7 @@ def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = 
                 missing.append(f'{bucket}: the server does not take {what}: {error.response["Error"].get("Code")}')
     for robot in robots:
         make_mailbox(s3, robot)
-    return missing
+    return [*missing, *full.values()]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,6 +200,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar='SENSOR=DAYS',
         help='let the server itself delete the objects of a sensor that are so old, whatever refers to them',
     )
+    parser.add_argument(
+        '--quota',
+        action='append',
+        default=[],
+        type=quota_of,
+        metavar='ROBOT=GIB',
+        help='let a robot that has stored so much store nothing more, until this is run again and there is room',
+    )
     parser.add_argument('--wait', type=float, default=60.0, metavar='S', help='how long to wait for the server')
     options = parser.parse_args(arguments)
     if not os.environ.get('AWS_ENDPOINT_URL'):
@@ -157,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         robots = options.robot or (robots_of(options.users) if options.users else ['thor'])
         s3 = connect()
         wait(s3, options.wait)
-        missing = prepare(s3, robots, options.expire)
+        missing = prepare(s3, robots, options.expire, options.quota)
     except (OSError, ValueError) as error:
         print(f'prepare: {options.users}: {error}', file=sys.stderr)
         return 2

@@ -7,10 +7,14 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import boto3
 import pytest
+import urllib3
+from botocore.config import Config
 from botocore.exceptions import ClientError
 from lake.making import add, add_part, row
 from tower_scripts import make_secrets, prepare
@@ -283,3 +287,94 @@ def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str)
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]
     assert found.is_finding
     assert says in found.cause
+
+
+def _presigned(
+    server: Tower, user: str, version: str, seconds: int, method: str = 'get_object', key: str = 'thor/camera/url.txt'
+) -> str:
+    environ = server.environment(user)
+    client = boto3.client(
+        's3', endpoint_url=environ['AWS_ENDPOINT_URL'], aws_access_key_id=environ['AWS_ACCESS_KEY_ID'],
+        aws_secret_access_key=environ['AWS_SECRET_ACCESS_KEY'], region_name='us-east-1',
+        config=Config(signature_version=version, s3={'addressing_style': 'path'}),
+    )  # fmt: skip
+    return str(
+        client.generate_presigned_url(method, Params={'Bucket': 'sensor-data', 'Key': 'thor/camera/url.txt'}, ExpiresIn=seconds)
+    )
+
+
+YEAR_S = 52 * 7 * 86_400
+
+
+@pytest.mark.parametrize(('user', 'version', 'seconds', 'method', 'status'), [
+    ('thor', 's3', YEAR_S, 'get_object', 403), ('thor', 's3', YEAR_S, 'put_object', 403), ('thor', 's3', 60, 'get_object', 403),
+    ('thor', 's3v4', 60, 'get_object', 403), ('thor', 's3v4', 60, 'put_object', 403), ('thor', 's3v4', YEAR_S, 'get_object', 400),
+    ('spark', 's3', YEAR_S, 'get_object', 403), ('spark', 's3v4', YEAR_S, 'get_object', 400),
+    ('spark', 's3v4', 60, 'get_object', 200),
+])  # fmt: skip
+def test_no_url_outlives_a_robots_keys(
+    server: Tower, as_user: Connect, user: str, version: str, seconds: int, method: str, status: int
+) -> None:
+    """A robot signs no URL at all, and Spark none for longer than a week."""
+    as_user('thor').put_object(Bucket='sensor-data', Key='thor/camera/url.txt', Body=b'mine')
+    url = _presigned(server, user, version, seconds, method)
+    body = b'theirs' if method == 'put_object' else None
+    answer = urllib3.request('PUT' if body else 'GET', url, body=body, retries=False, timeout=30)
+    assert answer.status == status
+    assert as_user('spark').get_object(Bucket='sensor-data', Key='thor/camera/url.txt')['Body'].read() == b'mine'
+
+
+@pytest.mark.parametrize('how', ['put', 'copy', 'parts'])
+def test_a_robot_hides_no_object_behind_a_key_of_its_own(as_user: Connect, how: str) -> None:
+    """With SSE-C nothing is stored, and what the server encrypts with its own key is read by Spark."""
+    thor, where = as_user('thor'), {'Bucket': 'sensor-data', 'Key': f'thor/camera/hidden-{how}.txt'}
+    thor.put_object(Bucket='sensor-data', Key='thor/camera/plain.txt', Body=b'plain', ServerSideEncryption='AES256')
+    own = {'SSECustomerAlgorithm': 'AES256', 'SSECustomerKey': b'k' * 32}
+    calls: dict[str, Callable[..., Any]] = {
+        'put': partial(thor.put_object, Body=b'hidden'), 'parts': thor.create_multipart_upload,
+        'copy': partial(thor.copy_object, CopySource='sensor-data/thor/camera/plain.txt'),
+    }  # fmt: skip
+    assert _is_denied(calls[how], **where, **own)
+    spark = as_user('spark')
+    assert spark.get_object(Bucket='sensor-data', Key='thor/camera/plain.txt')['Body'].read() == b'plain'
+    with pytest.raises(ClientError, match='404'):
+        spark.head_object(**where)
+
+
+def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch,
+                                                            capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    """All versions and unfinished uploads count; other robots go on, and so does this one once it may store more."""
+    for name, value in server.environment().items():
+        monkeypatch.setenv(name, value)
+    robots = ['--robot', 'thor', '--robot', 'tachi']
+    admin, tachi, where = prepare.connect(), as_user('tachi'), {'Bucket': 'trajectories', 'Key': 'tachi/quota.csv'}
+    before = prepare.stored_bytes(admin, 'tachi')
+    for _ in range(2):
+        tachi.put_object(**where, Body=b'x' * (1 << 20))
+    upload = tachi.create_multipart_upload(Bucket='sensor-data', Key='tachi/quota.mcap')['UploadId']
+    tachi.upload_part(Bucket='sensor-data', Key='tachi/quota.mcap', UploadId=upload, PartNumber=1, Body=b'x' * (1 << 20))
+    assert prepare.stored_bytes(admin, 'tachi') == before + (3 << 20)
+    try:
+        assert prepare.main([*robots, '--quota', f'tachi={(before + (2 << 20)) / prepare.GIB:.9f}', '--quota', 'thor=1000']) == 0
+        assert 'tachi has stored' in capsys.readouterr().err
+        for bucket in prepare.ROBOT_BUCKETS:
+            assert _is_denied(tachi.put_object, Bucket=bucket, Key='tachi/more', Body=b'x')
+            assert _is_denied(tachi.create_multipart_upload, Bucket=bucket, Key='tachi/more')
+            as_user('thor').put_object(Bucket=bucket, Key='thor/quota', Body=b'x')
+        assert _is_denied(
+            tachi.upload_part, Bucket='sensor-data', Key='tachi/quota.mcap', UploadId=upload, PartNumber=2, Body=b'x'
+        )
+        assert tachi.get_object(**where)['ContentLength'] == 1 << 20
+        assert prepare.main([*robots, '--quota', 'tachi=1000']) == 0
+        tachi.put_object(**where, Body=b'x')
+        assert capsys.readouterr().err == ''
+    finally:
+        assert prepare.main(robots) == 0
+
+
+@pytest.mark.parametrize('text', ['', 'thor', 'thor=', '=5', 'thor=-1', 'thor=1e3', '../x=5', 'thor=nan'])
+def test_a_quota_that_is_none_is_refused(text: str) -> None:
+    """With what it should look like."""
+    with pytest.raises(ArgumentTypeError, match='such as thor=500'):
+        prepare.quota_of(text)
+    assert prepare.quota_of('thor=0.5') == ('thor', 0.5)
