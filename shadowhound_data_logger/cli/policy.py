@@ -20,6 +20,7 @@ from shadowhound_data_logger.cli.common import (
     ExitCode,
     as_json,
     examples,
+    exit_code,
     robot_name,
     the_home,
     the_store,
@@ -134,6 +135,8 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
 
     Robots learn of it from the store. What somebody else signed with the old keys is no longer listed.
     """
+    if (publics or threshold) and 'root' not in roles:
+        raise BadUsage('--root-key and --threshold are of a new root', 'policy rotate root --root-key alice.pub')
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
     files, repository = _signers()
     new_root = [files.load_public(path) for path in publics]
@@ -144,8 +147,10 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
         click.echo(f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh')
         return ExitCode.FINE
     click.echo(f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}')
-    if not (place / repository.ONLINE_KEY).is_file():
-        click.echo('run policy refresh on the machine that has online.key')
+    if 'online' in roles or 'targets' in roles or not roles:
+        click.echo(f'copy {place / repository.ONLINE_KEY} to where policy refresh runs')
+    if (place / repository.ROOT_KEY).is_file():
+        click.echo(f'move {place / repository.ROOT_KEY} offline')
     return ExitCode.FINE
 
 
@@ -181,11 +186,10 @@ def refresh(*, days: float, folder: Path | None, as_json: bool) -> ExitCode:
         state = signing.refresh()
         listed = signing.listed()
     told = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
-            'listed': listed}  # fmt: skip
-    print_json(told) if as_json else click.echo(
-        f'fresh until {told["expires"]}; the root until {told["root_expires"]}; {len(listed)} versions are listed'
-    )
-    return ExitCode.FINE
+            'listed': listed, 'soon': (soon := [*state.soon()])}  # fmt: skip
+    fresh = f'fresh until {told["expires"]}; the root until {told["root_expires"]}; {len(listed)} versions are listed'
+    print_json(told) if as_json else click.echo('\n'.join((fresh, *soon)))
+    return exit_code(finding=soon)
 
 
 @policy.command(epilog=examples('policy pack outputs/go2_patrol --name go2_patrol --smoke sample.npz -o packed'))

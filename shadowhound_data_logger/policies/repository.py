@@ -43,6 +43,8 @@ from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 
 ROOT_DAYS: Final = 730
+RENEW_DAYS: Final = 60
+"""So long before is said that a root or a list will expire."""
 ROOT_KEY, TARGETS_KEY, ONLINE_KEY = (f'{name}{PRIVATE}' for name in ('root', 'targets', 'online'))
 NEXT: Final = '.next'
 """In the names of files that take effect with the next root."""
@@ -82,6 +84,15 @@ class InForce:
         """When robots that receive nothing newer take no new version."""
         return min(each.signed.expires for each in (self.root, self.snapshot, self.timestamp, *self.lists.values()) if each)
 
+    def soon(self) -> Iterator[str]:
+        """What expires next that no ``refresh`` renews, and what does."""
+        before = in_days(RENEW_DAYS)
+        if self.root.signed.expires < before:
+            yield f'the root expires on {self.root.signed.expires:%Y-%m-%d}: policy rotate makes another one'
+        for role, listed in self.lists.items():
+            if listed.signed.expires < before:
+                yield f'what {role} lists expires on {listed.signed.expires:%Y-%m-%d}: policy publish with its key signs it again'
+
 
 class Repository:
     """Life: New; any number of changes, each of which begins with a look at the store. One thread."""
@@ -113,35 +124,38 @@ class Repository:
         if missing := signatures(root).missing:
             remedy = f'policy sign-root {self._folder / ROOT} --key KEY, by each who keeps a root key'
             raise PolicyError(f'{self._folder / ROOT} lacks {missing} signatures', remedy=remedy)
+        root = self._newest(root)
         pending = self._folder / PENDING
         if pending.is_file():
-            following: Metadata[Root] = Metadata.from_bytes(pending.read_bytes())
+            following = read_root(pending)
             if following.signed.version == root.signed.version + 1 and not signatures(following, root).missing:
                 self._place(following, ROOT_ROLE, lambda body: _follows(root, body) is not None)
-                self._adopt(following)
-                root = following
+                root = self._newest(root)
+            if following.signed.version <= root.signed.version:
+                is_ours = following.to_bytes() == root.to_bytes()
                 for path in self._folder.glob(f'*{NEXT}*'):  # keys that it names, and itself
-                    if path == pending:
-                        path.unlink()
-                    else:
+                    if is_ours and path != pending:
                         path.replace(path.with_name(path.name.replace(NEXT, '')))
-        elif root.signed.version > 1:
+                    else:
+                        path.unlink()
+        if root.signed.version > 1:
             self._place(root, ROOT_ROLE, lambda body: body == root.to_bytes())
+        return root
+
+    def _newest(self, root: Metadata[Root]) -> Metadata[Root]:
+        """The last root in the store that follows from this one, which is kept."""
         for _ in range(MAX_STEPS):
             name = f'{root.signed.version + 1}.{ROOT_ROLE}.json'
             body = self._get(name)
             if body is None:
-                return root
+                break
             if (found := _follows(root, body)) is None:  # as long as it is there, no robot goes on
                 self._store.delete(BUCKET, f'{METADATA}/{name}')
-                return root
+                break
             root = found
-            self._adopt(root)
+            with durable_files.replacing(self._folder / ROOT, is_synced=True, mode=0o644) as file:
+                file.write(root.to_bytes())
         return root
-
-    def _adopt(self, root: Metadata[Root]) -> None:
-        with durable_files.replacing(self._folder / ROOT, is_synced=True, mode=0o644) as file:
-            file.write(root.to_bytes())
 
     def _timestamp(self, root: Metadata[Root]) -> tuple[Metadata[Timestamp] | None, str]:
         """The newer one of those of the store and of this folder, and the version of the object."""
@@ -309,8 +323,13 @@ class Repository:
         signed.version += 1
         signed.expires = in_days(ROOT_DAYS)
         following.signatures.clear()
+        if not root_keys and not (self._folder / ROOT_KEY).is_file():
+            raise PolicyError(f'a new root is signed with the keys of the one before, and {ROOT_KEY} is not in {self._folder}',
+                              remedy='name them, wherever they are: --root-secret /media/usb/root.key')  # fmt: skip
         signers = [keys.load_key(path, self._passphrase) for path in root_keys or [self._folder / ROOT_KEY]]
-        (self._folder / PENDING).unlink(missing_ok=True)
+        for path, signer in zip(root_keys, signers, strict=False):
+            if signer.public_key.keyid not in root.signed.roles[ROOT_ROLE].keyids:
+                raise PolicyError(f'{path} is not a key of the root of version {root.signed.version}')
         for path in self._folder.glob(f'*{NEXT}*'):
             path.unlink()
         if ROOT_ROLE in roles:
@@ -331,6 +350,7 @@ class Repository:
         (self._folder / PENDING).write_bytes(following.to_bytes())
         found = signatures(following, root)
         if not found.missing:
+            self.load()  # which puts it in force, also where somebody else has online.key
             self._refresh_if_here()
         return found
 

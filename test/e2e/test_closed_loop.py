@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
@@ -73,6 +74,7 @@ def summary(server: Server, command: str) -> dict[str, Any]:
     """Of a mission, as MLflow has it."""
     path = server.client.download_artifacts(server.run(command).info.run_id, 'summary.json')
     found: dict[str, Any] = json.loads(Path(path).read_bytes())
+    gc.collect()  # MLflow's client of artifacts keeps a thread until it is collected
     return found
 
 

@@ -7,21 +7,24 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import socket
+import threading
 import time
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from copy import deepcopy
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 import pytest
 from policies.models import Aliases, Spark, bucket_of, linear
 from tuf.api.metadata import DelegatedRole, Delegations, Metadata, MetaFile, Root, Snapshot, TargetFile, Targets, Timestamp
 
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.errors import DataLoggerError, PolicyError, PolicyRefused
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import repository, sync
@@ -261,6 +264,100 @@ def test_endless_data(battle: Battle, role: str) -> None:
         battle.write(name, whole)
     battle.spark.signing(battle.store).refresh()
     assert battle.robot.run().done == 'activated'
+
+
+@pytest.mark.seaweedfs
+@pytest.mark.long('a real store')
+def test_slow_retrieval(seaweed: Tower, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A byte now and then holds one look at the store, and nothing else: no rollback, and no word on what has expired.
+
+    When the connection is gone the next look continues where it was.
+    """
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
+    bucket_of(seaweed)
+    with closing(open_store(seaweed.store_settings(), UploadSettings())) as store:
+        battle = Battle(tmp_path, store)
+        first = battle.publish(1)
+        assert battle.taken() == first
+        second = battle.publish(2)
+        settings = replace(seaweed.store_settings(), endpoint_url='')
+        with closing(TricklingFront(urlsplit(seaweed.endpoint_url).port or 0)) as front:
+            settings = replace(settings, endpoint_url=f'http://127.0.0.1:{front.port}')
+            with closing(open_store(settings, UploadSettings(read_timeout_s=5.0))) as slow:
+                robot = replace(battle.robot, store=slow)
+                failed: list[BaseException] = []
+                look = threading.Thread(target=lambda: failed.extend(_raised(robot.run)))
+                look.start()
+                assert front.is_slow.wait(60.0)
+                assert look.is_alive()
+                assert battle.folder.roll_back() is None
+                battle.folder.use(str(first))
+                assert 'expired on' in why_stale(battle.folder.path, time.time_ns() + 20 * DAY_NS)
+                with pytest.raises(PolicyError, match='another process'):
+                    battle.robot.run()
+                front.close()
+                look.join(60.0)
+        assert not look.is_alive()
+        battle.folder.unpin()
+        assert battle.taken() == second
+
+
+def _raised(act: Callable[[], object]) -> list[BaseException]:
+    try:
+        act()
+    except (DataLoggerError, OSError) as error:
+        return [error]
+    return []
+
+
+class TricklingFront:
+    """Passes connections on to a server, whose answers come in single bytes from the second kilobyte on."""
+
+    def __init__(self, to: int) -> None:
+        self._to = to
+        self._listener = socket.create_server(('127.0.0.1', 0))
+        self.port: int = self._listener.getsockname()[1]
+        self.is_slow = threading.Event()
+        self._over = threading.Event()
+        self._sockets: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._serve)]
+        self._threads[0].start()
+
+    def close(self) -> None:
+        if not self._over.is_set():
+            self._over.set()
+            socket.create_connection(('127.0.0.1', self.port)).close()
+        for one in self._sockets:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(60.0)
+        for one in (self._listener, *self._sockets):
+            one.close()
+
+    def _serve(self) -> None:
+        while True:
+            client, _ = self._listener.accept()
+            if self._over.is_set():
+                client.close()
+                return
+            server = socket.create_connection(('127.0.0.1', self._to))
+            self._sockets += client, server
+            for source, target, is_answer in ((client, server, False), (server, client, True)):
+                self._threads.append(threading.Thread(target=self._pass, args=(source, target, is_answer)))
+                self._threads[-1].start()
+
+    def _pass(self, source: socket.socket, target: socket.socket, is_answer: bool) -> None:
+        passed = 0
+        with suppress(OSError):
+            while content := source.recv(1 if passed > 2_000 else 4096):
+                target.sendall(content)
+                passed += len(content) if is_answer else 0
+                if passed > 2_000:
+                    self.is_slow.set()
+                    self._over.wait(1.0)
+        with suppress(OSError):
+            target.shutdown(socket.SHUT_RDWR)
 
 
 def test_wrong_keys(battle: Battle) -> None:

@@ -1,0 +1,258 @@
+"""The verbs of who signs policies, and what a robot says when it has received nothing fresh."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from tuf.api.metadata import Metadata, Root, Timestamp
+
+from shadowhound_data_logger.cli.main import cli
+from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.policies import trust
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.repository import Repository
+from shadowhound_data_logger.stores import open_store
+
+
+class Team:
+    """A home with a folder of keys and a store, and the verbs."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        self.keys = home / 'policy-keys'
+        self.store = open_store(StoreSettings(directory=home / 'store'), UploadSettings())
+
+    def run(self, *arguments: object, code: int = 0, **environ: str) -> str:
+        """What it prints, of an error too."""
+        runner = CliRunner(env={'SHADOWHOUND_HOME': str(self.home), 'COLUMNS': '200', **environ})
+        done = runner.invoke(cli, ['policy', *map(str, arguments)], standalone_mode=False)
+        if isinstance(done.exception, DataLoggerError):
+            assert code == 1, done.exception
+            return f'{done.exception}'
+        assert (done.exception, done.return_value or 0) == (None, code), done.output
+        return done.output
+
+    def publish(self, path: str, key: Path | None = None) -> bool:
+        return Repository(self.keys, self.store, lambda _: '').publish({path: b'{}'}, key)
+
+    def root(self) -> Root:
+        return Metadata[Root].from_bytes((self.keys / 'root.json').read_bytes()).signed
+
+    def robot(self, name: str) -> PolicyFolder:
+        """It trusts the root that there is now."""
+        folder = PolicyFolder(self.home / name)
+        folder.make()
+        (folder.path / 'root.json').write_bytes((self.keys / 'root.json').read_bytes())
+        return folder
+
+    def listed(self, robot: PolicyFolder, path: str) -> bool:
+        """Whether the robot may run it."""
+        return trust.refresh(robot.path, self.store, lambda _: None, lambda _: None).listed(path) is not None
+
+
+@pytest.fixture
+def team(tmp_path: Path) -> Team:
+    return Team(tmp_path)
+
+
+def test_a_team_of_one_has_its_keys_with_one_command(team: Team) -> None:
+    """Four files for their owner alone, each with a word on where it belongs; what is there is not overwritten."""
+    said = team.run('keys')
+    for name, word in (('root.key', 'offline'), ('targets.key', 'stays'), ('online.key', 'refresh'), ('root.json', 'each robot')):
+        assert any(name in line and word in line for line in said.splitlines()), (name, said)
+    assert {path.stat().st_mode & 0o777 for path in team.keys.glob('*.key')} == {0o600}
+    assert team.keys.stat().st_mode & 0o777 == 0o700
+    before = {path: path.read_bytes() for path in team.keys.iterdir()}
+    assert 'exists already' in team.run('keys', code=1)
+    assert {path: path.read_bytes() for path in team.keys.iterdir()} == before
+
+
+def test_keys_with_a_passphrase(team: Team) -> None:
+    """They are no use without it; online.key has none, for cron."""
+    team.run('keys', '--encrypt', SHADOWHOUND_KEY_PASSPHRASE='correct horse')
+    assert [b'ENCRYPTED' in (team.keys / f'{name}.key').read_bytes() for name in ('root', 'targets', 'online')] == [
+        True,
+        True,
+        False,
+    ]
+    team.run('refresh', SHADOWHOUND_KEY_PASSPHRASE='correct horse')
+    assert 'the passphrase is wrong' in team.run('rotate', code=1, SHADOWHOUND_KEY_PASSPHRASE='wrong')
+    assert team.root().version == 1
+    assert 'version 2 is in force' in team.run('rotate', '--encrypt', SHADOWHOUND_KEY_PASSPHRASE='correct horse')
+    assert b'ENCRYPTED' in (team.keys / 'targets.key').read_bytes()
+    team.run('refresh')
+
+
+def test_a_team_whose_root_needs_two(team: Team) -> None:
+    """Nothing is signed before two of three have; one alone rotates nothing; a robot follows from the first root to the last."""
+    people = {name: team.home / 'people' / f'{name}.key' for name in ('alice', 'bob', 'carol')}
+    for name in people:
+        team.run('keys', '--only', name, '--keys', team.home / 'people')
+    publics = [part for key in people.values() for part in ('--root-key', key.with_suffix('.pub'))]
+    assert 'cannot sign' in team.run('keys', '--threshold', 4, *publics, code=1)
+    assert 'lacks 2 signatures' in team.run('keys', '--threshold', 2, *publics)
+    assert not (team.keys / 'root.key').exists()
+    assert 'lacks 2 signatures' in team.run('refresh', code=1)
+    root = team.keys / 'root.json'
+    said = team.run('sign-root', root, '--key', people['alice'])
+    assert 'root: 2 of' in said
+    assert '1 missing' in said
+    assert '1 missing' in team.run('sign-root', root, '--key', people['alice']), 'the same signature counts once'
+    assert 'complete' in team.run('sign-root', root, '--key', people['bob'])
+    robot = team.robot('thor')
+    assert team.publish('go2/go2_patrol/1')
+    assert team.listed(robot, 'go2/go2_patrol/1')
+
+    assert 'lacks 1 signatures' in team.run('rotate', '--root-secret', people['alice'])
+    assert team.publish('go2/go2_patrol/2'), 'the old keys are in force until then'
+    assert 'complete' in team.run('sign-root', team.keys / 'root.next.json', '--key', people['carol'])
+    assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1', 'go2/go2_patrol/2']
+    assert team.root().version == 2
+    assert team.listed(robot, 'go2/go2_patrol/2')
+    assert sorted(path.name for path in team.keys.glob('*.next.*')) == []
+
+
+def test_a_rotation_that_was_cut_off(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever that was, the next verb ends it: with the new root or, where it was not in the store yet, with it as well."""
+    team.run('keys')
+    robot = team.robot('thor')
+    team.publish('go2/go2_patrol/1')
+    for version, step in enumerate(('_place', '_newest', '_sign', '_replace_timestamp'), 2):
+        with monkeypatch.context() as patch:
+            patch.setattr(Repository, step, _dying(getattr(Repository, step), after=1 if step == '_newest' else 0))
+            with pytest.raises(ZeroDivisionError):
+                Repository(team.keys, team.store, lambda _: '').rotate(('targets', 'online'))
+        assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1'], step
+        assert team.root().version == version, step
+        assert team.listed(robot, 'go2/go2_patrol/1'), step
+        assert list(team.keys.glob('*.next*')) == []
+
+
+def _dying(act: Any, after: int) -> Any:
+    """Dies in place of the call after so many."""
+    calls = []
+
+    def dies(*given: Any, **named: Any) -> Any:
+        calls.append(given)
+        return act(*given, **named) if len(calls) <= after else 1 // 0
+
+    return dies
+
+
+def test_two_rotations_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only one of two roots of the same number is in force; who was late keeps none of its keys."""
+    team.run('keys')
+    team.publish('go2/go2_patrol/1')
+    shutil.copytree(team.keys, team.home / 'other')
+    other = Repository(team.home / 'other', team.store, lambda _: '')
+    with pytest.raises(DataLoggerError, match='is not a key of the root'):
+        other.rotate(('online',), [team.keys / 'targets.key'])
+    with monkeypatch.context() as patch:
+        patch.setattr(Repository, '_place', _dying(Repository._place, after=0))
+        with pytest.raises(ZeroDivisionError):
+            other.rotate(('online',))
+    assert 'version 2 is in force' in team.run('rotate')
+    with pytest.raises(DataLoggerError, match='is not the key of root version 2'):
+        other.refresh()
+    assert list((team.home / 'other').glob('*.next*')) == []
+    assert 'version 3 is in force' in team.run('rotate', 'root', 'online')
+
+
+def test_another_key_signs_some_policies(team: Team) -> None:
+    """What it signs waits for a refresh where online.key is; when its right ends, what it signed may not run."""
+    team.run('keys')
+    robot = team.robot('thor')
+    dora = team.home / 'dora'
+    team.run('keys', '--only', 'dora', '--keys', dora)
+    assert 'is not a pattern' in team.run('delegate', dora / 'dora.pub', '--for', 'go2_patrol', code=1)
+    team.run('delegate', dora / 'dora.pub', '--for', 'go2/go2_patrol/*')
+    (dora / 'root.json').write_bytes((team.keys / 'root.json').read_bytes())
+    hers = Repository(dora, team.store, lambda _: '')
+    assert not hers.publish({'go2/go2_patrol/1': b'{}'})
+    assert not team.listed(robot, 'go2/go2_patrol/1')
+    assert '1 versions are listed' in team.run('refresh')
+    assert team.listed(robot, 'go2/go2_patrol/1')
+    with pytest.raises(DataLoggerError, match='may not sign go2/stairs/1'):
+        hers.publish({'go2/stairs/1': b'{}'})
+    assert 'no longer may sign' in team.run('delegate', 'dora', '--end')
+    assert not team.listed(robot, 'go2/go2_patrol/1')
+    assert "nothing is delegated to 'dora'" in team.run('delegate', 'dora', '--end', code=1)
+
+
+def test_a_public_key_is_of_who_has_the_private_one(team: Team) -> None:
+    """A file that somebody else changed, or that names another key as its own, is refused."""
+    team.run('keys')
+    for name in ('eve', 'alice'):
+        team.run('keys', '--only', name, '--keys', team.home / 'people')
+    eve, alice = (json.loads((team.home / 'people' / f'{name}.pub').read_bytes()) for name in ('eve', 'alice'))
+    changed = team.home / 'changed.pub'
+    for change in (
+        {'public': alice['public']},
+        {'name': '../x'},
+        {'metadata': {}},
+        {'public': 'x'},
+        {'metadata': alice['metadata']},
+    ):
+        changed.write_text(json.dumps({**eve, **change}))
+        assert 'is not a public key' in team.run('delegate', changed, '--for', 'go2/*/*', code=1)
+    assert team.run('delegate', team.home / 'people' / 'eve.pub', '--for', 'go2/*/*').startswith('eve-')
+
+
+def test_a_version_is_withdrawn(team: Team) -> None:
+    team.run('keys')
+    robot = team.robot('thor')
+    team.publish('go2/go2_patrol/7')
+    assert team.listed(robot, 'go2/go2_patrol/7')
+    assert team.run('withdraw', 'go2_patrol@7') == 'go2_patrol@7 is no longer listed\n'
+    assert not team.listed(robot, 'go2/go2_patrol/7')
+    assert 'does not list' in team.run('withdraw', 'go2_patrol@7', code=1)
+
+
+def test_two_who_sign_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one is told, and does it once more: neither is lost."""
+    team.run('keys')
+    team.publish('go2/go2_patrol/1')
+    one = Repository(team.keys, team.store, lambda _: '')
+    load, is_first = one.load, [True]
+
+    def and_another_signs() -> Any:
+        state = load()
+        if is_first.pop() if is_first else False:
+            team.publish('go2/go2_patrol/2')
+        return state
+
+    monkeypatch.setattr(one, 'load', and_another_signs)
+    with pytest.raises(DataLoggerError, match='by somebody else'):
+        one.publish({'go2/go2_patrol/3': b'{}'})
+    one.publish({'go2/go2_patrol/3': b'{}'})
+    assert one.listed() == [f'go2/go2_patrol/{number}' for number in (1, 2, 3)]
+
+
+def test_a_robot_that_received_nothing_fresh_says_so(team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In policy list, policy show, status and the doctor, with both dates; with a fresh timestamp none of them does."""
+    team.run('keys')
+    robot = team.robot('.')
+    team.run('refresh')
+    assert team.listed(robot, 'go2/go2_patrol/1') is False
+
+    def said() -> list[bool]:
+        status = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(cli, ['status', '--json'], standalone_mode=False)
+        doctor = CliRunner(env={'SHADOWHOUND_HOME': str(tmp_path)}).invoke(
+            cli, ['doctor', '--role', 'thor', '--only', 'policies', '--json'], standalone_mode=False
+        )
+        texts = (team.run('list'), json.loads(team.run('list', '--json'))['stale'], status.output, doctor.output)
+        return ['expired on' in text for text in texts]
+
+    assert said() == [False] * 4
+    path = robot.path / 'metadata' / 'timestamp.json'
+    old = Metadata[Timestamp].from_bytes(path.read_bytes())
+    old.signed.expires = datetime.now(timezone.utc) - timedelta(days=1)
+    path.write_bytes(old.to_bytes())  # as it is a fortnight later
+    assert said() == [True] * 4
