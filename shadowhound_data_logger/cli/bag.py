@@ -546,7 +546,8 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
         yield f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)}{share} in {requests}.'
     yield from (plain(f'{name} {why}; nothing of it was copied.', 'red') for name, why in found.damaged.items())
     if found.extras:
-        yield f'Not copied: {counted(found.extras, "attachment or metadata record")}.'
+        what = 'attachment or metadata record' if found.extras == 1 else 'attachments or metadata records'
+        yield f'Not copied: {number(found.extras)} {what}.'
     if found.absent:
         yield plain(f'The bag has no topic {", ".join(found.absent)}.', 'yellow')
     if found.missing:

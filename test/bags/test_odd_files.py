@@ -1,0 +1,229 @@
+"""MCAP files that the format allows and few writers make, assembled record by record; and files that it does not allow."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, Protocol
+
+import pytest
+import zstandard
+from bags.test_foreign import CDR, STRING, read, topics, write
+from click.testing import CliRunner
+from lz4.frame import compress as lz4_compress
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Message, Metadata, Schema, Statistics
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from shadowhound_data_logger.bags.cut import Choice, cut_folder
+from shadowhound_data_logger.bags.info import info_folder
+from shadowhound_data_logger.bags.verify import verify_folder
+from shadowhound_data_logger.cli.bag import bag
+from shadowhound_data_logger.errors import BagDamaged, BagError
+
+SCHEMA, CHANNEL = Schema(1, STRING[2], STRING[1], STRING[0]), Channel(1, '/x', 'cdr', {}, 1)
+OTHER = Channel(2, '/y', 'cdr', {'k': 'v'}, 1)
+
+
+class Record(Protocol):
+    """One of ``mcap.records``."""
+
+    def write(self, stream: RecordBuilder) -> None: ...
+
+
+def packed(*records: Record | bytes) -> bytes:
+    """One after the other; bytes as they are."""
+    builder = RecordBuilder()
+    for record in records:
+        if isinstance(record, bytes):
+            builder.write(record)
+        else:
+            record.write(builder)
+    return bytes(builder.end())
+
+
+def message(log_ns: int, channel: int = 1) -> Message:
+    return Message(channel, log_ns, CDR, log_ns, log_ns & 0xFF)
+
+
+def chunk(*records: Record | bytes, compression: str = '', crc: int | None = None) -> Chunk:
+    content = packed(*records)
+    data = {'': bytes, 'zstd': zstandard.compress, 'lz4': lz4_compress}[compression](content)
+    times = [record.log_time for record in records if isinstance(record, Message)] or [0]
+    return Chunk(compression, data, max(times), min(times), zlib.crc32(content) if crc is None else crc, len(content))
+
+
+def raw(op: int, content: bytes = b'') -> bytes:
+    return struct.pack('<BQ', op, len(content)) + content
+
+
+def assembled(folder: Path, *records: Record | bytes, summary: bytes = b'') -> Path:
+    """A bag of one file with these records."""
+    folder.mkdir(parents=True)
+    data = MCAP0_MAGIC + packed(Header('ros2', 'other'), *records, DataEnd(0))
+    footer = packed(Footer(0, len(data) if summary else 0, 0))
+    (folder / 'b_0.mcap').write_bytes(data + summary + footer + MCAP0_MAGIC)
+    return folder
+
+
+def check(folder: Path, out: Path, wanted: list[tuple[str, int]]) -> None:
+    """Info, verify and cut agree on the messages: topic and log time of each, in the order of the file."""
+    found = info_folder(folder).description
+    times = [log_ns for _, log_ns in wanted]
+    assert (found.messages, found.t_start_ns, found.t_end_ns) == (len(wanted), min(times), max(times))
+    assert verify_folder(folder, deep=True).is_sound
+    cut_folder(folder, out, Choice())
+    assert [(one[0], one[4]) for one in read(out / f'{out.name}_0.mcap')] == wanted
+
+
+@pytest.mark.parametrize('records', [
+    [SCHEMA, CHANNEL, message(1), OTHER, chunk(message(2), message(3, 2)), message(4)],
+    [chunk(SCHEMA, CHANNEL, message(1)), chunk(SCHEMA, CHANNEL, OTHER, message(2), message(3, 2)), message(4)],
+    [chunk(SCHEMA, CHANNEL, message(1), compression='zstd'), chunk(message(2), OTHER, message(3, 2), compression='lz4'),
+     chunk(message(4))],
+    [chunk(SCHEMA, CHANNEL, message(1), crc=0), chunk(OTHER, message(2), message(3, 2), message(4), crc=0, compression='zstd')],
+    [raw(0x80, b'x' * 99), chunk(SCHEMA, raw(0xFF), CHANNEL, OTHER, message(1), raw(0x90, b'private')), raw(0x81),
+     chunk(message(2), message(3, 2)), raw(0x7F, b'of a later version'), message(4)],
+    [SCHEMA, CHANNEL, OTHER, message(1), message(2), Attachment(1, 1, 'a', 'b', CDR), Metadata('n', {}), message(3, 2),
+     message(4)],
+    [SCHEMA, CHANNEL, OTHER, message(1), chunk(), chunk(SCHEMA, CHANNEL), message(2), message(3, 2), message(4)],
+], ids=['messages in and outside of chunks', 'definitions repeated', 'compressions mixed', 'no CRC', 'private records',
+        'attachment and metadata between', 'empty chunks'])  # fmt: skip
+def test_what_the_format_allows(tmp_path: Path, records: list[Any]) -> None:
+    """Without a summary: every message is found, in the order of the file."""
+    folder = assembled(tmp_path / 'b', *records)
+    check(folder, tmp_path / 'piece', [('/x', 1), ('/x', 2), ('/y', 3), ('/x', 4)])
+
+
+def test_extra_bytes_at_the_end_of_records(tmp_path: Path) -> None:
+    """Belong to a later version of the format, also in the summary and in chunks; those of a message are its data."""
+
+    def padded(record: Record) -> bytes:
+        content = packed(record)
+        return raw(content[0], content[9:] + b'later')
+
+    inside = (padded(SCHEMA), padded(CHANNEL), message(1), message(2))
+    summary = b''.join(map(padded, (SCHEMA, CHANNEL, Statistics(0, 1, {1: 2}, 1, 2, 2, 1, 0, 1))))
+    folder = assembled(tmp_path / 'b', padded(Header('x', 'y')), padded(chunk(*inside)), summary=summary)
+    check(folder, tmp_path / 'piece', [('/x', 1), ('/x', 2)])
+
+
+DAMAGED = {
+    'channel redefined': ([SCHEMA, CHANNEL, message(1), Channel(1, '/other', 'cdr', {}, 1)], 'defined twice'),
+    'schema redefined': ([SCHEMA, CHANNEL, message(1), Schema(1, b'int32 data', STRING[1], STRING[0])], 'defined twice'),
+    'schema 0': ([Schema(0, b'', '', '')], 'schema 0'),
+    'no schema': ([CHANNEL, message(1)], 'without their schema|does not define before'),
+    'no channel': ([SCHEMA, message(1)], 'does not define before'),
+    'channel after its message': ([SCHEMA, message(1), CHANNEL], 'does not define before'),
+    'wrong CRC': ([chunk(SCHEMA, CHANNEL, message(1), crc=7)], 'CRC-32'),
+    'unknown compression': ([Chunk('br', b'x', 1, 1, 0, 9)], "'br'"),
+    'short message': ([SCHEMA, CHANNEL, raw(Opcode.MESSAGE, b'1234')], 'message of 4 bytes'),
+    'zeros': ([SCHEMA, CHANNEL, message(1), bytes(18)], 'zeros'),
+    'torn record': ([SCHEMA, CHANNEL, message(1), struct.pack('<BQ', 5, 1 << 40)], 'torn record'),
+}
+
+
+@pytest.mark.parametrize('name', DAMAGED)
+def test_what_it_does_not_allow(tmp_path: Path, name: str) -> None:
+    """Is damage: never a message on the wrong topic, and none left out without a word."""
+    records, says = DAMAGED[name]
+    folder = assembled(tmp_path / 'b', *records)  # type: ignore[misc]
+    for attempt in (lambda: info_folder(folder), lambda: cut_folder(folder, tmp_path / 'piece', Choice())):
+        with pytest.raises(BagDamaged, match=says):
+            attempt()
+    (finding,) = verify_folder(folder).findings
+    assert str(folder) not in finding.finding
+
+
+def test_a_summary_that_contradicts_the_data(tmp_path: Path) -> None:
+    """``verify --deep`` finds it: other counts, other times, another channel."""
+    content = chunk(SCHEMA, CHANNEL, message(1), message(2))
+    for place, (channel, count, end) in enumerate(((CHANNEL, 3, 2), (CHANNEL, 2, 9), (Channel(1, '/z', 'cdr', {}, 1), 2, 2))):
+        statistics = Statistics(0, 1, {1: count}, 1, count, end, 1, 0, 1)
+        folder = assembled(tmp_path / str(place), content, summary=packed(SCHEMA, channel, statistics))
+        assert verify_folder(folder).is_sound
+        (finding,) = verify_folder(folder, deep=True).findings
+        assert 'messages' in finding.finding
+
+
+def test_attachments_are_not_read(tmp_path: Path) -> None:
+    """However large they are, and whatever verb skips them: 3 GB of a sparse file, with messages before and behind."""
+    folder, size = tmp_path / 'b', 3 << 30
+    folder.mkdir()
+    with (folder / 'b_0.mcap').open('wb') as file:
+        file.write(MCAP0_MAGIC + packed(Header('ros2', 'other'), SCHEMA, CHANNEL, message(1)))
+        for op in (Opcode.ATTACHMENT, Opcode.METADATA):
+            file.write(struct.pack('<BQ', op, size))
+            file.seek(size, os.SEEK_CUR)
+        file.write(packed(message(2), DataEnd(0), Footer(0, 0, 0)) + MCAP0_MAGIC)
+    found = info_folder(folder)
+    assert (found.description.messages, found.read_bytes < 20 << 20) == (2, True)
+    cut = cut_folder(folder, tmp_path / 'piece', Choice())
+    assert (cut.messages, cut.extras) == (2, 2)
+    assert verify_folder(folder).is_sound
+
+
+def test_attachments_alone(tmp_path: Path) -> None:
+    """Are a bag without messages; a cut of others says how many it leaves out."""
+    alone = write(tmp_path / 'alone' / 'b_0.mcap', lambda writer: writer.add_attachment(1, 1, 'map.png', 'image/png', b'x' * 999))
+    found = info_folder(alone).description
+    assert (found.messages, found.topics, found.t_start_ns) == (0, (), None)
+    assert verify_folder(alone, deep=True).is_sound
+    with pytest.raises(BagError, match='no messages'):
+        cut_folder(alone, tmp_path / 'piece', Choice())
+
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel('/x', 'cdr', writer.register_schema(*STRING))
+        writer.register_channel('/silent', 'cdr', 1)
+        writer.add_message(channel, 1, CDR, 1)
+        writer.add_attachment(1, 1, 'a', 'b', b'c')
+        writer.add_metadata('rosbag2', {'serialized_metadata': ''})
+        writer.add_metadata('calibration', {'fx': '1'})
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
+    assert topics(folder) == {('/x', STRING[0]): 1, ('/silent', STRING[0]): 0}
+    ran = CliRunner().invoke(bag, ['cut', f'{folder}/b_0.mcap', '-o', str(tmp_path / 'piece')], standalone_mode=False)
+    assert 'Not copied: 2 attachments or metadata records.' in ran.output
+    assert '1 message on 1 topic' in ran.output
+    assert 'Read ' not in ran.output
+
+
+NAMES = {'/a': {'a': '/a', '/a': '/a', 'a/': '/a'}, 'b': {'b': 'b', '/b': 'b'}, '/c/': {'/c': '/c/', 'c': '/c/', '/c/': '/c/'},
+         '/d/e': {'d/e': '/d/e', 'e': None}}  # fmt: skip
+
+
+def test_topics_with_and_without_slashes(tmp_path: Path) -> None:
+    """Are found however they are written; if a bag has both, the one that is named."""
+
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema(*STRING)
+        for topic in (*NAMES, 'f', '/f'):
+            writer.add_message(writer.register_channel(topic, 'cdr', schema), 1, CDR, 1)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
+    wanted = {asked: topic for names in NAMES.values() for asked, topic in names.items()} | {'f': 'f', '/f': '/f'}
+    for place, (asked, topic) in enumerate(wanted.items()):
+        if topic is None:
+            with pytest.raises(BagError, match='no topic'):
+                cut_folder(folder, tmp_path / str(place), Choice(topics=(asked,)))
+        else:
+            cut_folder(folder, tmp_path / str(place), Choice(topics=(asked,)))
+            assert [one[0] for one in read(tmp_path / str(place) / f'{place}_0.mcap')] == [topic], asked
+
+
+@pytest.mark.parametrize('name', ['my bag', '-x', 'späti', "it's", 'x.mcap'])
+def test_folders_of_any_name(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Are read by a path with a slash; one file by its name alone."""
+    write(tmp_path / name / f'{name}_0.mcap', lambda writer: writer.add_message(
+        writer.register_channel('/x', 'cdr', writer.register_schema(*STRING)), 1, CDR, 1))  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    for verb in (['info'], ['verify'], ['cut', '-o', 'piece']):
+        ran = CliRunner().invoke(bag, [*verb, f'./{name}'], standalone_mode=False)
+        assert ran.return_value == 0, (verb, ran.output, ran.exception)
+    monkeypatch.chdir(tmp_path / name)
+    if not name.startswith('-'):
+        ran = CliRunner().invoke(bag, ['info', f'{name}_0.mcap'], standalone_mode=False)
+        assert '1 on 1 topic' in ran.output
