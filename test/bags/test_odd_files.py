@@ -64,7 +64,7 @@ def assembled(folder: Path, *records: Record | bytes, summary: bytes = b'') -> P
     """A bag of one file with these records."""
     folder.mkdir(parents=True)
     data = MCAP0_MAGIC + packed(Header('ros2', 'other'), *records, DataEnd(0))
-    footer = packed(Footer(0, len(data) if summary else 0, 0))
+    footer = packed(Footer(summary_start=len(data) if summary else 0, summary_offset_start=0, summary_crc=0))
     (folder / 'b_0.mcap').write_bytes(data + summary + footer + MCAP0_MAGIC)
     return folder
 
