@@ -38,7 +38,7 @@ MOST_RATIO: Final = 1000
 """Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
 OWN_METADATA: Final = frozenset({'rosbag2', 'shadowhound_recording'})
 """Metadata records that every writer makes for its own file."""
-NOT_READ: Final = 'the figures are those of metadata.yaml: its files are not read in a store; fetch the bag to have them read'
+NOT_READ: Final = 'metadata.yaml is the only source of these figures: such files are not read in a store, but after bag fetch'
 ZSTD_MAGIC: Final = b'\x28\xb5\x2f\xfd'
 _TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
 _LATEST_NS: Final = 1 << 63

@@ -149,7 +149,12 @@ def _counts(bag: Description) -> dict[tuple[str, str], int]:
 def _span(bag: Description) -> str:
     if bag.t_start_ns is None or bag.t_end_ns is None:
         return 'unknown'
-    return f'{iso(bag.t_start_ns)} to {iso(bag.t_end_ns)}'
+    return f'{_iso_ns(bag.t_start_ns)} to {_iso_ns(bag.t_end_ns)}'
+
+
+def _iso_ns(time_ns: int) -> str:
+    """To the nanosecond: bags with times near 0 last for some of these."""
+    return f'{iso(time_ns)[:-1]}{time_ns % 1000:03d}Z'
 
 
 def profiles(qos: object) -> Sequence[Mapping[str, Any]]:

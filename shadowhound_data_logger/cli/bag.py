@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -55,12 +56,13 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.cli.question import ranges_option
 from shadowhound_data_logger.clock import SystemClock, iso
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import NameRefused, StoreUnavailable
+from shadowhound_data_logger.errors import BagDamaged, NameRefused, StoreUnavailable
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.times import moment
 
 STORE_THREADS: Final = 8
+LOCAL_REMEDY: Final = 'shadowhound-data bag verify DIR --deep shows what is damaged'
 LEAST_RATED_S: Final = 0.01
 """A bag that is shorter has no rates."""
 LOOK_S: Final = 5.0
@@ -83,6 +85,16 @@ def _bag(_: click.Context, __: click.Parameter, name: str) -> str | Path:
         return check_name(name, 'the bag', MAX_BAG_BYTES)
     except NameRefused as error:
         raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
+
+
+@contextmanager
+def _in_folder() -> Iterator[None]:
+    """What helps against damage in a folder, which no store may have."""
+    try:
+        yield
+    except BagDamaged as error:
+        error.remedy = error.remedy or LOCAL_REMEDY
+        raise
 
 
 _robot = click.option(
@@ -156,7 +168,8 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
     Exit code 1 when a file is missing or cannot be read.
     """
     if isinstance(bag, Path):
-        found = info_folder(bag)
+        with _in_folder():
+            found = info_folder(bag)
     else:
         with the_store(STORE_THREADS) as store:
             found = info_of(store, robot, bag, the_home())
@@ -182,7 +195,8 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
     """
     with progress('read', of='bytes') as bar:
         if isinstance(bag, Path):
-            found = verify_folder(bag, deep=deep, told=bar.have)
+            with _in_folder():
+                found = verify_folder(bag, deep=deep, told=bar.have)
         else:
             with the_store(STORE_THREADS) as store:
                 found = verify_remote(store, find_bag(store, robot, bag), deep=deep, told=bar.have)
@@ -262,7 +276,8 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
     names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
     choice = Choice(topics=names, spans=None if ranges is None else _spans(ranges), **wanted)
     if isinstance(bag, Path):
-        found = cut_folder(bag, output, choice)
+        with _in_folder():
+            found = cut_folder(bag, output, choice)
     else:
         with the_store(STORE_THREADS) as store:
             found = cut_remote(store, find_bag(store, robot, bag), output, choice)
@@ -305,6 +320,7 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     folder = folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
     with (
+        _in_folder(),
         planned(folder, robot, name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
         progress('sent', of='bytes') as bar,
     ):
@@ -460,7 +476,7 @@ def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
 
 def _remarks(remarks: Sequence[str]) -> Iterator[Text]:
     """Where a metadata.yaml contradicts the files, whose figures are shown."""
-    yield from (plain(f'{remark[0].upper()}{remark[1:]}.', 'yellow') for remark in remarks)
+    yield from (plain(f'{remark}.', 'yellow') for remark in remarks)
 
 
 def _rate(messages: int | None, seconds: float | None) -> str:
@@ -542,8 +558,11 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
     yield f'{found.folder}: {what}, {shown_time(found.t_start_ns)} to {shown_time(found.t_end_ns)} UTC ({length})'
     if is_remote:
         requests = counted(found.read_requests, 'request')
-        share = f' ({100 * found.read_bytes / found.bag_bytes:.1f} %)' if found.read_bytes < found.bag_bytes else ''
-        yield f'Read {volume(found.read_bytes)} of {volume(found.bag_bytes)}{share} in {requests}.'
+        if found.read_bytes < found.bag_bytes:
+            share = f'{volume(found.read_bytes)} of {volume(found.bag_bytes)} ({100 * found.read_bytes / found.bag_bytes:.1f} %)'
+        else:  # parts of a small file are read twice
+            share = f'all {volume(found.bag_bytes)}'
+        yield f'Read {share} in {requests}.'
     yield from (plain(f'{name} {why}; nothing of it was copied.', 'red') for name, why in found.damaged.items())
     if found.extras:
         what = 'attachment or metadata record' if found.extras == 1 else 'attachments or metadata records'

@@ -193,7 +193,7 @@ def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: in
     for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert ran.return_value == 0, ran.output
-        assert ran.output.count('etadata.yaml claims') == 1
+        assert ran.output.count('metadata.yaml claims') == 1
 
 
 def test_names_that_cannot_be_part_of_a_key(tmp_path: Path) -> None:

@@ -11,12 +11,14 @@ from pathlib import Path
 import click
 import pytest
 from bags.real_bags import NAME, stored, write_ours
+from bags.test_foreign import write
 from click.testing import CliRunner, Result
+from mcap.writer import Writer
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.errors import BagError, SettingError
+from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
@@ -182,3 +184,31 @@ def test_help_is_enough(verb: str) -> None:
     command = bag.commands[verb]
     assert command.help
     assert all(option.help for option in command.params if isinstance(option, click.Option))
+
+
+def test_pages_of_a_bag_whose_times_are_a_counter(tmp_path: Path) -> None:
+    """Some 400 ns have no rates, shares stay below 100 %, one is no plural, and a file in a folder needs no fetch."""
+    home, folder = tmp_path / 'home', tmp_path / 'b'
+
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel('/x', 'cdr', writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data'))
+        for number in range(400):
+            writer.add_message(channel, number, b'1234', number)
+
+    write(folder / 'b_0.mcap', fill)
+    found = run(home, 'info', f'{folder}/').output
+    assert 'Hz' not in found
+    assert '400 on 1 topic ' in found
+    assert 'in 1 file ' in found
+    assert '1 of 1 file is sound' in run(home, 'verify', f'{folder}/').output
+    there = home / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b'
+    there.mkdir(parents=True)
+    (there / 'b_0.mcap').write_bytes((folder / 'b_0.mcap').read_bytes())
+    found = run(home, 'cut', 'b', '-o', tmp_path / 'piece').output
+    assert 'Read all 8.0 KB in 3 requests.' in found
+    assert '%' not in found
+    (folder / 'b_0.mcap').write_bytes((folder / 'b_0.mcap').read_bytes()[:-1])
+    for verb in ('info', 'cut'):
+        ran = run(home, verb, f'{folder}/', *(('-o', tmp_path / 'other') if verb == 'cut' else ()))
+        assert isinstance(ran.exception, BagDamaged)
+        assert 'fetch' not in str(ran.exception)
