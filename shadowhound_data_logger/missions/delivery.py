@@ -95,12 +95,12 @@ class Delivery:
         self._recall()
         if self.run is None:
             return False
-        before = self._agent.sent, self._node.sent
-        send = partial(self._attach, self.run)
-        done = self._agent.attach(self._lines(self.sent.artifacts), send, ARTIFACTS_A_STEP)
-        rest = self._node.lines(self._node.sent.artifacts, self._node.sent.metrics)
-        self._node.attach(rest, send, ARTIFACTS_A_STEP - done)
-        return (self._agent.sent, self._node.sent) != before
+        before = self._agent.attached, self._node.attached
+        send, refuse = partial(self._attach, self.run), partial(self._refuse, count='unattached')
+        done = self._agent.attach(self._lines(self._agent.attached), send, refuse, ARTIFACTS_A_STEP)
+        rest = self._node.lines(self._node.attached, self._node.sent.metrics)
+        done += self._node.attach(rest, send, refuse, ARTIFACTS_A_STEP - done)
+        return done > 0 or (self._agent.attached, self._node.attached) != before
 
     def spool(self, *, hold: bool = False) -> bool:
         """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
@@ -245,17 +245,14 @@ class Delivery:
 
     # -- artifacts -------------------------------------------------------------------------------------------------
 
-    def _attach(self, run: Run, artifact: Artifact) -> None:
-        """Send one file; that it is gone, or refused, is counted."""
+    def _attach(self, run: Run, artifact: Artifact) -> bool:
+        """Send one file; that it is gone, or refused, is counted. Returns whether the server took it."""
         try:
-            path = prepared(self.folder, artifact)
-        except FileNotFoundError as error:
+            self._tracking.artifact(run, prepared(self.folder, artifact), artifact.folder)
+        except (FileNotFoundError, TrackingRefused) as error:
             self._refuse(error, 'unattached')
-            return
-        try:
-            self._tracking.artifact(run, path, artifact.folder)
-        except TrackingRefused as error:
-            self._refuse(error, 'unattached')
+            return False
+        return True
 
     def _summarize(self) -> bool:
         """Once: artifact and object must be the same. False while the pictures are being made."""

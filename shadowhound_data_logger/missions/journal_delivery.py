@@ -6,10 +6,12 @@ before it has arrived; whatever is sent again after a crash changes nothing. The
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
+from shadowhound_data_logger.errors import TrackingUnavailable
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
 from shadowhound_data_logger.missions.batch import MOST_POINTS
@@ -17,6 +19,9 @@ from shadowhound_data_logger.missions.folder import MissionFolder, Run
 from shadowhound_data_logger.missions.objects import Item, objects_of
 from shadowhound_data_logger.missions.story import Point, Story
 from shadowhound_data_logger.missions.values import MAX_KEYS
+
+TRIES: Final = 3
+"""How often a server must refuse an artifact, and take others meanwhile, before it is skipped."""
 
 
 @dataclass(slots=True)
@@ -42,6 +47,18 @@ class ObjectBatch:
     """Frames and trajectories whose file is gone."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """An artifact that is to be sent."""
+
+    start: int
+    """The place of its record."""
+    artifact: Artifact
+    tries: int = 0
+    taken: int = 0
+    """How many others the server had taken when it failed first."""
+
+
 class JournalDelivery:
     """Reads one journal of a mission, and sends what is new in it.
 
@@ -63,6 +80,10 @@ class JournalDelivery:
         self._read = read
         self._leaves_out = leaves_out
         self._batch: PointBatch | None = None
+        self.attached = self.sent.artifacts
+        """Up to here the artifacts of the journal were tried."""
+        self._waiting: deque[_Waiting] = deque()
+        self._taken = 0
 
     def recall(self) -> None:
         """After a restart: tell the story what was sent before."""
@@ -84,17 +105,25 @@ class JournalDelivery:
             self._batch = self._next_points(may_end)
         return self._batch
 
-    def attach(self, lines: Iterable[journal.Line], send: Callable[[Artifact], None], most: int) -> int:
-        """Send the artifacts of the next lines; returns how many there were."""
-        end, done = self.sent.artifacts, 0
-        for line in lines:
-            for artifact in artifacts_of(line.record or {}, self._folder, self.story):
-                send(artifact)
-                done += 1
-            end = line.end
-            if done >= most:
-                break
-        self.move(artifacts=end)
+    def attach(self, lines: Iterable[journal.Line], send: Callable[[Artifact], bool], refuse: Callable[[Exception], None],
+               most: int) -> int:  # fmt: skip
+        """Send the artifacts of the next lines (from ``attached`` on); returns how many there were.
+
+        ``send`` says whether the server took it. One that fails is tried again after all others, so that it delays none; what the
+        server refuses again (``data['of_object']`` of the error) after it took another one is passed to ``refuse`` and skipped.
+        """
+        done = 0
+        try:
+            for line in lines:
+                found = deque(_Waiting(self.attached, each) for each in artifacts_of(line.record or {}, self._folder, self.story))
+                self.attached = line.end
+                done += self._send(found, send, refuse)
+                if done >= most:
+                    break
+            else:
+                done += self._send(self._waiting, send, refuse)
+        finally:
+            self.move(artifacts=min([self.attached, *(each.start for each in self._waiting)]))
         return done
 
     def objects(self, lines: Iterable[journal.Line], start: Mapping[str, Any], run: Run | None, most: int,
@@ -133,6 +162,26 @@ class JournalDelivery:
             durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files go
             self._folder.set_sent(moved, durable=durable)
             self.sent = moved
+
+    def _send(self, items: deque[_Waiting], send: Callable[[Artifact], bool], refuse: Callable[[Exception], None]) -> int:
+        """Send them until one fails: that one waits, and those behind it."""
+        done = 0
+        while items:
+            item = items.popleft()
+            try:
+                self._taken += send(item.artifact)
+            except Exception as error:
+                again = replace(item, tries=item.tries + 1, taken=item.taken if item.tries else self._taken)
+                of_object = isinstance(error, TrackingUnavailable) and error.data.get('of_object')
+                if of_object and again.tries >= TRIES and again.taken < self._taken:
+                    refuse(error)
+                else:
+                    self._waiting.append(again)
+                    if items is not self._waiting:
+                        self._waiting.extend(items)
+                    raise
+            done += 1
+        return done
 
     def _next_points(self, may_end: Callable[[], bool]) -> PointBatch | None:
         batch = PointBatch(self.told)

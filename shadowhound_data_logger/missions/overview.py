@@ -125,10 +125,13 @@ def _unsent(folder: MissionFolder, sent: MissionSent) -> dict[str, int]:
         return count
     for path, place in ((folder.journal, sent), (folder.node.journal, folder.node.sent())):
         for line in journal.read(path) if path.exists() else ():
-            has_file = (line.record or {}).get('k') in FILES
+            record = line.record or {}
+            kind = record.get('k')
             count['records'] += line.end > place.metrics
-            count['artifacts'] += has_file and line.end > place.artifacts
-            count['objects'] += has_file and line.end > place.objects
+            count['artifacts'] += (
+                kind in FILES and (kind != 'frame' or bool(record.get('artifact'))) and line.end > place.artifacts
+            )
+            count['objects'] += kind in FILES - {'artifact'} and line.end > place.objects
     return count
 
 
@@ -153,21 +156,53 @@ class Report:
     missing: int = 0
     """Frames and trajectories whose file was gone before it was handed on."""
     last_error: str = ''
-    """What holds it up now, or was refused forever; empty when nothing."""
+    """What delays it now, or was refused last; empty if nothing was."""
     remedy: str = ''
+    refused: int = 0
+    """Points, params and tags that the tracking server will never take."""
+    unattached: int = 0
+    """Artifacts that it will never take, or whose file is gone."""
+    waiting_for: str = ''
+    """What is still to be done where it is not complete."""
 
 
 def report(folder: MissionFolder) -> Report:
     """Reads the whole journals; they are there for as long as the mission is not complete."""
     sent, run = folder.sent(), folder.run()
     count, unsent = map(sum, zip(_counted(folder.journal, sent), _counted(folder.node.journal, folder.node.sent()), strict=True))
-    error, remedy = (WAITS, REMEDY) if folder.journal.exists() and waits(folder) else (sent.error, '')
+    error, remedy = (WAITS, REMEDY) if folder.journal.exists() and waits(folder) else ('', '')
+    waiting_for, wait_remedy = ('', '') if sent.complete else _waiting_for(folder, unsent)
     if not sent.complete and not error:
-        for one in errors(folder.path.parent).values():
-            error, remedy = one
-            break
+        error, remedy = next(iter(errors(folder.path.parent).values()), ('', ''))
     run_id = run.run_id if run else None
-    return Report(folder.mission_id, run_id, count - unsent, unsent, sent.complete, sent.missing, error, remedy)
+    return Report(
+        folder.mission_id, run_id, count - unsent, unsent, sent.complete, sent.missing, last_error=error or sent.error,
+        remedy=remedy or wait_remedy, refused=sent.refused, unattached=sent.unattached, waiting_for=waiting_for,
+    )  # fmt: skip
+
+
+def _waiting_for(folder: MissionFolder, unsent: int) -> tuple[str, str]:
+    """What a mission that is not complete waits for, and what can be done about it."""
+    sent, node = folder.sent(), folder.node.sent()
+    if not folder.journal.exists():
+        return 'its journal, which is gone', 'was the folder of the mission deleted?'
+    if _is_locked(folder):
+        return 'its end: the mission is active', ''
+    if not is_sending(folder.path.parent):
+        return 'a process that sends it', 'if none is starting, run `shadowhound-data missions resume`'
+    left = [f'{unsent} records to be in its run'] if unsent else []
+    if _is_locked(folder.node):
+        return ', '.join([*left, 'the node to finish its part']), 'it takes a second, at most 30 s; is the node stopped?'
+    files = _unsent(folder, sent)
+    left += [f'{files["artifacts"]} artifacts to be in its run'] if files['artifacts'] else []
+    left += [f'{files["objects"]} objects to be in the spool'] if files['objects'] else []
+    if sent.metrics > sent.artifacts and not folder.summary.exists() and not unsent:
+        left.append('its pictures and its summary, which are being made')
+    elif not left and max(sent.metrics, node.metrics) > min(sent.artifacts, sent.objects):
+        left.append('its last artifacts and its summary')
+    if sent.held:
+        left.append('its objects to get their names')
+    return ', '.join(left) or 'its run to be closed', 'wait longer, with close(seconds); the sending goes on in the background'
 
 
 def _counted(path: Path, sent: MissionSent) -> tuple[int, int]:

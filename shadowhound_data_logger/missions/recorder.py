@@ -119,10 +119,18 @@ class Mission:
         self._log_file('trajectory', trajectory_csv_path, {})
 
     def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
-        """Copy a file as it is now, for the run's artifacts, in the folder ``artifact_path``."""
+        """Copy a file as it is now, for the run's artifacts, in the folder ``artifact_path``.
+
+        A name that MLflow cannot hold, such as ``map#1.png``, is changed (``values.artifact_name``), with a warning; the summary
+        has both names.
+        """
         try:
-            name = values.text(os.path.basename(os.fspath(path)), values.MAX_KEY)  # noqa: PTH119 - a text or a Path
-            more = {'name': name or 'artifact', 'folder': values.artifact_folder(artifact_path)}
+            given = os.path.basename(os.fsdecode(path)) or 'artifact'  # noqa: PTH119 - a text, bytes or a Path
+            more = {'name': values.artifact_name(given), 'folder': values.artifact_folder(artifact_path)}
+            if (more['name'], more['folder']) != (given, artifact_path or ''):
+                more['given'] = values.text(f'{artifact_path}/{given}' if artifact_path else given)
+                self._warn('renamed', 'mission %s: the artifact %r is called %r in its run, because MLflow cannot hold that name',
+                           self.id, more['given'], f'{more["folder"]}/{more["name"]}'.lstrip('/'))  # fmt: skip
         except Rejected as error:
             self._refuse(error)
         except TypeError as error:

@@ -27,6 +27,7 @@ MOST_EVENTS: Final = 200
 MOST_EVENT: Final = 2000
 """Letters of an event that stands in the summary; ``events.jsonl`` in the run has all."""
 MOST_POLICIES: Final = 100
+MOST_RENAMED: Final = 1000
 BUCKET: Final = 'sensor-data'
 TRAJECTORIES: Final = 'trajectories'
 
@@ -50,6 +51,8 @@ class Story:
     refused: Counter[str] = field(default_factory=Counter)
     errors: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
+    renamed: dict[str, str] = field(default_factory=dict)
+    """Artifacts whose names MLflow cannot hold: path in the run -> path that the agent passed."""
     policies: list[tuple[str | None, int]] = field(default_factory=list)
     """The one that was active at the start and those that followed it, each with the time from which on; None: there was none."""
     first: dict[str, float] = field(default_factory=dict)
@@ -90,6 +93,8 @@ class Story:
             self._note_event(record, time_ns)
         if kind == 'policy' and len(self.policies) < MOST_POLICIES:
             self.policies.append((record.get('policy'), time_ns))
+        if kind == 'artifact' and 'given' in record and len(self.renamed) < MOST_RENAMED:
+            self.renamed['/'.join(filter(None, (record['folder'], record['name'])))] = record['given']
         if kind == 'refused':
             self.refused[str(record['reason'])] += 1
         elif kind == 'event' and record.get('name') in {'error', 'exception'}:
@@ -228,6 +233,7 @@ def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictu
             'trajectories': story.counts['trajectory'], 'artifacts': story.counts['artifact'], 'events': story.counts['event'],
         },
         'ledger': _ledger(story, sent),
+        'renamed_artifacts': dict(story.renamed),
         'pictures': dict(pictures),
         'data': _places(story, run),
     }  # fmt: skip

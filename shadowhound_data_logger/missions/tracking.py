@@ -7,7 +7,9 @@ there already stay as they are. (Only ``file:`` stores keep a point twice that i
 
 from __future__ import annotations
 
+import errno
 import os
+import posixpath
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +20,7 @@ from typing import Any, Final, Protocol
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
-from shadowhound_data_logger.tls import distrust
+from shadowhound_data_logger.tls import causes, distrust
 
 MISSION_TAG: Final = 'shadowhound.mission_id'
 DUPLICATE_TAG: Final = 'shadowhound.duplicate_of'
@@ -45,6 +47,10 @@ STATUS_CODES: Final = {401: 'UNAUTHENTICATED', 403: 'PERMISSION_DENIED'}
 """Of answers that come without a code, such as those of the proxy for artifacts."""
 TOO_LARGE: Final = 413
 """The HTTP status of a proxy that will never take this file, whatever it takes besides."""
+OF_OBJECT: Final = frozenset({400, 404, 406, 409, 410, 412, 414, 422, 431, 451})
+"""HTTP statuses that may be about the object that was sent; whether they are, shows when the server takes others."""
+OF_PATH: Final = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.EEXIST})
+"""The same of a folder."""
 RUN_GONE: Final = 'RUN_GONE'
 """``data['code']`` of the refusal of everything that belongs to a run that somebody deleted."""
 S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
@@ -145,7 +151,7 @@ class MlflowTracking:
                 f'artifacts of run {run.run_id} lie in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not say where that is'
             )
             raise TrackingUnavailable(text, remedy=S3_REMEDY)
-        what, remedy = f'took no artifact of run {run.run_id}', ''
+        what, remedy = f'did not take the artifact {posixpath.join(folder, path.name)!r} of run {run.run_id}', ''
         if run.artifact_uri.startswith('s3:'):
             what, remedy = f'{what} for {run.artifact_uri}', S3_REMEDY
         with self._translated(what, remedy):
@@ -242,21 +248,40 @@ class MlflowTracking:
             if code in REFUSALS and is_own:
                 raise TrackingRefused(text, code=code) from error
             self._raise_distrust(error)
-            raise TrackingUnavailable(text, remedy=remedy_for(code), code=code) from error
+            of_object = code in REFUSALS or _is_of_object(error)
+            raise TrackingUnavailable(text, remedy=remedy_for(code), code=code, of_object=of_object) from error
         except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is not JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
-            status = getattr(getattr(error, 'response', None), 'status_code', 0)
+            status = _status(error)
             if status == TOO_LARGE:
                 raise TrackingRefused(text, remedy='let the proxy before MLflow take larger files', code='TOO_LARGE') from error
             code = STATUS_CODES.get(status, '')
-            raise TrackingUnavailable(text, remedy=remedy_for(code) if code else remedy or remedy_for(''), code=code) from error
+            remedy = remedy_for(code) if code else remedy or remedy_for('')
+            raise TrackingUnavailable(text, remedy=remedy, code=code, of_object=_is_of_object(error)) from error
 
     def _raise_distrust(self, error: Exception) -> None:
         """Raises TrackingUnavailable where the certificate of the server is not believed, or of the store of artifacts."""
         bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE where artifacts go to the S3 server itself)'
         if found := distrust(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
             raise TrackingUnavailable(found[0], remedy=found[1], code='CERTIFICATE') from error
+
+
+def _status(error: BaseException) -> int:
+    """The HTTP status of the answer, of MLflow's server or an S3 server; 0 where there was none."""
+    for cause in causes(error):
+        response: Any = getattr(cause, 'response', None)
+        if isinstance(response, dict):  # botocore's
+            return int(response.get('ResponseMetadata', {}).get('HTTPStatusCode', 0))
+        if response is not None:
+            return int(getattr(response, 'status_code', 0))
+    return 0
+
+
+def _is_of_object(error: BaseException) -> bool:
+    """Whether the answer may be about the object alone."""
+    errors = {cause.errno for cause in causes(error) if type(cause).__module__ == 'builtins' and isinstance(cause, OSError)}
+    return _status(error) in OF_OBJECT or not errors.isdisjoint(OF_PATH)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ The limits are MLflow's own (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import posixpath
@@ -34,6 +35,18 @@ MAX_SIDE: Final = 65_500
 _ARRAYS: Final = ('__array__', '__array_interface__')
 _SPACES: Final = {(): 'GRAY', (1,): 'GRAY', (3,): 'RGB', (4,): 'RGBA'}
 """What simplejpeg calls an array of so many channels."""
+MAX_NAME_BYTES: Final = 240
+"""A file has at most 255, of which boto3 needs 9 while it downloads one."""
+MAX_EXTENSION: Final = 16
+_ODD: Final = re.compile(r'[\x00-\x1f\x7f-\x9f#?\\\ud800-\udfff]|%(?=[0-9A-Fa-f]{2})|=(?=[0-9A-F]{2})|^ ')
+"""What does not arrive, tried with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX`` until none
+is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and a
+leading blank."""
+_ODD_FOLDER: Final = re.compile(rf"{_ODD.pattern}|'|^\.(?=\.)")
+"""MLflow puts a folder into a query between quotes, and takes ``..x`` for a way out."""
+_SCHEME: Final = re.compile(r'^([A-Za-z][A-Za-z0-9+.-]*):')
+"""``C:`` and ``file:x`` look like URLs."""
+_CUT: Final = re.compile(r'=[0-9A-F]?$')
 _KEY: Final = re.compile(r'[/\w.\- ]+')
 
 
@@ -129,9 +142,39 @@ def artifact_folder(path: object) -> str:
     """A folder below the run's artifacts, '' for its root; raises Rejected for one that leads elsewhere."""
     if path is None or path == '':
         return ''
-    if not isinstance(path, str) or not _is_plain(path) or '\0' in path or len(path) > MAX_KEY:
+    if not isinstance(path, str) or posixpath.normpath(path) != path or len(path) > MAX_KEY or '\0' in path:
         raise Rejected('bad_name', f'{text(path, 80)!r} is not a folder below the artifacts of a run')
-    return path
+    if path.partition('/')[0] in {'', '.', '..'}:
+        raise Rejected('bad_name', f'{text(path, 80)!r} leads out of the artifacts of a run')
+    return '/'.join(artifact_name(part, _ODD_FOLDER) for part in path.split('/'))
+
+
+def artifact_name(name: str, odd: re.Pattern[str] = _ODD) -> str:
+    """The name under which a run can have a file: unchanged, if MLflow's server and clients list it and download it as that.
+
+    Otherwise ``=XX`` stands for each byte that they do not take (``map#1.png`` is ``map=231.png``), ``=`` before two such digits
+    among them, so that two names never become one. A name of more than 240 bytes is cut and has a hash.
+    """
+    found = _SCHEME.sub(r'\1=3A', odd.sub(lambda match: _escaped(match[0]), name))
+    if len(found.encode()) <= MAX_NAME_BYTES:
+        return found
+    stem, dot, extension = found.rpartition('.')
+    tail = f'~{hashlib.sha256(_bytes(name)).hexdigest()[:16]}'
+    tail += f'.{extension}' if stem and dot and len(extension.encode()) <= MAX_EXTENSION else ''
+    kept = found.encode()[: MAX_NAME_BYTES - len(tail.encode())].decode(errors='ignore')
+    return _CUT.sub('', kept) + tail
+
+
+def _escaped(letters: str) -> str:
+    return ''.join(f'={byte:02X}' for byte in _bytes(letters))
+
+
+def _bytes(name: str) -> bytes:
+    """As the file system has it; lone surrogates that it cannot have become question marks."""
+    try:
+        return name.encode('utf-8', 'surrogateescape')
+    except UnicodeEncodeError:
+        return name.encode('utf-8', 'replace')
 
 
 def plain(value: Any, depth: int = 4) -> Any:

@@ -87,7 +87,7 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
             console.print(f'  MLflow     {tower.tracking_uri}')
         record, run_id, page, address = _patrol(folder, tower, duration_s, outage_s, console, with_mission=mlflow, with_arm=arm,
                                                 stack=stack)  # fmt: skip
-        drawn = [demo_mission.picture(tower.tracking(READER), run_id, folder / 'mission.png')] if run_id else []
+        drawn = demo_mission.pictures(tower.tracking(READER), run_id, folder / 'mission.png', console) if run_id else []
         console.print('\nReading everything back from the S3 server ...\n')
         store = open_store(tower.store_settings(), UploadSettings())
         try:
@@ -109,8 +109,8 @@ def _tell(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, ru
     """The result, and the exit code that says it."""
     (folder / 'ledger.json').write_text(json.dumps(audit.ledger, indent=2), encoding='utf-8')
     demo_report.show_result(audit, record, console)
-    if run_id:
-        demo_report.show_mission(demo_mission.summary(audit.bodies, run_id), console)
+    if run_id and (summary := demo_mission.summary(audit.bodies, run_id)) is not None:
+        demo_report.show_mission(summary, console)
     from shadowhound_data_logger.sim import demo_pictures  # noqa: PLC0415
 
     pictures = demo_pictures.draw(folder, audit.bodies, record)
@@ -147,7 +147,7 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
                         agent.ask_to_stop()
 
                 record = demo_run.patrol(folder, node, outage, environ, duration_s, look)
-            run_id = demo_mission.end(agent) if with_mission else ''
+            run_id = demo_mission.end(agent, console) if with_mission else ''
         began = time.monotonic()
         node.stop(demo_processes.STOP_S)
         node.check()
