@@ -23,7 +23,7 @@ from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED
 from shadowhound_data_logger.encode.definitions import describe
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.format import CDR, ROS2
-from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_profile
+from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_profile, read_summary
 from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, read_whole
 from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
@@ -336,17 +336,30 @@ class BagReader:
             raise BagDamaged(f'a message in {name} cannot be unpacked: {error}', path=name) from error
 
 
-def described(sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None) -> Description | None:
+def described(
+    sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None, *, scans: bool = True
+) -> Description | None:
     """What a bag holds whose files are in a store, or some of them; None if there is nothing to read.
 
-    SQLite and packed files in a store would have to be downloaded: of a bag with those, it is what the metadata claims.
+    SQLite and packed files in a store would have to be downloaded: of a bag with those, it is what the metadata claims. The same
+    is true without ``scans`` of MCAP files whose summary is not enough.
     """
     names = slices_of(sorted(sources, key=natural), claimed)
     if any(not name.endswith(MCAP) and not isinstance(sources[name], LocalFile) for name in names):
         return claimed and replace(claimed, remarks=(NOT_READ,))
+    if claimed is not None and not scans and not all(_has_summary(sources[name]) for name in names):
+        return replace(claimed, remarks=(NOT_READ,))
     if not names and claimed is None:
         return None
     return BagReader({name: sources[name] for name in names}, claimed, manifest).describe()
+
+
+def _has_summary(source: Ranged) -> bool:
+    """Whether an MCAP file is described without reading all of it; also one that is damaged, which is found by its end."""
+    try:
+        return read_summary(source) is not None
+    except BagDamaged:
+        return True
 
 
 @dataclass(frozen=True, slots=True)

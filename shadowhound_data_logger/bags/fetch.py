@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.bags.contents import BagReader
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, clock_of, missing_of
 from shadowhound_data_logger.durable_files import fingerprint, lock, replacing
 from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.index import read_index
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.model import ObjectInfo
@@ -148,8 +148,11 @@ def _alone(path: Path) -> Iterator[int]:
 
 def _describe(folder: Path, bag: RemoteBag, clock: Mapping[str, str]) -> None:
     """Of a bag that is not all there, so that players open what is; the real one replaces it with the rest."""
-    slices = [file for file in bag.slices if file.name.endswith('.mcap')]
-    infos = [read_index(LocalFile(folder / file.name)).info(folder / file.name, file.size) for file in slices]
+    sources = {file.name: LocalFile(folder / file.name) for file in bag.slices if file.name.endswith(MCAP)}
+    try:
+        infos = list(BagReader(sources, None).infos().values())
+    except BagDamaged:
+        return  # none can be read, which verify shows
     if infos:
         with replacing(folder / METADATA) as file:
             file.write(metadata_yaml(infos, ros_distro='', custom_data=clock))

@@ -149,7 +149,7 @@ def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: 
         return _span(messages, len(topics), [(each.t_start_ns + step_ns, each.t_end_ns + step_ns) for each in filled])
     if file := bag.file(METADATA):
         sources = {each.name: StoredFile(store, BUCKET, each.key, each.size) for each in bag.files}
-        found = described(sources, of_metadata(document(store, file), file.key, sources), None)
+        found = described(sources, of_metadata(document(store, file), file.key, sources), None, scans=False)
         if found is not None:
             wrong = [f'{name} is not there' for name in found.absent]
             wrong += [f'{name} {why}' for name, why in found.damaged.items()]

@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
 from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex, read_index, scan
+from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_summary, scan
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -190,11 +190,17 @@ def _check_local(files: Mapping[str, Path], expected: _Expected, deep: bool, tol
 
 
 def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileCheck:
-    """What the file holds: of an MCAP file by its summary, of another one, on the disk alone, by all of it."""
+    """What the file holds: in a store by its summary alone, on the disk by everything that has to be read for it."""
     if not expected.name.endswith(MCAP) and not (expected.name.endswith(SLICES) and isinstance(source, LocalFile)):
         return FileCheck(expected.name, '', checked)
     try:
-        info = opened(source).check()
+        if isinstance(source, StoredFile):
+            index = read_summary(source)
+            if index is None:
+                return FileCheck(expected.name, '', checked)  # it would have to be downloaded
+            info = index.info(Path(source.name), source.size)
+        else:
+            info = opened(source).check()
     except BagDamaged as error:
         return FileCheck(expected.name, reason(error, source.name), checked)
     if expected.messages not in {None, info.messages}:

@@ -230,7 +230,9 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
     if as_json:
         print_json({**asdict(found), 'folder': str(found.folder)})
         return ExitCode.FINE
-    lines = [plain(f'{found.folder}: {number(found.files)} files, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')]
+    lines = [
+        plain(f'{found.folder}: {counted(found.files, "file")}, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')
+    ]
     if found.unverified:
         lines.append(plain(f'No checksum is known of {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
     elif found.missing:
@@ -397,10 +399,10 @@ def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> Exit
         print_json({**asdict(found), 'where': found.where})
     else:
         state = 'confirmed by the store' if found.delivered else f'waits in the spool for the store ({found.last_error})'
-        print_lines(f'{found.where}: {number(found.messages)} messages on {number(len(found.topics))} topics, '
-            f'{number(found.slices)} slices, {volume(found.bytes)}, {state}')  # fmt: skip
+        what = f'{counted(found.messages, "message")} on {counted(len(found.topics), "topic")}, {counted(found.slices, "slice")}'
+        print_lines(f'{found.where}: {what}, {volume(found.bytes)}, {state}')
         if found.dropped:
-            print_lines(f'{number(found.dropped)} messages were dropped: this machine was too slow for them.')
+            print_lines(f'Dropped: {counted(found.dropped, "message")}; this machine was too slow.')
     return exit_code(finding=not (found.delivered and not found.dropped))
 
 
@@ -469,7 +471,7 @@ def _clock(clock: Mapping[str, str], start_ns: int | None) -> str:
 def _lost(missing: Sequence[Missing]) -> Iterator[RenderableType]:
     """What the recording itself could not get into the bag."""
     for lost in missing:
-        count = '' if lost.messages is None else f' ({number(lost.messages)} messages)'
+        count = '' if lost.messages is None else f' ({counted(lost.messages, "message")})'
         topic = f' of {lost.topic}' if lost.topic else ''
         yield plain(f'Missing{topic}, in or after {lost.file}: {lost.what}{count}', 'yellow')
 
@@ -577,10 +579,10 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
 def _told_upload(found: Uploaded) -> str:
     name = f'{found.robot}/rosbags/{found.bag}'
     if found.is_delivered:
-        return f'{name}: {number(found.files)} files, {volume(found.bytes)}, confirmed by the store'
+        return f'{name}: {counted(found.files, "file")}, {volume(found.bytes)}, confirmed by the store'
     left = found.files - found.delivered
     why = f' ({found.last_error})' if found.last_error else ''
-    return f'{name}: {number(left)} of {number(found.files)} files wait in the spool for the store{why}'
+    return f'{name}: {number(left)} of {counted(found.files, "file")} wait in the spool for the store{why}'
 
 
 def _tell(steps: list[WatchStep], as_json: bool) -> None:

@@ -37,7 +37,7 @@ FIRST_READ: Final = 64 << 10
 """From the end: the whole summary of most slices, so that one request does."""
 MOST_SUMMARY_BYTES: Final = 64 << 20
 """That of a hundred thousand chunks: a bag of 100 GB in one file."""
-MOST_HEADER_BYTES: Final = 64 << 10
+MOST_HEADER_BYTES: Final = 4 << 10
 MOST_RECORD_BYTES: Final = MOST_CHUNK_BYTES + 1024
 """A chunk, and what says of it how it is packed."""
 BLOCK_BYTES: Final = 4 << 20

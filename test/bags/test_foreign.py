@@ -17,6 +17,7 @@ from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import safe_bag
+from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
 from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
@@ -298,3 +299,29 @@ def test_times_of_64_bits(tmp_path: Path) -> None:
         assert (found.description.t_start_ns, found.description.t_end_ns) == (0, (1 << 64) - 1)
     ran = CliRunner().invoke(bag, ['info', f'{fetched}/'], standalone_mode=False)
     assert '2554-07-21 23:34:33.709' in ran.output
+
+
+def test_a_list_downloads_no_bag(tmp_path: Path) -> None:
+    """Of a bag without a manifest whose summary is not enough, it shows what metadata.yaml claims; info counts."""
+    root = tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags'
+    for name, options in (('whole', {}), ('bare', BARE)):
+        metadata_yaml(write(root / name / f'{name}_0.mcap', ten, **options), message_count=7)
+    store = DirectoryStore(tmp_path / 'store')
+    rows = {row.bag: row for row in bag_overview(store, 'thor', tmp_path / 'home')}
+    assert (rows['whole'].messages, rows['whole'].remark.startswith('metadata.yaml claims 7 messages')) == (10, True)
+    assert (rows['bare'].messages, rows['bare'].remark) == (7, '')
+    assert info_of(store, 'thor', 'bare', tmp_path / 'home').description.messages == 10
+    assert verify_remote(store, find_bag(store, 'thor', 'bare')).is_sound
+
+
+def test_a_growing_bag_with_a_torn_file_is_fetched(tmp_path: Path) -> None:
+    """Its metadata.yaml is made of the files that can be read."""
+    store = DirectoryStore(tmp_path / 'store')
+    for part in range(2):
+        write(tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b' / f'b_{part}.mcap', ten)
+    torn = tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b' / 'b_1.mcap'
+    torn.write_bytes(torn.read_bytes()[:-9])
+    fetched = fetch(store, find_bag(store, 'thor', 'b'), tmp_path / 'here').folder
+    found = info_folder(fetched).description
+    assert (found.messages, list(found.damaged)) == (10, ['b_1.mcap'])
+    assert 'b_1' not in (fetched / 'metadata.yaml').read_text()
