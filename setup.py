@@ -38,7 +38,7 @@ setup(
         'rich>=13',
         'rosbags>=0.11.9',
         'ruamel-yaml>=0.17',
-        'simplejpeg>=1.7',
+        'simplejpeg>=1.8',
     ],
     extras_require={
         'datasets': ['av>=15', 'daft>=0.7.26,<0.8', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],

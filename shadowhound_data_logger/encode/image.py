@@ -1,21 +1,27 @@
 """Camera messages to image files: compressed ones pass through byte for byte, raw ones are encoded.
 
-``jpeg`` makes JPEGs of 8-bit colours and greys, ``png`` PNGs without loss. Depth fits in neither JPEG nor, as float, in PNG:
-with both formats 16-bit images become 16-bit PNGs, and float32 images become TIFFs with every value as it was, NaN included.
-The sizes of JPEG and PNG files are read from their headers, without decoding them.
+``jpeg`` makes JPEGs of 8-bit colors, grays and YUV, ``png`` PNGs without loss. What is more than a picture is never compressed
+with loss: 16-bit images, ``8UC1`` (labels, masks) and Bayer mosaics become PNGs, float32 images become TIFFs with every value as
+it was, NaN included. Images of other encodings are stored as they were serialized. The sizes of JPEG and PNG files are read from
+their headers, without decoding them.
 """
 
 from __future__ import annotations
 
+import logging
 import struct
+import zlib
+from collections.abc import Mapping
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import simplejpeg
 
-from shadowhound_data_logger.encode.payload import Fact, Job, Payload
+from shadowhound_data_logger.encode.payload import Fact, Job, Payload, verbatim
+from shadowhound_data_logger.encode.rvl import decode_rvl
 from shadowhound_data_logger.encode.statistics import ALL, NONE, Statistic, of_number, of_whole, packed
+from shadowhound_data_logger.encode.yuv import Planes, at_full_resolution, is_yuv, planes_of
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
 from shadowhound_data_logger.options import ARCHIVES, COMPRESSED_IMAGE, IMAGE
@@ -23,14 +29,22 @@ from shadowhound_data_logger.untrusted import check_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+log = logging.getLogger(__name__)
+
 JPEG_MAGIC: Final = b'\xff\xd8\xff'
 PNG_MAGIC: Final = b'\x89PNG\r\n\x1a\n'
+TIFF_MAGICS: Final = b'II*\0', b'MM\0*'
 _SOF: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers that begin a frame header; C4, C8 and CC in their midst are something else (ITU-T T.81, table B.1)."""
 _SOS: Final = 0xDA
 _CHUNK: Final = struct.Struct('>I4s')
 _IHDR: Final = struct.Struct('>I4sII')
 _PNG_SIDE: Final = (1 << 31) - 1
+
+
+DEEP: Final = 'deep'
+"""A mode that Pillow does not have: colors of 16 bits."""
 
 
 class _Pixel(NamedTuple):
@@ -49,15 +63,29 @@ class _Pixel(NamedTuple):
 
 
 _DEPTH16: Final = _Pixel(2, 2, 'I;16', 'I;16')
+_GRAY: Final = _Pixel(1, 1, 'L', 'L')
+_BGR: Final = _Pixel(3, 1, 'RGB', 'BGR', 'BGR')
+_BGRA: Final = _Pixel(4, 1, 'RGBA', 'BGRA', 'BGRA')
 _PIXELS: Final = {
-    'bgr8': _Pixel(3, 1, 'RGB', 'BGR', 'BGR'),
+    'bgr8': _BGR,
     'rgb8': _Pixel(3, 1, 'RGB', 'RGB', 'RGB'),
-    'bgra8': _Pixel(4, 1, 'RGBA', 'BGRA', 'BGRA'),
+    'bgra8': _BGRA,
     'rgba8': _Pixel(4, 1, 'RGBA', 'RGBA', 'RGBA'),
     'mono8': _Pixel(1, 1, 'L', 'L', 'GRAY'),
+    '8UC1': _GRAY,
+    '8UC3': _BGR,  # the order of OpenCV, which RViz assumes too
+    '8UC4': _BGRA,
     'mono16': _DEPTH16,
     '16UC1': _DEPTH16,
+    'rgb16': _Pixel(6, 2, DEEP, 'RGB'),
+    'bgr16': _Pixel(6, 2, DEEP, 'BGR'),
+    '16UC3': _Pixel(6, 2, DEEP, 'BGR'),
+    'rgba16': _Pixel(8, 2, DEEP, 'RGBA'),
+    'bgra16': _Pixel(8, 2, DEEP, 'BGRA'),
+    '16UC4': _Pixel(8, 2, DEEP, 'BGRA'),
     '32FC1': _Pixel(4, 4, 'F', 'F;32F'),
+    **{f'bayer_{order}8': _GRAY for order in ('rggb', 'bggr', 'gbrg', 'grbg')},
+    **{f'bayer_{order}16': _DEPTH16 for order in ('rggb', 'bggr', 'gbrg', 'grbg')},
 }
 """By ROS encoding (sensor_msgs/image_encodings.hpp)."""
 _MAX_SIDE: Final = 65_500
@@ -65,7 +93,9 @@ _MAX_SIDE: Final = 65_500
 _PNG_LEVEL: Final = 1
 """zlib's fastest: the default 6 takes five times as long to save a tenth of a depth image, and 30 a second have to be made."""
 _DEPTH: Final = 'compressedDepth'
-"""In the ``format`` of what compressed_depth_image_transport publishes, such as ``16UC1; compressedDepth png``."""
+"""In the ``format`` of what compressed_depth_image_transport publishes, such as ``16UC1; compressedDepth png``; old versions have
+no ``png`` there, or the encoding alone."""
+_RVL: Final = 'rvl'
 _CONFIG_HEADER: Final = struct.Struct('<iff')
 """Its struct before the PNG: a format number without meaning, and the two parameters of the inverse depth
 (compressed_depth_image_transport/compression_common.hpp, codec.cpp)."""
@@ -74,8 +104,8 @@ _CONFIG_HEADER: Final = struct.Struct('<iff')
 def encode_jpeg(job: Job, sample: Sample) -> Payload:
     """The image of one CompressedImage or Image, JPEG where it can be.
 
-    Raises Rejected: ``wrong_type``, ``unknown_type``, ``malformed``, ``empty``, ``unsupported_encoding``,
-    ``size_mismatch`` (width, height, step and data contradict each other), ``too_large`` (for a JPEG).
+    Raises Rejected: ``wrong_type``, ``unknown_type``, ``malformed``, ``empty``, ``size_mismatch`` (width, height, step and data
+    contradict each other), ``too_large`` (for a JPEG).
     """
     return _encode(job, sample, lossless=False)
 
@@ -91,34 +121,63 @@ def _encode(job: Job, sample: Sample, *, lossless: bool) -> Payload:
     message = job.types.deserialize(job.batch.type, memoryview(sample.cdr))
     if job.batch.type == COMPRESSED_IMAGE:
         return _published(job, sample, message)
-    pixel = _layout(message)
-    facts = {'width': message.width, 'height': message.height, 'encoding': message.encoding}
+    facts: dict[str, Fact] = {'width': message.width, 'height': message.height, 'encoding': printable_ascii(message.encoding)}
+    if is_yuv(message.encoding):
+        return _yuv(job, sample, message, facts, lossless=lossless)
+    pixel = _PIXELS.get(message.encoding)
+    if pixel is None:
+        return verbatim(sample, 'unsupported_encoding', facts)
+    _check_size(message, pixel)
     if pixel.colorspace and not lossless:
         body = _jpeg(message, pixel, job.sensor.quality)
         return Payload(body, (sample,), 'jpg', 'image/jpeg', facts, _statistics(job, body))
     if pixel.mode == 'F':
         return Payload(_pillow(message, pixel, 'TIFF'), (sample,), 'tiff', 'image/tiff', facts)
-    return Payload(_pillow(message, pixel, 'PNG', compress_level=_PNG_LEVEL), (sample,), 'png', 'image/png', facts)
+    body = _deep_png(message, pixel) if pixel.mode == DEEP else _pillow(message, pixel, 'PNG', compress_level=_PNG_LEVEL)
+    return Payload(body, (sample,), 'png', 'image/png', facts)
+
+
+def _yuv(job: Job, sample: Sample, message: Any, facts: Mapping[str, Fact], *, lossless: bool) -> Payload:
+    """The camera's own planes as a JPEG; a PNG has the colors that these are."""
+    _check_not_empty(message)
+    planes = planes_of(message)
+    if planes is None:
+        return verbatim(sample, 'unknown_layout', facts)
+    if lossless:
+        return Payload(_png_of_planes(planes), (sample,), 'png', 'image/png', facts)
+    _check_sides(message)
+    if message.width % 2 or message.height % 2:  # libjpeg-turbo would read past the end of a plane
+        planes = at_full_resolution(planes)
+    body = bytes(simplejpeg.encode_jpeg_yuv_planes(*map(np.ascontiguousarray, planes), quality=job.sensor.quality))
+    return Payload(body, (sample,), 'jpg', 'image/jpeg', facts, _statistics(job, body))
 
 
 def _published(job: Job, sample: Sample, message: Any) -> Payload:
-    """A CompressedImage's own bytes, if they are a JPEG or a PNG."""
+    """A CompressedImage's own bytes, if they are a JPEG, a PNG or a TIFF, and depth that was compressed otherwise as a PNG."""
     data: Any = message.data
     facts: dict[str, Fact] = {}
-    if _DEPTH in message.format:
+    if not data.size:
+        raise Rejected('empty', 'no image data')
+    if _DEPTH in message.format or _has_png(data, _CONFIG_HEADER.size):
         data, facts = _depth(message)
+    if data is None:
+        return verbatim(sample, 'unsupported_encoding', facts)
     body = data.tobytes()
     if body.startswith(JPEG_MAGIC):
         (width, height), ext, content_type = jpeg_size(body), 'jpg', 'image/jpeg'
     elif body.startswith(PNG_MAGIC):
         (width, height), ext, content_type = png_size(body), 'png', 'image/png'
-    elif not body:
-        raise Rejected('empty', 'no image data')
+    elif body.startswith(TIFF_MAGICS):
+        return Payload(body, (sample,), 'tiff', 'image/tiff', facts)
     else:
-        text = f'neither JPEG nor PNG: format {message.format[:40]!r}, data begins with {body[:4].hex()}'
-        raise Rejected('unsupported_encoding', text)
+        return verbatim(sample, 'unsupported_encoding', {'encoding': printable_ascii(message.format)})
     found = _statistics(job, body) if ext == 'jpg' else b''
     return Payload(body, (sample,), ext, content_type, {'width': width, 'height': height, **facts}, found)
+
+
+def printable_ascii(text: str) -> str:
+    """Text of a message as object metadata take it."""
+    return ascii(text[:40])[1:-1]
 
 
 def _statistics(job: Job, body: bytes) -> bytes:
@@ -127,31 +186,51 @@ def _statistics(job: Job, body: bytes) -> bytes:
 
 
 def _depth(message: Any) -> tuple[Any, dict[str, Fact]]:
-    """The PNG of a compressed depth image, and what its header says.
+    """The PNG of a compressed depth image, and what its header says; None for the PNG if it is neither a PNG nor RVL.
 
-    With encoding 32FC1 the PNG holds the inverse depth: metres are ``depth_quant_a / (pixel - depth_quant_b)``, 0 is NaN.
+    With encoding 32FC1 the PNG holds the inverse depth: meters are ``depth_quant_a / (pixel - depth_quant_b)``, 0 is NaN. Some
+    publishers leave out the header.
     """
-    encoding, _, rest = message.format.partition(';')
-    if encoding not in ('16UC1', 'mono16', '32FC1') or rest.strip() not in (_DEPTH, f'{_DEPTH} png'):
-        raise Rejected('unsupported_encoding', f'{message.format[:40]!r} is not a depth image as PNG')
-    data = message.data
-    if data.size <= _CONFIG_HEADER.size or data[_CONFIG_HEADER.size :][: len(PNG_MAGIC)].tobytes() != PNG_MAGIC:
+    encoding, _, compression = message.format.partition(';')
+    facts: dict[str, Fact] = {'encoding': printable_ascii(encoding)}
+    if _has_png(message.data, 0):
+        return message.data, facts
+    if message.data.size <= _CONFIG_HEADER.size:
+        raise Rejected('malformed', f'{message.data.size} bytes of {message.format[:40]!r}')
+    _, quant_a, quant_b = _CONFIG_HEADER.unpack_from(message.data)
+    facts |= {'depth_quant_a': quant_a, 'depth_quant_b': quant_b}
+    body = message.data[_CONFIG_HEADER.size :]
+    if _RVL in compression:
+        try:
+            return np.frombuffer(_png_of_depth(decode_rvl(body.tobytes())), np.uint8), facts
+        except ValueError as error:
+            log.debug('%s', error)
+            return None, facts
+    if not _has_png(body, 0):
         raise Rejected('malformed', f'no PNG behind the header of {message.format[:40]!r}')
-    _, quant_a, quant_b = _CONFIG_HEADER.unpack_from(data)
-    return data[_CONFIG_HEADER.size :], {'encoding': encoding, 'depth_quant_a': quant_a, 'depth_quant_b': quant_b}
+    return body, facts
 
 
-def _layout(message: Any) -> _Pixel:
-    """What the pixels are, once it is certain that all of them are there."""
-    pixel = _PIXELS.get(message.encoding)
-    if pixel is None:
-        raise Rejected('unsupported_encoding', f'{message.encoding[:40]!r} is none of {", ".join(_PIXELS)}')
+def _has_png(data: Any, at: int) -> bool:
+    return bool(data[at : at + len(PNG_MAGIC)].tobytes() == PNG_MAGIC)
+
+
+def _check_size(message: Any, pixel: _Pixel) -> None:
+    """Raises Rejected unless all pixels are there."""
+    _check_not_empty(message)
     width, height, step = message.width, message.height, message.step
-    if not width or not height:
-        raise Rejected('empty', f'{width} x {height} pixels')
     if step < width * pixel.size or message.data.size != step * height:
         raise Rejected('size_mismatch', f'{width} x {height} {message.encoding}, step {step}, {message.data.size} bytes of data')
-    return pixel
+
+
+def _check_not_empty(message: Any) -> None:
+    if not message.width or not message.height:
+        raise Rejected('empty', f'{message.width} x {message.height} pixels')
+
+
+def _check_sides(message: Any) -> None:
+    if max(message.width, message.height) > _MAX_SIDE:
+        raise Rejected('too_large', f'{message.width} x {message.height} pixels, a JPEG has at most {_MAX_SIDE} a side')
 
 
 def _rows(message: Any, pixel: _Pixel) -> NDArray[Any]:
@@ -162,10 +241,8 @@ def _rows(message: Any, pixel: _Pixel) -> NDArray[Any]:
 
 
 def _jpeg(message: Any, pixel: _Pixel, quality: int) -> bytes:
-    width, height = message.width, message.height
-    if max(width, height) > _MAX_SIDE:
-        raise Rejected('too_large', f'{width} x {height} pixels, a JPEG has at most {_MAX_SIDE} a side')
-    pixels = _rows(message, pixel).reshape(height, width, pixel.size)
+    _check_sides(message)
+    pixels = _rows(message, pixel).reshape(message.height, message.width, pixel.size)
     # Half-resolution colour is what OpenCV and libjpeg write by default, and takes half the time of full.
     subsampling = 'Gray' if pixel.size == 1 else '420'
     return bytes(simplejpeg.encode_jpeg(pixels, quality=quality, colorspace=pixel.colorspace, colorsubsampling=subsampling))
@@ -177,6 +254,40 @@ def _pillow(message: Any, pixel: _Pixel, kind: str, **options: int) -> bytes:
 
     size = message.width, message.height
     image = Image.frombuffer(pixel.mode, size, _rows(message, pixel), 'raw', pixel.raw, 0, 1)
+    return _saved(image, kind, **options)
+
+
+def _deep_png(message: Any, pixel: _Pixel) -> bytes:
+    """Colors of 16 bits, which Pillow does not write: https://www.w3.org/TR/png-3/."""
+    height, width = message.height, message.width
+    colors = _rows(message, pixel).view(np.uint16).reshape(height, width, -1)
+    order = [pixel.raw.index(channel) for channel in 'RGBA' if channel in pixel.raw]
+    lines = np.zeros((height, 1 + width * pixel.size), np.uint8)  # the first byte of a line: no filter
+    lines[:, 1:] = colors[:, :, order].astype('>u2').reshape(height, -1).view(np.uint8)
+    kind = 6 if len(order) == 4 else 2
+    header = struct.pack('>IIBBBBB', width, height, 16, kind, 0, 0, 0)
+    chunks = ((b'IHDR', header), (b'IDAT', zlib.compress(lines.tobytes(), _PNG_LEVEL)), (b'IEND', b''))
+    return PNG_MAGIC + b''.join(
+        _CHUNK.pack(len(body), name) + body + struct.pack('>I', zlib.crc32(name + body)) for name, body in chunks
+    )
+
+
+def _png_of_planes(planes: Planes) -> bytes:
+    from PIL import Image  # noqa: PLC0415 - see _pillow
+
+    image = Image.merge('YCbCr', [Image.fromarray(np.ascontiguousarray(part)) for part in at_full_resolution(planes)])
+    return _saved(image.convert('RGB'), 'PNG', compress_level=_PNG_LEVEL)
+
+
+def _png_of_depth(pixels: NDArray[np.uint16]) -> bytes:
+    from PIL import Image  # noqa: PLC0415 - see _pillow
+
+    height, width = pixels.shape
+    image = Image.frombuffer('I;16', (width, height), pixels.astype('<u2'), 'raw', 'I;16', 0, 1)
+    return _saved(image, 'PNG', compress_level=_PNG_LEVEL)
+
+
+def _saved(image: Any, kind: str, **options: int) -> bytes:
     file = BytesIO()
     image.save(file, kind, **options)
     return file.getvalue()

@@ -108,8 +108,10 @@ class MessageTypes:
         """
         self.fields(type_name)
         if type_name not in self._uncompiled:
-            with suppress(SerdeError):
+            try:
                 return self._store.deserialize_cdr(cdr, type_name)
+            except SerdeError:  # of another vendor, or malformed
+                pass
         return read_message(self._store, type_name, cdr)
 
     def fields(self, type_name: str) -> Fielddefs:

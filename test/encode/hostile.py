@@ -131,20 +131,49 @@ def measured(work: Callable[[], Encoding]) -> tuple[Encoding, int, float]:
 
 def content(ros: Any, type_name: str) -> list[bytes]:
     """Valid messages of a type, in both byte orders, with something in the fields that encoders look into."""
-    values: dict[str, Any] = {}
+    variants: list[dict[str, Any]] = [{}]
+    values = variants[0]
     if type_name.endswith('/Image'):
-        pixels = np.arange(48, dtype=np.uint8)
-        values = {'width': 4, 'height': 4, 'step': 12, 'encoding': 'bgr8', 'data': pixels, 'header': {'frame_id': 'camera'}}
+        of_encoding = {
+            'bgr8': (12, 48),
+            'yuv422_yuy2': (8, 32),
+            'yuv422': (12, 48),
+            'nv12': (4, 24),
+            'nv24': (4, 48),
+            'mono8': (4, 16),
+            'rgb16': (24, 96),
+            'rgba16': (32, 128),
+            'bayer_rggb16': (8, 32),
+            '32FC1': (16, 64),
+            '64FC1': (32, 128),
+        }
+        variants = [
+            {
+                'width': 4,
+                'height': 4,
+                'step': step,
+                'encoding': encoding,
+                'data': np.arange(size, dtype=np.uint8),
+                'header': {'frame_id': 'camera'},
+            }
+            for encoding, (step, size) in of_encoding.items()
+        ]
     elif type_name.endswith('/CompressedImage'):
-        values = {'format': 'jpeg', 'data': np.frombuffer(JPEG, np.uint8)}
+        variants = [
+            {'format': 'jpeg', 'data': np.frombuffer(JPEG, np.uint8)},
+            {'format': '16UC1; compressedDepth rvl', 'data': np.frombuffer(RVL, np.uint8)},
+        ]
     elif type_name.endswith('/PointCloud2'):
         fields = [ros.make('sensor_msgs/msg/PointField', name=name, offset=4 * number, datatype=7, count=1)
                   for number, name in enumerate('xyz')]  # fmt: skip
         values = {'width': 2, 'height': 2, 'point_step': 12, 'row_step': 24, 'fields': fields, 'data': np.zeros(48, np.uint8)}
     elif type_name.endswith('/JointState'):
         values = {'name': ['a', 'bb'], 'position': np.ones(2), 'velocity': np.ones(2), 'effort': np.ones(2)}
-    return [ros.cdr(type_name, little_endian=little, **values) for little in (True, False)]
+    variants = [values] if values else variants
+    return [ros.cdr(type_name, little_endian=little, **each) for each in variants for little in (True, False)]
 
 
 JPEG: Final = bytes.fromhex('ffd8ffe000104a46494600010100000100010000ffc0000b080001000101011100ffda0008010100003f00d2cf20ffd9')
 """Headers of a JPEG of one pixel, and something of a scan."""
+RVL: Final = struct.pack('<iffIII', 0, 1.0, 2.0, 4, 2, 0x1382_2222) + struct.pack('<I', 0x2220_0000)
+"""A depth image of 4 x 2 pixels: one that is 0, then numbers that rise."""

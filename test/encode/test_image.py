@@ -1,4 +1,4 @@
-"""JPEGs pass through untouched, raw colours become JPEGs that look the same, and what lies is rejected by reason."""
+"""JPEGs pass through untouched, raw colors become JPEGs that look the same, and contradictory images are rejected by reason."""
 
 from __future__ import annotations
 
@@ -66,16 +66,14 @@ def test_a_missing_end_and_fill_bytes_are_passed(ros: Any) -> None:
 
 @pytest.mark.parametrize(
     ('data', 'reason'),
-    [(b'', 'empty'), (b'BM' + bytes(60), 'unsupported_encoding'), (b'\xff\xd8', 'unsupported_encoding'),
-     (b'\xff\xd8\xff', 'malformed'), (b'\xff\xd8\xff\xe0' + bytes(400), 'malformed')],
-    ids=['nothing', 'bmp', 'two bytes', 'magic only', 'zeros'],
+    [(b'', 'empty'), (b'\xff\xd8\xff', 'malformed'), (b'\xff\xd8\xff\xe0' + bytes(400), 'malformed')],
+    ids=['nothing', 'magic only', 'zeros'],
 )  # fmt: skip
 def test_what_is_no_image(ros: Any, data: bytes, reason: str) -> None:
-    """Data that is neither JPEG nor PNG is counted under a reason that says what it is, and a sentence that shows it."""
+    """No data, and a JPEG without its headers, are rejected by reason."""
     encoding = compressed(ros, data)
     assert encoding.object is None
     assert encoding.rejected == {reason: 1}
-    assert data[:2].hex() in encoding.details[reason] or reason != 'unsupported_encoding'
 
 
 def test_a_jpeg_cut_in_its_headers(ros: Any) -> None:
@@ -131,13 +129,10 @@ def test_quality(ros: Any) -> None:
         ({'width': 0}, 'empty'),
         ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty'),
         ({'encoding': '32FC1'}, 'size_mismatch'),
-        ({'encoding': '16SC1'}, 'unsupported_encoding'),
-        ({'encoding': ''}, 'unsupported_encoding'),
-        ({'encoding': 'yuv422_yuy2'}, 'unsupported_encoding'),
     ],
 )
 def test_raw_images_that_lie(ros: Any, lies: dict[str, Any], reason: str) -> None:
-    """Sizes that contradict each other, nothing at all, and encodings that are not known are told apart, whatever is made."""
+    """Sizes that contradict each other and images without pixels are told apart, whatever is made."""
     for format_name in ('jpeg', 'png'):
         result = raw(ros, gradient().reshape(48, -1), sensor={'format': format_name}, **({'encoding': 'bgr8'} | lies))
         assert result.object is None
