@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
-from shadowhound_data_logger.bags.description import BagPart, Description, of_files, of_metadata
+from shadowhound_data_logger.bags.description import Description, of_files, of_manifest, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural
 from shadowhound_data_logger.encode.definitions import describe
@@ -39,6 +39,8 @@ MOST_RATIO: Final = 1000
 OWN_METADATA: Final = frozenset({'rosbag2', 'shadowhound_recording'})
 """Metadata records that every writer makes for its own file."""
 NOT_READ: Final = 'metadata.yaml is the only source of these figures: such files are not read in a store, but after bag fetch'
+WAL_HEADER_BYTES: Final = 32
+"""Of SQLite's write-ahead log, without content."""
 ZSTD_MAGIC: Final = b'\x28\xb5\x2f\xfd'
 _TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
 _LATEST_NS: Final = 1 << 63
@@ -107,6 +109,11 @@ class SqliteFile:
 
     @cached_property
     def _channels(self) -> dict[int, Channel]:
+        for suffix in ('-wal', '-journal'):
+            rest = self._path.with_name(self._path.name + suffix)
+            if rest.exists() and rest.stat().st_size > WAL_HEADER_BYTES:
+                text = f'{self._path} was not closed: {rest.name} has messages that are not in it'
+                raise BagDamaged(text, path=str(self._path))
         check_tables(self._path)
         with self._opened() as database:
             columns = {str(name) for _, name, *_ in database.execute('PRAGMA table_info(topics)')}
@@ -229,11 +236,8 @@ class BagReader:
     def __init__(self, sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None = None) -> None:
         """``sources`` by name, in their order. A manifest, which was made from the files, saves opening all of them."""
         self.claimed = claimed
-        slices = manifest.slices if manifest is not None else ()
-        self._recorded = {
-            each.file: BagPart(each.file, each.messages, *((each.t_start_ns, each.t_end_ns) if each.messages else (None, None)))
-            for each in slices
-        }
+        self._manifest = manifest
+        self._recorded = {each.file: each for each in manifest.slices} if manifest is not None else {}
         self._names = {name: source.name for name, source in sources.items()}
         self._parts: dict[str, BagFile] = {}
         self._damaged: dict[str, BagDamaged] = {}
@@ -252,8 +256,9 @@ class BagReader:
 
     def describe(self) -> Description:
         """By all files, or by the manifest if it knows all of them. Raises BagDamaged if none can be read."""
-        if self.claimed is not None and self._recorded and self._parts.keys() <= self._recorded.keys() and not self._damaged:
-            return self._by_manifest(self.claimed)
+        is_recorded = self._recorded.keys() >= {*self._parts, *self._damaged}
+        if self.claimed is not None and self._manifest is not None and is_recorded:
+            return of_manifest(self._manifest, self._parts, self.claimed)
         infos = self.infos()
         return of_files(infos, self.damaged, self.claimed)
 
@@ -292,16 +297,6 @@ class BagReader:
                 for message in self._parts[name].messages(wanted):
                     yield self._plain(message, name)
 
-    def _by_manifest(self, claimed: Description) -> Description:
-        parts = self._recorded.values()
-        return replace(
-            claimed, parts=tuple(sorted(parts, key=lambda part: natural(part.name))),
-            messages=sum(part.messages or 0 for part in parts),
-            t_start_ns=min((part.t_start_ns for part in parts if part.t_start_ns is not None), default=None),
-            t_end_ns=max((part.t_end_ns for part in parts if part.t_end_ns is not None), default=None),
-            absent=tuple(name for name in self._recorded if name not in self._parts),
-        )  # fmt: skip
-
     def _open(self, names: Sequence[str]) -> None:
         """Several at a time."""
 
@@ -316,14 +311,10 @@ class BagReader:
             list(pool.map(one, wanted))
 
     def _may_have(self, name: str, wanted: MessageFilter) -> bool:
-        part = self._recorded.get(name)
-        if part is not None and name not in self._infos:
-            start, end, messages = part.t_start_ns, part.t_end_ns, part.messages
-        elif (info := self._infos.get(name)) is not None:
-            start, end, messages = info.t_start_ns, info.t_end_ns, info.messages
-        else:
+        known = self._infos.get(name) or self._recorded.get(name)
+        if known is None:
             return True
-        return bool(messages) and start is not None and end is not None and start < wanted.end_ns and end >= wanted.start_ns
+        return known.messages > 0 and known.t_start_ns < wanted.end_ns and known.t_end_ns >= wanted.start_ns
 
     def _plain(self, message: RecordedMessage, name: str) -> RecordedMessage:
         """Without rosbag2's compression of each message: no CDR begins as zstd does."""
@@ -341,17 +332,19 @@ def described(
 ) -> Description | None:
     """What a bag holds whose files are in a store, or some of them; None if there is nothing to read.
 
-    SQLite and packed files in a store would have to be downloaded: of a bag with those, it is what the metadata claims. The same
-    is true without ``scans`` of MCAP files whose summary is not enough.
+    By the manifest if it knows all of them. Otherwise, SQLite and packed files in a store would have to be downloaded: of a bag
+    with those, it is what the metadata claims. The same is true without ``scans`` of MCAP files whose summary is not enough.
     """
     names = slices_of(sorted(sources, key=natural), claimed)
+    if claimed is not None and manifest is not None and {each.file for each in manifest.slices}.issuperset(names):
+        return of_manifest(manifest, sources, claimed)
     if any(not name.endswith(MCAP) and not isinstance(sources[name], LocalFile) for name in names):
         return claimed and replace(claimed, remarks=(NOT_READ,))
     if claimed is not None and not scans and not all(_has_summary(sources[name]) for name in names):
         return replace(claimed, remarks=(NOT_READ,))
     if not names and claimed is None:
         return None
-    return BagReader({name: sources[name] for name in names}, claimed, manifest).describe()
+    return BagReader({name: sources[name] for name in names}, claimed).describe()
 
 
 def _has_summary(source: Ranged) -> bool:
@@ -398,9 +391,15 @@ def files_of(path: Path) -> dict[str, Path]:
 
 
 def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
-    """The files with messages: all in the folder itself, and those in folders below it that the metadata names."""
+    """The files with messages: all in the folder itself, and those in folders below it that the metadata names.
+
+    Of a file that is there twice, packed and not, it is the one that the metadata names.
+    """
     named = {part.name for part in claimed.parts} if claimed is not None else set()
-    return [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
+    found = [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
+    twice = {name for name in found if name + PACKED in found}  # left by a recorder that crashed while it compressed them
+    dropped = {name if name + PACKED in named and name not in named else name + PACKED for name in twice}
+    return [name for name in found if name not in dropped]
 
 
 def reason(error: BagDamaged, name: str) -> str:

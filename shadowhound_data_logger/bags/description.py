@@ -12,6 +12,7 @@ from pathlib import PurePosixPath
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.naming import natural
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged
@@ -123,7 +124,23 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
     return whole if absent or damaged else replace(whole, remarks=tuple(_contradictions(whole, claimed)))
 
 
-def _part_of(name: str, info: SliceInfo) -> BagPart:
+def of_manifest(manifest: Manifest, there: Container[str], claimed: Description) -> Description:
+    """From what the manifest recorded of the files, also of those that are not ``there``."""
+    counts = {(topic.topic, topic.type): topic.messages for topic in manifest.topics}
+    known = {(topic.name, topic.type): topic for topic in claimed.topics}
+    topics = [known.get(name, DescribedTopic(*name, 0, (), '')) for name in dict.fromkeys((*known, *counts))]
+    parts = [_part_of(each.file, each) for each in manifest.slices]
+    found = replace(
+        claimed, topics=tuple(replace(topic, messages=counts.get((topic.name, topic.type), 0)) for topic in topics),
+        parts=tuple(sorted(parts, key=lambda part: natural(part.name))), messages=sum(each.messages for each in manifest.slices),
+        t_start_ns=min((part.t_start_ns for part in parts if part.t_start_ns is not None), default=None),
+        t_end_ns=max((part.t_end_ns for part in parts if part.t_end_ns is not None), default=None),
+        absent=tuple(part.name for part in parts if part.name not in there),
+    )  # fmt: skip
+    return replace(found, remarks=tuple(_contradictions(found, claimed)))
+
+
+def _part_of(name: str, info: SliceInfo | SliceEntry) -> BagPart:
     times = (info.t_start_ns, info.t_end_ns) if info.messages else (None, None)
     return BagPart(name, info.messages, *times)
 

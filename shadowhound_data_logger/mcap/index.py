@@ -22,7 +22,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk as ChunkRecord
-from mcap.records import ChunkIndex, Footer, Header, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
 
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.format import MAGIC, RECORD, REPEATED
@@ -124,8 +124,8 @@ class Schemas:
     """Channels as they are found, and the schemas that they need. A channel is known as soon as its schema is."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    waiting: dict[int, ChannelRecord] = field(default_factory=dict)
-    """Channels whose schema has not been found."""
+    waiting: dict[int, dict[int, ChannelRecord]] = field(default_factory=dict)
+    """By the schema that has not been found, the channels that need it."""
     _schemas: dict[int, tuple[str, str, str]] = field(default_factory=lambda: {0: ('', '', '')})
 
     def add(self, kind: int, content: bytes | memoryview) -> None:
@@ -135,14 +135,13 @@ class Schemas:
             found = schema.name, schema.encoding, schema.data.decode(errors='surrogateescape')
             if not schema.id or self._schemas.setdefault(schema.id, found) != found:
                 raise McapError(f'schema {schema.id} is defined twice, differently' if schema.id else 'schema 0 is defined')
-            for channel in [each for each in self.waiting.values() if each.schema_id == schema.id]:
-                del self.waiting[channel.id]
+            for channel in self.waiting.pop(schema.id, {}).values():
                 self._add(channel)
             return
         channel = parsed(ChannelRecord, content)
         if channel.schema_id in self._schemas:
             self._add(channel)
-        elif self.waiting.setdefault(channel.id, channel) != channel:
+        elif self.waiting.setdefault(channel.schema_id, {}).setdefault(channel.id, channel) != channel:
             raise McapError(f'channel {channel.id} is defined twice, differently')
 
     def _add(self, record: ChannelRecord) -> None:
@@ -176,12 +175,12 @@ def read_summary(source: Ranged) -> McapIndex | None:
 def read_profile(source: Ranged) -> str:
     """The profile in the header of a file. Raises BagDamaged."""
     start = len(MAGIC) + RECORD.size
-    head = source.read(0, min(start + MOST_HEADER_BYTES, source.size))
+    head = source.read(0, min(MOST_HEADER_BYTES, source.size))
+    length = int.from_bytes(head[start : start + 4], 'little')
     try:
-        kind, length = RECORD.unpack_from(head, len(MAGIC))
-        if head[: len(MAGIC)] != MAGIC or kind != Opcode.HEADER:
+        if not head.startswith(MAGIC + bytes([Opcode.HEADER])) or start + 4 + length > len(head):
             raise EOFError('it is not the header of an MCAP file')
-        return str(parsed(Header, head[start : start + length]).profile)
+        return head[start + 4 : start + 4 + length].decode()
     except UNREADABLE as error:
         raise BagDamaged(f'{source.name} has a header that cannot be read: {error}', path=source.name) from error
 
@@ -207,7 +206,7 @@ def scan(source: Ranged, data_end: int) -> McapIndex:
         elif kind == Opcode.METADATA:
             metadata.append('')
     if declared.waiting:
-        raise BagDamaged(f'{source.name} has channels without their schema: {sorted(declared.waiting)}', path=source.name)
+        raise BagDamaged(f'{source.name} does not define schema {min(declared.waiting)}, which a channel has', path=source.name)
     filled = [chunk for chunk in chunks if chunk.counts]
     counts: dict[int, int] = {}
     for chunk in filled:

@@ -191,6 +191,12 @@ def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: in
     (remark,) = cut.remarks
     assert remark.startswith('metadata.yaml claims the time 2025-10-18T12:00:')
     assert found.remarks == verify_folder(folder).remarks == cut.remarks
+    store = DirectoryStore(tmp_path / 'store')
+    with planned(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+        upload_now(store, sent, deadline_s=60)
+    described = info_of(store, 'thor', 'b', tmp_path / 'home').description
+    assert (described.messages, described.t_start_ns, described.t_end_ns, described.remarks) == (30, T0, T0 + 29 * S, cut.remarks)
+    assert cut_remote(store, find_bag(store, 'thor', 'b'), tmp_path / 'remote', Choice()).messages == 30
     for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert ran.return_value == 0, ran.output

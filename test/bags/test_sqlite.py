@@ -155,6 +155,8 @@ def test_a_split_bag_by_its_files(tmp_path: Path) -> None:
     assert [(each.messages, each.t_start_ns, dict(each.counts)) for each in manifest.slices] == [
         (3, T0 + 3 * part * 10**9, {'/chat': 1, 'count': 1, '/mine': 1, '/silent': 0}) for part in range(3)
     ]
+    described = info_of(store, 'thor', 'b', tmp_path / 'home').description
+    assert (described.messages, described.t_end_ns, described.remarks) == (9, T0 + 8 * 10**9, (remark,))
     (row,) = bag_overview(store, 'thor', tmp_path / 'home')
     assert (row.messages, row.t_start_ns, row.t_end_ns) == (9, T0, T0 + 8 * 10**9)
     assert cut_remote(store, remote, tmp_path / 'remote', Choice('2', '7')).messages == 5
@@ -197,3 +199,26 @@ def test_messages_of_no_topic(tmp_path: Path) -> None:
     assert info_folder(path.parent).description.messages == 0
     with pytest.raises(BagError, match='no messages'):
         cut_folder(path.parent, tmp_path / 'none', Choice())
+
+
+@pytest.mark.parametrize('suffix', ['-wal', '-journal'])
+def test_a_file_that_was_not_closed(tmp_path: Path, suffix: str) -> None:
+    """Has messages in another file: it is not read as if these were not there."""
+    path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE)
+    (path.parent / f'b_0.db3{suffix}').write_bytes(bytes(32))
+    assert info_folder(path.parent).description.messages == 9
+    (path.parent / f'b_0.db3{suffix}').write_bytes(bytes(4096))
+    for attempt in (lambda: info_folder(path.parent), lambda: cut_folder(path.parent, tmp_path / 'piece', Choice())):
+        with pytest.raises(BagDamaged, match='was not closed'):
+            attempt()
+    assert not verify_folder(path.parent).is_sound
+
+
+@pytest.mark.parametrize('named', ['b_0.db3', 'b_0.db3.zstd', ''])
+def test_a_file_that_is_there_twice(tmp_path: Path, named: str) -> None:
+    """Packed and not, after a crash of the recorder: its messages are not."""
+    path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE)
+    path.with_name('b_0.db3.zstd').write_bytes(zstandard.compress(path.read_bytes()))
+    if named:
+        metadata(path.parent, [named], 5)
+    check(path.parent, tmp_path / 'piece')
