@@ -56,6 +56,7 @@ __all__ = [
     'StoreSettings',
     'UploadSettings',
     'default_parameters',
+    'endpoint_url',
     'home',
     'store_settings',
 ]  # fmt: skip
@@ -68,6 +69,15 @@ _FIELD: Final = re.compile(r'[^:\s]+:[A-Za-z]\w*(\.\w+)*', re.ASCII)
 """A part of the field that is a number counts in an array: lowstate:motor_state.0.temperature."""
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
+ENDPOINTS: Final = ('AWS_ENDPOINT_URL_S3', 'AWS_ENDPOINT_URL')
+"""The first that is set, as in botocore (https://docs.aws.amazon.com/sdkref/latest/guide/feature-ss-endpoints.html)."""
+NOT_SHOWN: Final = '(not shown: it may hold a secret)'
+MAX_PORT: Final = 65_535
+_ENDPOINT: Final = re.compile(
+    r'https?://([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:(?P<port>[0-9]{1,5}))?(/[A-Za-z0-9._~%/-]*)?', re.IGNORECASE
+)
+_REGION: Final = re.compile(r'[A-Za-z0-9_-]+')
+_VISIBLE: Final = re.compile(r'[!-~]*')
 NOT_SETTINGS: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 """Parameters that rclpy itself declares; they are not ours to judge."""
 
@@ -128,19 +138,39 @@ def home(environ: Mapping[str, str]) -> Path:
 
 
 def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
-    """The store the environment names; raises SettingError for an endpoint that is no http(s) URL."""
-    endpoint = environ.get('AWS_ENDPOINT_URL') or None
-    if endpoint and (not endpoint.startswith(('http://', 'https://')) or '@' in endpoint):
-        shown = endpoint if '@' not in endpoint else '(not shown: it may hold a password)'
-        raise SettingError('AWS_ENDPOINT_URL', shown, 'a URL such as http://TOWER_IP:9000, without user and password')
+    """The store that the environment names. Raises SettingError for a value with which no S3 client can send a request."""
+    endpoint, of_s3 = environ.get('AWS_ENDPOINT_URL'), environ.get('AWS_ENDPOINT_URL_S3')
+    region, other_region = environ.get('AWS_REGION'), environ.get('AWS_DEFAULT_REGION')
+    for name, value in (('AWS_REGION', region), ('AWS_DEFAULT_REGION', other_region)):
+        if value and not _REGION.fullmatch(value):
+            raise SettingError(name, value, 'the name of a region, such as us-east-1, without blanks')
     return StoreSettings(
-        endpoint_url=endpoint,
-        access_key_id=environ.get('AWS_ACCESS_KEY_ID') or None,
-        secret_access_key=environ.get('AWS_SECRET_ACCESS_KEY') or None,
-        session_token=environ.get('AWS_SESSION_TOKEN') or None,
-        region=environ.get('AWS_REGION') or environ.get('AWS_DEFAULT_REGION') or 'us-east-1',
+        endpoint_url=endpoint_url(of_s3, ENDPOINTS[0]) if of_s3 else endpoint_url(endpoint) if endpoint else None,
+        access_key_id=_key('AWS_ACCESS_KEY_ID', environ.get('AWS_ACCESS_KEY_ID')),
+        secret_access_key=_key('AWS_SECRET_ACCESS_KEY', environ.get('AWS_SECRET_ACCESS_KEY')),
+        session_token=_key('AWS_SESSION_TOKEN', environ.get('AWS_SESSION_TOKEN')),
+        region=region or other_region or 'us-east-1',
         directory=folder / 'store',
     )
+
+
+def _key(name: str, value: str | None) -> str | None:
+    """A blank would make the signature wrong, or could not be in a header."""
+    if not _VISIBLE.fullmatch(value or ''):
+        raise SettingError(name, NOT_SHOWN, 'ASCII without blanks; does the line in the file of variables end with one?')
+    return value or None
+
+
+def endpoint_url(given: str, name: str = ENDPOINTS[1]) -> str:
+    """The URL of an S3 server, without the slashes at its end. Raises SettingError for a URL that not all S3 clients can use.
+
+    What they make of a blank, a query or a user name differs: botocore refuses some of it, obstore panics.
+    """
+    match = _ENDPOINT.fullmatch(given)
+    if match is None or int(match['port'] or 0) > MAX_PORT:
+        shown = given if '@' not in given else NOT_SHOWN
+        raise SettingError(name, shown, 'a URL such as http://TOWER_IP:9000, without blanks, user, password and query')
+    return given.rstrip('/')
 
 
 def default_parameters() -> dict[str, Any]:

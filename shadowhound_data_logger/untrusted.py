@@ -6,11 +6,13 @@ memory only as far as this module allows. What it refuses is a NameRefused or a 
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import unicodedata
 import warnings
-from io import BytesIO
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -72,6 +74,23 @@ def visible(text: str) -> str:
     if text.isprintable():
         return text
     return ''.join(_escape(letter) if unicodedata.category(letter) in UNSEEN else letter for letter in text)
+
+
+def csv_encoding(head: bytes) -> str:
+    """The encoding of a CSV file that starts with these bytes: UTF-8, or what Excel writes, with a byte order mark of either."""
+    return 'utf-16' if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else 'utf-8-sig'
+
+
+def csv_rows(body: bytes) -> csv.DictReader[str]:
+    """The rows of a CSV file with a line of names; more cells than names are under ``''``. Raises ValueError, csv.Error."""
+    text = body.decode(csv_encoding(body))
+    names = text.partition('\n')[0]
+    for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if mark in names and ',' not in names:
+            raise ValueError(f'its columns are separated by {name}: save it with commas')
+    rows = csv.DictReader(StringIO(text, newline=''), strict=True, restkey='')
+    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
+    return rows
 
 
 def csv_cell(value: object) -> object:

@@ -164,6 +164,54 @@ def test_an_endpoint_is_a_url() -> None:
         load({'AWS_ENDPOINT_URL': 'tower:9000'})
 
 
+@pytest.mark.parametrize(
+    'url',
+    ['http://tower:9000 ', ' http://tower:9000', 'http://tower:9000\n', 'http://tower:9000?x=1', 'http://tower:9000/#a',
+     'tower:9000', 'ftp://tower', 'http://', 'http://:9000', 'http://to wer', 'http://tower:99999', 'http://tower:1:2', 'http://[::1',
+     'http://me:hunter2@tower'],
+)  # fmt: skip
+@pytest.mark.parametrize('name', ['AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_S3'])
+def test_an_endpoint_that_some_client_cannot_use_is_refused(name: str, url: str) -> None:
+    """With the name of its variable, and without a password that is in it."""
+    with pytest.raises(SettingError) as caught:
+        load({name: url})
+    assert caught.value.data['name'] == name
+    assert 'hunter2' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('environ', 'expected'),
+    [({'AWS_ENDPOINT_URL': 'http://tower:9000/'}, 'http://tower:9000'),
+     ({'AWS_ENDPOINT_URL': 'HTTPS://tower/s3//'}, 'HTTPS://tower/s3'),
+     ({'AWS_ENDPOINT_URL': 'http://[fe80::1]:9000'}, 'http://[fe80::1]:9000'),
+     ({'AWS_ENDPOINT_URL_S3': 'http://s3:9000'}, 'http://s3:9000'),
+     ({'AWS_ENDPOINT_URL': 'http://all:1', 'AWS_ENDPOINT_URL_S3': 'http://s3:9000'}, 'http://s3:9000'),
+     ({'AWS_ENDPOINT_URL': 'http://all:1', 'AWS_ENDPOINT_URL_S3': ''}, 'http://all:1'),
+     ({'AWS_ENDPOINT_URL': '', 'AWS_ENDPOINT_URL_S3': ''}, None)],
+)  # fmt: skip
+def test_which_endpoint_is_used(environ: dict[str, str], expected: str | None) -> None:
+    """AWS_ENDPOINT_URL_S3 before AWS_ENDPOINT_URL, as in botocore; slashes at the end do not count, an empty value is none."""
+    assert load(environ).store.endpoint_url == expected
+
+
+@pytest.mark.parametrize('value', ['the-secret ', 'the-secret\n', 'a b', 'se\u00fcret', '\u200bkey'])
+@pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_SESSION_TOKEN'])
+def test_a_key_with_a_blank_is_refused_and_not_shown(name: str, value: str) -> None:
+    """It would be refused as a wrong signature, or not be a header at all."""
+    with pytest.raises(SettingError, match='without blanks') as caught:
+        load({**ENVIRON, name: value})
+    assert caught.value.data['name'] == name
+    assert value.strip() not in str(caught.value)
+
+
+@pytest.mark.parametrize('name', ['AWS_REGION', 'AWS_DEFAULT_REGION'])
+def test_a_region_with_a_blank_is_refused(name: str) -> None:
+    """It is part of what is signed."""
+    with pytest.raises(SettingError, match=f"{name} = 'us-east-1 '"):
+        load({name: 'us-east-1 '})
+    assert load({name: 'eu-central-1'}).store.region == 'eu-central-1'
+
+
 @pytest.mark.parametrize('given', ['lowstate', 'lowstate:', ':soc', 'lowstate:bms_state..soc', 'a b:c', 'a:b:c'])
 def test_a_field_needs_a_topic_and_a_name(given: str) -> None:
     """The node says at its start what it could never find in a message."""

@@ -28,6 +28,9 @@ from shadowhound_data_logger.options import POINT_CLOUD
 log = logging.getLogger(__name__)
 
 JPEG: Final = 'image/jpeg'
+BATTERY_STATE: Final = 'sensor_msgs/msg/BatteryState'
+_ROUNDING: Final = 1e-6
+"""Of a full battery in float32."""
 
 
 class MissionObserver:
@@ -106,11 +109,14 @@ class MissionObserver:
     def _readings(self, type_name: str, sample: Sample, fields: Mapping[str, list[str]]) -> Iterator[Reading]:
         message = self._types.deserialize(type_name, sample.cdr)
         for key, path in fields.items():
-            value = number_at(message, path)
-            if value is None:
+            raw = number_at(message, path)
+            value = battery_pct(message, path) if key == BATTERY else raw
+            if raw is None:
                 self._tell(key, f'{type_name} has no number {".".join(path)}')
-            elif math.isfinite(value):
+            elif value is not None and math.isfinite(value):
                 yield Reading(sample.stamp_ns, key, value)
+            elif math.isfinite(raw):
+                self._tell(key, f'{type_name} has {".".join(path)} = {raw:g}, which is not between 0 and 1')
 
     def _tell(self, what: str, text: str) -> None:
         if what not in self._told:
@@ -127,6 +133,26 @@ def number_at(message: Any, path: list[str]) -> float | None:
         return float(found)
     except (AttributeError, IndexError, TypeError, ValueError):
         return None
+
+
+def battery_pct(message: Any, path: list[str]) -> float | None:
+    """The number at the end of the path as the charge in percent; None for a charge that is unknown.
+
+    ``sensor_msgs/msg/BatteryState.percentage`` is 0 to 1, and NaN where it is not measured. A value beyond is not what the
+    message defines, so what its publisher means is unknown.
+    """
+    value = number_at(message, path)
+    if value is None or not _is_share(message, path):
+        return value if value is not None and math.isfinite(value) else None
+    return 100 * value if 0 <= value <= 1 + _ROUNDING else None
+
+
+def _is_share(message: Any, path: list[str]) -> bool:
+    """Whether the path ends at the charge of a BatteryState, which may be part of another message or of an array."""
+    found = message
+    for name in path[:-1]:
+        found = found[int(name)] if name.isdigit() else getattr(found, name)
+    return path[-1] == 'percentage' and getattr(found, '__msgtype__', '') == BATTERY_STATE
 
 
 def yaw_of(turn: Any) -> float:

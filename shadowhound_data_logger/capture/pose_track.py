@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.capture.consumers import Consumer, Drained
-from shadowhound_data_logger.capture.mission_observer import number_at, yaw_of
+from shadowhound_data_logger.capture.mission_observer import battery_pct, yaw_of
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import MissionSettings
 from shadowhound_data_logger.encode.records import ODOMETRY
@@ -168,10 +168,9 @@ class RobotTrack(Consumer):
 
     def _charge(self, type_name: str, cdr: bytes) -> float | None:
         try:
-            value = number_at(self._types.deserialize(type_name, cdr), self._field)
+            return battery_pct(self._types.deserialize(type_name, cdr), self._field)
         except Rejected:
             return None
-        return value if value is not None and math.isfinite(value) else None
 
 
 def _between(found: list[tuple[int, _Pose]], stamp_ns: int) -> _Pose | None:

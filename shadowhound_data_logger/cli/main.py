@@ -5,9 +5,11 @@ An error has one form: the verb, what is wrong and where, and on the next line w
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import Final
 
 import click
@@ -93,8 +95,17 @@ class _WithoutPandas:
 def main() -> None:
     """The console script."""
     sys.meta_path.insert(0, _WithoutPandas())
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a terminal that is not UTF-8, or text that is not Unicode
+            stream.reconfigure(errors='backslashreplace')
     try:
-        sys.exit(ExitCode(cli(prog_name=PROGRAM, standalone_mode=False) or 0))
+        code = ExitCode(cli(prog_name=PROGRAM, standalone_mode=False) or 0)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        sys.exit(code)
+    except BrokenPipeError:  # whoever reads the output has enough of it, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(ExitCode.FINDING)
     except click.exceptions.Exit as error:
         sys.exit(error.exit_code)
     except click.Abort:

@@ -207,6 +207,7 @@ Secrets are read from the environment alone: whatever is a ROS parameter can be 
 """
 VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('AWS_ENDPOINT_URL', 'a folder, `$SHADOWHOUND_HOME/store`', 'The S3 server, such as `http://TOWER_IP:9000`.'),
+    ('AWS_ENDPOINT_URL_S3', '', 'The same, for S3 alone: it takes precedence, as in all AWS programs.'),
     ('AWS_ACCESS_KEY_ID', '', 'Its access key.'),
     ('AWS_SECRET_ACCESS_KEY', '', 'Its secret key.'),
     ('AWS_SESSION_TOKEN', '', 'Where the credentials are temporary.'),

@@ -16,6 +16,7 @@ import numpy as np
 
 from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.untrusted import csv_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -90,10 +91,8 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
 def pairs_of(path: Path) -> NDArray[np.int64]:
     """(n, 2) of a CSV file with the columns ``robot_ns`` and ``arm_ns``, ns since 1970. Raises SettingError."""
     try:
-        with path.open(newline='', encoding='utf-8') as file:
-            rows = csv.DictReader(file)
-            found = [tuple(int(row[name]) for name in COLUMNS) for row in rows]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = [tuple(int(row[name]) for name in COLUMNS) for row in csv_rows(path.read_bytes())]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise SettingError('--clock', path, f'a CSV file with the columns {",".join(COLUMNS)} ({error})') from error
     return _sane(found, path)
 

@@ -39,6 +39,7 @@ from shadowhound_data_logger.lake.bucket import put_part
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.untrusted import csv_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -121,9 +122,8 @@ def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: N
 def times_of(path: Path) -> dict[int, int]:
     """Episode -> when it began by the arm's clock, of a CSV file with ``episode,begin_ns``. Raises SettingError."""
     try:
-        with path.open(newline='', encoding='utf-8') as file:
-            found = {int(row['episode']): int(row['begin_ns']) for row in csv.DictReader(file)}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = {int(row['episode']): int(row['begin_ns']) for row in csv_rows(path.read_bytes())}
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise SettingError('--times', path, f'a CSV file with the columns {",".join(COLUMNS)} ({error})') from error
     if any(not EARLIEST_SANE_NS <= begin < 1 << 62 for begin in found.values()):
         raise SettingError('--times', path, 'times in ns since 1970')

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.config import ENDPOINTS, Settings
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
 from shadowhound_data_logger.errors import SettingError
@@ -75,7 +75,7 @@ def guess(environ: Mapping[str, str], spool: Path, root: Path) -> Role:
 def _serves(environ: Mapping[str, str], root: Path) -> bool:
     """Whether the S3 server or MLflow listens on this machine."""
     ports = {S3_PORT, MLFLOW_PORT}
-    for variable in ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI'):
+    for variable in (*ENDPOINTS, 'MLFLOW_TRACKING_URI'):
         try:
             url = urlsplit(environ.get(variable, ''))
             if url.hostname in {'localhost', '127.0.0.1', '::1'} and url.port:

@@ -9,16 +9,18 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.config import ENDPOINTS, endpoint_url
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
+from shadowhound_data_logger.errors import SettingError
 from shadowhound_data_logger.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.spool import status
 
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
-SHARED: Final = ('AWS_ENDPOINT_URL', *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
+SHARED: Final = (*ENDPOINTS, *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
 """Where the node and this shell should agree; AWS's keys among them are compared, never shown."""
 PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
 """What is in the variables of somebody who pasted the guide as it is."""
@@ -57,7 +59,7 @@ def _store(context: Context) -> Iterator[Result]:
             f'export {pasted[0]}=...  # with what Tower gave you',
         )
     if not endpoint:
-        if any(problem.data['name'] == 'AWS_ENDPOINT_URL' for problem in context.refused):
+        if any(problem.data['name'] in ENDPOINTS for problem in context.refused):
             return
         yield _no_endpoint(context)
         return
@@ -157,6 +159,12 @@ def _tracking(context: Context) -> Iterator[Result]:
             f'export {missing[0]}=...  # or both in ~/.mlflow/credentials',
         )
     endpoint = context.settings.store.endpoint_url
+    if s3:
+        try:
+            endpoint_url(s3, 'MLFLOW_S3_ENDPOINT_URL')
+        except SettingError as problem:
+            yield of_error('environment.artifacts', problem, 'no artifact could be sent to it')
+            return
     if uri.startswith('http') and endpoint and not s3:
         yield info(
             'environment.artifacts',

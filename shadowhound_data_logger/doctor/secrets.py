@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.config import ENDPOINTS
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.model import Context, Result, info, ok, warning
@@ -16,7 +17,7 @@ NAME: Final = 'secrets'
 OTHERS: Final = stat.S_IRGRP | stat.S_IROTH | stat.S_IWGRP | stat.S_IWOTH
 WELL_KNOWN: Final = frozenset({'minioadmin', 'minio', 'minio123', 'password', 'admin', 'any', 'some_secret_key'})
 """Defaults of servers and of their manuals."""
-URLS: Final = ('AWS_ENDPOINT_URL', 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
+URLS: Final = (*ENDPOINTS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
 MOST_BYTES: Final = 1 << 20
 _SECRET: Final = re.compile(
     r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password|weed_jwt_\w+)\b"?\s*[:=]\s*\S'

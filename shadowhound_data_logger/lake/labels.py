@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -34,7 +33,7 @@ from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json, is_path
+from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
 
 MOST_IN_LAYER: Final = 50_000
 _BOX: Final = ('x', 'y', 'width', 'height')
@@ -191,7 +190,7 @@ def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
     """
     try:
         check_size(len(body), MOST_DOCUMENT_BYTES)
-        reader = csv.DictReader(io.StringIO(body.decode('utf-8-sig')), strict=True, restkey='')
+        reader = csv_rows(body)
         _check_columns(reader.fieldnames or ())
         return [_of_csv({name: value or '' for name, value in row.items()}, robot, now_ns) for row in reader]
     except (ValueError, csv.Error, TypeError) as error:

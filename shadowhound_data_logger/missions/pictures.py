@@ -24,6 +24,7 @@ from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_
 from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
 from shadowhound_data_logger.missions.folder import MissionFolder, write_json
 from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE, named
+from shadowhound_data_logger.untrusted import csv_encoding
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +94,9 @@ def read_path(path: Path) -> list[tuple[float, float, float]]:
     Raises OSError, or ValueError for a file without these columns.
     """
     found: list[tuple[float, float, float]] = []
-    with path.open(encoding='utf-8', errors='replace', newline='') as file:
+    with path.open('rb') as file:
+        encoding = csv_encoding(file.read(2))
+    with path.open(encoding=encoding, errors='replace', newline='') as file:
         lines = csv.reader(line.replace('\0', '') for line in file)
         names = [name.strip().lower() for name in next(lines, [])]
         places = [names.index(name) for name in ('timestamp', 'x', 'y')]

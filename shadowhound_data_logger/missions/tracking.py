@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from shadowhound_data_logger.config import ENDPOINTS
 from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
@@ -101,8 +102,8 @@ class MlflowTracking:
             return
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
-        if os.environ.get('AWS_ENDPOINT_URL'):
-            os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', os.environ['AWS_ENDPOINT_URL'])
+        if endpoint := next(filter(None, map(os.environ.get, ENDPOINTS)), None):
+            os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', endpoint)
         try:
             with _without('pandas'):  # a third of the time and of the memory; mlflow-skinny has none either
                 from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere

@@ -20,11 +20,11 @@ import obstore
 from obstore import exceptions as refused
 from obstore.store import S3Store as Client
 
+from shadowhound_data_logger.config import endpoint_url
 from shadowhound_data_logger.errors import (
     BucketMissing,
     CredentialsRejected,
     ObjectRefused,
-    SettingError,
     StoreError,
     StoreUnavailable,
 )
@@ -46,8 +46,6 @@ _WHOLE: Final = timedelta(days=1)
 """For one answer: a large object over WiFi takes its time."""
 _CLIENTS: Final = 16
 """Buckets whose connections are kept: rows of a catalogue can name any number."""
-_URL: Final = re.compile(r'https?://([^\s/@]*@)?([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?(/[!-~]*)?', re.IGNORECASE)
-"""What obstore can send a request to; at anything else it panics."""
 _CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
 _MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
 _STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')
@@ -84,8 +82,8 @@ class ObstoreStore:
 
     def open(self) -> None:
         """Raises SettingError for an endpoint that no request can be sent to."""
-        if not _URL.fullmatch(self._endpoint):
-            raise SettingError('AWS_ENDPOINT_URL', _shown(self._endpoint), 'a URL such as http://TOWER_IP:9000')
+        scheme, _, rest = self._endpoint.rpartition('://')
+        endpoint_url(f'{scheme}://{rest.rpartition("@")[2]}')  # a user name is not sent
 
     def close(self) -> None:
         with self._lock:

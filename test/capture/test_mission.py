@@ -233,6 +233,20 @@ def test_a_field_that_is_not_there_is_said_once(caplog: pytest.LogCaptureFixture
     ]
 
 
+def test_a_battery_state_is_logged_in_percent(caplog: pytest.LogCaptureFixture) -> None:
+    """Its ``percentage`` is 0 to 1; one that is not measured is not logged, one beyond is said once."""
+    observer = new_observer(battery='battery:percentage', temperature='battery:temperature')
+    kind, none = STORE.types['sensor_msgs/msg/BatteryState'], np.empty(0, np.float32)
+    some = [kind(a_header(), 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
+            for share in (0.5, float('nan'), 73.0, 74.0)]  # fmt: skip
+    found = list(observer.facts(batch('battery', '/battery', 'sensor_msgs/msg/BatteryState', *some, step_ns=SECOND)))
+    assert [each.value for each in found if each.key == 'battery_pct'] == [50.0]
+    assert [each.value for each in found if each.key == 'temperature_c'] == [31.0] * 4
+    assert [record.getMessage() for record in caplog.records] == [
+        'battery_pct is not logged to the mission: sensor_msgs/msg/BatteryState has percentage = 73, which is not between 0 and 1'
+    ]
+
+
 def test_a_picture_is_taken_every_few_seconds() -> None:
     """As the camera published it; other sensors' pictures are none of the mission's."""
     observer, kind = new_observer(frame_every_s=5.0), 'sensor_msgs/msg/CompressedImage'

@@ -12,6 +12,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.capture.consumers import Drained
+from shadowhound_data_logger.capture.mission_observer import BATTERY_STATE
 from shadowhound_data_logger.capture.pose_track import RobotTrack
 from shadowhound_data_logger.clock import SECOND, SystemClock
 from shadowhound_data_logger.config import MissionSettings
@@ -42,6 +43,14 @@ def odometry(x: float, y: float, yaw: float, frame: str = 'odom') -> bytes:
 
 def charge(percent: float) -> bytes:
     return bytes(STORE.serialize_cdr(STORE.types[CHARGE](percent), CHARGE))
+
+
+def battery_state(share: float) -> bytes:
+    of = STORE.types
+    header = of['std_msgs/msg/Header'](of['builtin_interfaces/msg/Time'](0, 0), '')
+    none = np.empty(0, np.float32)
+    message = of[BATTERY_STATE](header, 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, 'base', '1')
+    return bytes(STORE.serialize_cdr(message, BATTERY_STATE))
 
 
 def robot(settings: MissionSettings = SETTINGS) -> RobotTrack:
@@ -189,6 +198,24 @@ def test_the_battery_is_the_nearest_one_known() -> None:
     track.add(ns(10.0), charge(79.5))
     told = [marked(found, t).get('battery_pct') for t in (-31.0, -29.0, 4.0, 6.0, 39.0, 41.0)]
     assert told == [None, '80', '80', '79.5', '79.5', None]
+
+
+@pytest.mark.parametrize(
+    ('published', 'known'),
+    [(0.73, '73'), (0.0, '0'), (1.0, '100'), (math.nan, None), (-1.0, None), (73.0, None)],
+)
+def test_the_share_of_a_battery_state_is_percent_here(published: float, known: str | None) -> None:
+    """``BatteryState.percentage`` is 0 to 1 by its definition, and NaN where it is not measured; what is beyond is unknown."""
+    found = robot(MissionSettings(battery='battery:percentage'))
+    take(found, '/battery', BATTERY_STATE, (0.0, battery_state(published)))
+    assert marked(found, 0.0).get('battery_pct') == known
+
+
+def test_other_fields_of_a_battery_state_are_as_they_are() -> None:
+    """Volts are volts."""
+    found = robot(MissionSettings(battery='battery:voltage'))
+    take(found, '/battery', BATTERY_STATE, (0.0, battery_state(0.5)))
+    assert marked(found, 0.0)['battery_pct'] == '28.5'
 
 
 def test_only_what_is_asked_for_is_kept() -> None:

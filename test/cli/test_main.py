@@ -7,6 +7,7 @@ import pkgutil
 import re
 import shlex
 import sqlite3
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -243,3 +244,40 @@ def test_how_it_ends(
 
     monkeypatch.setattr(cli.commands['status'], 'callback', fail)
     assert ended(monkeypatch, capsys, 'status')[0] == code
+
+
+def printing(lines: int, **environ: str) -> list[str]:
+    """The command line of a verb that prints so many lines that no 8-bit encoding has, and one that no encoding has."""
+    script = (
+        'from shadowhound_data_logger.cli import main, output\n'
+        'import click\n'
+        'def talk(**_):\n'
+        f'    for _ in range({lines}):\n'
+        '        click.echo("\\u5de1 caf\\xe9 \\ud800")\n'
+        '    output.print_page("\\u2588")\n'
+        'main.cli.commands["status"].callback = talk\n'
+        'main.sys.argv[1:] = ["status"]\n'
+        'main.main()\n'
+    )
+    return ['env', *(f'{name}={value}' for name, value in environ.items()), sys.executable, '-c', script]
+
+
+@pytest.mark.parametrize('encoding', ['ascii', 'latin-1', 'cp1252', 'utf-8', 'utf-8:strict'])
+def test_output_that_the_terminal_cannot_hold_is_escaped(encoding: str) -> None:
+    """What an encoding does not have becomes its escape, in the output and in errors; nothing ends in a traceback."""
+    done = subprocess.run(printing(1, PYTHONIOENCODING=encoding, PYTHONUTF8='0'), capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b'')
+    if encoding != 'ascii':  # click takes it for a mistake, and writes UTF-8
+        first = done.stdout.splitlines()[0].decode(encoding.partition(':')[0])
+        assert first == ('巡 café \\ud800' if 'utf-8' in encoding else '\\u5de1 café \\ud800')
+
+
+@pytest.mark.parametrize('lines', [1, 100_000])
+def test_a_reader_that_goes_away_is_no_error(lines: int) -> None:
+    """``| head`` has enough: not a word on standard error, whether the rest was written meanwhile or is still in a buffer."""
+    with subprocess.Popen(printing(lines), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b''
+        assert process.wait(30) == ExitCode.FINDING
