@@ -32,6 +32,17 @@ class Body(Protocol):
     def read(self, size: int, /) -> bytes: ...
 
 
+class PacedBody:
+    """A body that is read once, from its start to its end: each ``read`` waits until its piece may leave."""
+
+    def __init__(self, pieces: Iterator[bytes]) -> None:
+        self._pieces = pieces
+
+    def read(self, _: int = -1, /) -> bytes:
+        """The next piece, of any size; empty at the end. Raises ConnectionAbortedError as ``Pace.pieces``."""
+        return next(self._pieces, b'')
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiter:
     """One body that wants to send its next piece."""
@@ -99,6 +110,10 @@ class Pace:
         """So many bytes left by a way that knows no cap."""
         with self._lock:
             self._sent_bytes += size
+
+    def body(self, body: bytes | Body, priority: int, *, stands_back: bool = False) -> PacedBody:
+        """The body as a file for an HTTP client: ``pieces`` of it, read once."""
+        return PacedBody(self.pieces(body, priority, stands_back=stands_back))
 
     def pieces(self, body: bytes | Body, priority: int, *, stands_back: bool = False) -> Iterator[bytes]:
         """The whole body, each piece when it may leave. Raises ConnectionAbortedError after a later ``abandon``.

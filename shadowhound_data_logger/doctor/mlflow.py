@@ -207,7 +207,7 @@ def _direct(location: str, context: Context) -> Iterator[Result]:
     try:
         with s3_put.single_requests(settings) as requests:
             item = s3_put.probe(url.netloc, key)
-            requests.put(item, s3_put.BODY, s3_put.crc32(s3_put.BODY), conditional=False)
+            requests.put(item, s3_put.BODY, conditional=False)
             b''.join(requests.content(url.netloc, key))
     except StoreError as problem:
         whose = 'this robot' if context.role is Role.THOR else 'this machine'

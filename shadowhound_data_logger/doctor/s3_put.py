@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import os
 import time
-import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -74,11 +73,11 @@ def write(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
 
     item = probe(bucket, key(robot))
     try:
-        sent = requests.put(item, BODY, crc32(BODY), conditional=True)
+        sent = requests.put(item, BODY, conditional=True)
         if sent is Sent.NOT_IMPLEMENTED:
-            requests.put(item, BODY, crc32(BODY), conditional=False)
+            requests.put(item, BODY, conditional=False)
         elif sent is Sent.CREATED:  # the first time; now it is there, and a condition that is honoured is refused
-            sent = requests.put(item, BODY, crc32(BODY), conditional=True)
+            sent = requests.put(item, BODY, conditional=True)
         body = b''.join(requests.content(bucket, item.key))
     except BucketMissing:
         yield missing_bucket(bucket, requests.endpoint)
@@ -128,7 +127,7 @@ def promises(requests: S3Requests, bucket: str, robot: str, latency_s: float) ->
         yield error(
             's3.checksum',
             'the server took an object whose CRC32 is wrong',
-            'it does not verify x-amz-checksum-crc32: what is damaged on its way would be confirmed',
+            'it does not verify x-amz-checksum-sha256: what is damaged on its way would be confirmed',
             'update the S3 server on Tower',
         )
     mbps = 8e-6 * size / max(took_s - latency_s, took_s / 2)
@@ -145,10 +144,10 @@ def promises(requests: S3Requests, bucket: str, robot: str, latency_s: float) ->
 def _damaged(requests: S3Requests, bucket: str, name: str, size: int) -> tuple[float, bool]:
     """Seconds that it took, and whether the server refused it."""
     body = os.urandom(size)
-    item = probe(bucket, name, body)
+    item = replace(probe(bucket, name, body), sha256=hashlib.sha256(b'another').hexdigest())
     began_s = time.perf_counter()
     try:
-        requests.put(item, body, crc32(b'another'), conditional=False)
+        requests.put(item, body, conditional=False)
         refused = False
     except (StoreUnavailable, ObjectRefused) as problem:
         if not problem.data.get('status'):  # no answer: a break that says nothing of checksums
@@ -172,8 +171,3 @@ def probe(bucket: str, name: str, body: bytes = BODY) -> SpooledObject:
         priority=0,
         created_ns=0,
     )
-
-
-def crc32(body: bytes) -> str:
-    """As S3 writes it: base64 of four big-endian bytes."""
-    return base64.b64encode(zlib.crc32(body).to_bytes(4, 'big')).decode('ascii')

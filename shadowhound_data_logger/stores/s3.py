@@ -1,7 +1,7 @@
 """An S3 server as a store.
 
-Guarantees: a put is one PUT with ``If-None-Match: *``, a CRC32 that the server verifies and ``sha256`` as metadata, and whether
-the server honours the condition is proved before it is relied on: MinIO before 2024 and some others ignore it and overwrite.
+Guarantees: a put is one PUT with ``If-None-Match: *`` and a SHA-256, which the server verifies and which is metadata as well.
+Whether the server honors the condition is verified before it is relied on: MinIO before 2024 and some others ignore it.
 Servers have let two creates of one instant through (SeaweedFS 4.16): where another writer of the same keys was seen, each put
 looks afterwards whose content is there, so that the one that was overwritten knows.
 Of a large object it is a multipart upload (s3_multipart.py), which looks twice and sends the condition as well.
@@ -9,13 +9,11 @@ Of a large object it is a multipart upload (s3_multipart.py), which looks twice 
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import logging
 import os
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
@@ -40,6 +38,8 @@ from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 STREAM_BYTES: Final = 4 << 20
 """Larger objects are read twice from the disk (hash, send) instead of once into memory, of which each thread takes so much."""
+LOOK_FIRST_BYTES: Final = 256 << 10
+"""Of a larger object it is asked first whether its key is taken: a round trip costs less than a body that is sent in vain."""
 BUCKET_PAUSE_S: Final = 10.0
 """A bucket that could not be created is not asked for again sooner: each of its objects would ask."""
 
@@ -160,25 +160,25 @@ class S3Store:
         return self._judge(item, self._s3.head(item.bucket, item.key))
 
     def _put_whole(self, item: SpooledObject) -> Put:
-        with _verified(item) as (body, crc32):
-            return self._put(item, body, crc32)
+        with _verified(item) as body:
+            return self._put(item, body)
 
-    def _put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> Put:
+    def _put(self, item: SpooledObject, body: bytes | IO[bytes]) -> Put:
         """One confirmed put; it looks before it leaps as long as the server's word on the condition is not proved."""
-        if self._condition is not _Condition.HONOURED:
+        if self._condition is not _Condition.HONOURED or item.size > LOOK_FIRST_BYTES:
             held = self._look(item)
             if held is not None:
                 return self._judge(item, held)
         conditional = self._condition is not _Condition.IGNORED
-        sent = self._s3.put(item, body, crc32, conditional=conditional)
+        sent = self._s3.put(item, body, conditional=conditional)
         if sent is Sent.NOT_IMPLEMENTED:
             self._learn(_Condition.IGNORED, 'does not know')
-            return self._put(item, body, crc32)  # which looks first now: it may have honoured the condition until this one
+            return self._put(item, body)  # which looks first now: it may have honoured the condition until this one
         if sent is Sent.TAKEN:
             self._learn(_Condition.HONOURED)
             return self._judge(item, self._s3.head(item.bucket, item.key))
         if self._condition is _Condition.UNPROVED:
-            self._prove(item, body, crc32)
+            self._prove(item, body)
         self._look_again(item)
         return Put.CREATED
 
@@ -201,10 +201,10 @@ class S3Store:
         if held is None or held.sha256 != item.sha256:
             self._judge(item, held)
 
-    def _prove(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str) -> None:
+    def _prove(self, item: SpooledObject, body: bytes | IO[bytes]) -> None:
         """Put the very same content once more: a server that takes it would have taken other content as well."""
         try:
-            sent = self._s3.put(item, body, crc32, conditional=True)
+            sent = self._s3.put(item, body, conditional=True)
         except StoreUnavailable as error:  # the put itself is confirmed; the next one will prove it
             _log.debug('the condition is not proved yet: %s', error)
             return
@@ -282,18 +282,12 @@ class S3Store:
 
 
 @contextmanager
-def _verified(item: SpooledObject) -> Iterator[tuple[bytes | IO[bytes], str]]:
-    """The content, checked against ``item``, and its CRC32 as S3 writes it (base64 of four big-endian bytes)."""
+def _verified(item: SpooledObject) -> Iterator[bytes | IO[bytes]]:
+    """The content, checked against ``item``."""
     if item.size <= STREAM_BYTES:
-        body = b''.join(chunks(item))
-        yield body, _base64(zlib.crc32(body))
+        yield b''.join(chunks(item))
         return
-    crc32 = 0
-    for chunk in chunks(item):
-        crc32 = zlib.crc32(chunk, crc32)
+    for _ in chunks(item):
+        pass
     with opened(item) as descriptor, os.fdopen(descriptor, 'rb', closefd=False) as file:
-        yield file, _base64(crc32)
-
-
-def _base64(crc32: int) -> str:
-    return base64.b64encode(crc32.to_bytes(4, 'big')).decode('ascii')
+        yield file

@@ -5,6 +5,7 @@ Stays inside the subset that MinIO, SeaweedFS and AWS share. An answer that did 
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from enum import Enum
@@ -13,6 +14,7 @@ from typing import Any, Final, TypeVar
 import botocore
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
+from botocore.handlers import add_expect_header
 from botocore.session import Session
 
 from shadowhound_data_logger.bandwidth import Body, Pace
@@ -23,8 +25,7 @@ from shadowhound_data_logger.stores.base import Content, changed_meanwhile, join
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
-from shadowhound_data_logger.stores.s3_http import AGENT, ContentRequests
-from shadowhound_data_logger.stores.s3_metadata import from_headers
+from shadowhound_data_logger.stores.s3_metadata import from_headers, to_headers
 
 OLDEST_BOTOCORE: Final = (1, 36)
 """The first with If-None-Match on PUT and the checksum settings; Debian's of Humble and Jazzy are older."""
@@ -34,7 +35,7 @@ CHANGED: Final = 412
 """It has another ETag than that which was asked for."""
 RANGE_NOT_SATISFIABLE: Final = 416
 """Nothing is behind the first byte that was asked for."""
-META: Final = 'x-amz-meta-'
+AGENT: Final = 'shadowhound-data-logger'
 
 _Asked = TypeVar('_Asked')
 
@@ -63,7 +64,6 @@ class S3Requests:
         self.pace = Pace(upload.max_mbps)
         self._keys: Keys | None = None
         self._client: Any = None
-        self._http: ContentRequests | None = None
 
     @property
     def generation(self) -> int:
@@ -74,22 +74,24 @@ class S3Requests:
         """Raises SettingError for an endpoint no request can be sent to, or a botocore that is too old."""
         if self._client is None:
             self._keys = Keys(self._settings)
-            self._client, trust = _client(session_with(self._keys), self._settings, self._upload)
-            self._http = ContentRequests(self._keys, trust, self._settings, self._upload, self.pace)
+            self._client = _client(session_with(self._keys), self._settings, self._upload)
 
     def close(self) -> None:
         client, self._client = self._client, None
-        http, self._http = self._http, None
         self.pace.abandon()
-        for held in (client, http):
-            if held is not None:
-                held.close()
+        if client is not None:
+            client.close()
 
-    def put(self, item: SpooledObject, body: bytes | Body, crc32: str, *, conditional: bool) -> Sent:
-        """One PUT; ``crc32`` in base64. Returns Sent.CREATED only when the server confirmed it."""
-        with self._asking(item.bucket, item.key, self._http) as sender:
+    def put(self, item: SpooledObject, body: bytes | Body, *, conditional: bool) -> Sent:
+        """One PUT, of which the server verifies the SHA-256. Returns Sent.CREATED only when the server confirmed it."""
+        checksum = b64encode(bytes.fromhex(item.sha256)).decode('ascii')
+        condition = {'IfNoneMatch': '*'} if conditional else {}
+        with self._asking(item.bucket, item.key, self._client) as client:
             try:
-                answer = sender.put(item, body, crc32, conditional=conditional)
+                answer = client.put_object(
+                    Bucket=item.bucket, Key=item.key, Body=self.pace.body(body, item.priority), ContentLength=item.size,
+                    ContentType=item.content_type, Metadata=to_headers(item), ChecksumSHA256=checksum, **condition,
+                )  # fmt: skip
             except ClientError as error:
                 if status_of(error) == 412:
                     return Sent.TAKEN
@@ -101,10 +103,14 @@ class S3Requests:
 
     def put_part(self, item: SpooledObject, upload: str, number: int, part: Part) -> str:
         """One part of a multipart upload, verified by the server; returns its ETag."""
-        with self._asking(item.bucket, item.key, self._http) as sender:
-            answer = sender.put_part(item, upload, number, part)
+        with self._asking(item.bucket, item.key, self._client) as client:
+            answer = client.upload_part(
+                Bucket=item.bucket, Key=item.key, UploadId=upload, PartNumber=number, ContentLength=part.size,
+                ContentMD5=b64encode(part.md5).decode('ascii'), Body=self.pace.body(part, item.priority, stands_back=True),
+            )  # fmt: skip
         self.confirm(answer, item.bucket, item.key)
-        return answer['ETag']
+        etag: str = answer['ETag']
+        return etag
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         with self._asking(bucket, key, self._client) as client:
@@ -133,9 +139,10 @@ class S3Requests:
 
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         """The object, or what of it is behind ``start``, in pieces. Raises ObjectRefused when there is none of that version."""
-        with self._asking(bucket, key, self._http) as http:
+        how = {**({'Range': f'bytes={start}-'} if start else {}), **({'IfMatch': version} if version else {})}
+        with self._asking(bucket, key, self._client) as client:
             try:
-                headers, body = http.get(bucket, key, f'bytes={start}-' if start else '', version=version)
+                answer = client.get_object(Bucket=bucket, Key=key, **how)
             except ClientError as error:
                 if version and status_of(error) == CHANGED:
                     raise changed_meanwhile(bucket, key) from error
@@ -145,33 +152,33 @@ class S3Requests:
                 if info is None:
                     raise
                 return Content(info, iter(()))
+            body = answer['Body']
             try:
-                size = self._whole_size(headers, bucket, key, start or None)
+                size = self._full_size(answer, bucket, key, start or None)
             except BaseException:
                 body.close()
                 raise
-            if version not in {'', headers['etag']}:  # of a server that does not know the condition
+            if version not in {'', answer['ETag']}:  # of a server that does not know the condition
                 body.close()
                 raise changed_meanwhile(bucket, key)
-        marked = {name.lower()[len(META) :]: value for name, value in headers.items() if name.lower().startswith(META)}
-        metadata = from_headers(marked)
-        kind = headers.get('content-type', '')
-        info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind, headers['etag'])
+        metadata = from_headers(answer.get('Metadata', {}))
+        kind = answer.get('ContentType', '')
+        info = ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, kind, answer['ETag'])
         return Content(info, self._pieces(bucket, key, body), body.close)
 
     def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
-        """The whole object and its ETag; None where that is ``version``."""
-        with self._asking(bucket, key, self._http) as http:
+        """The whole object and its ETag; None if that is ``version``."""
+        with self._asking(bucket, key, self._client) as client:
             try:
-                headers, body = http.get(bucket, key, unless=version)
+                answer = client.get_object(Bucket=bucket, Key=key, **({'IfNoneMatch': version} if version else {}))
             except ClientError as error:
                 if status_of(error) == NOT_MODIFIED:
                     return None
                 raise
-            with closing(body):
-                size = self._whole_size(headers, bucket, key, None)
+            with closing(answer['Body']) as body:
+                size = self._full_size(answer, bucket, key, None)
                 found = Content(ObjectInfo(bucket, key, size, None), self._pieces(bucket, key, body))
-                return joined(found, most), headers['etag']
+                return joined(found, most), answer['ETag']
 
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
         """One PUT with ``If-Match``; False where another version is there, or another put under way."""
@@ -187,15 +194,15 @@ class S3Requests:
 
     def range(self, bucket: str, key: str, begin: int, end: int) -> bytes:
         """From the first byte to before the last one; fewer where it ends before."""
-        with self._asking(bucket, key, self._http) as http:
+        with self._asking(bucket, key, self._client) as client:
             try:
-                headers, body = http.get(bucket, key, f'bytes={begin}-{end - 1}')
+                answer = client.get_object(Bucket=bucket, Key=key, Range=f'bytes={begin}-{end - 1}')
             except ClientError as error:
                 if status_of(error) == RANGE_NOT_SATISFIABLE:
                     return b''
                 raise
-            with closing(body):
-                self._whole_size(headers, bucket, key, begin)
+            with closing(answer['Body']) as body:
+                self._full_size(answer, bucket, key, begin)
                 return joined(Content(ObjectInfo(bucket, key, end - begin, None), self._pieces(bucket, key, body)), None)
 
     def list(self, bucket: str, prefix: str) -> Iterator[ObjectInfo]:
@@ -275,13 +282,13 @@ class S3Requests:
         with self._asking(bucket, key, body), closing(body):
             yield from body.iter_chunks(CHUNK_BYTES)
 
-    def _whole_size(self, headers: Mapping[str, str], bucket: str, key: str, first: int | None) -> int:
+    def _full_size(self, answer: Mapping[str, Any], bucket: str, key: str, first: int | None) -> int:
         """Of the object that an answer is about. Raises StoreUnavailable for an answer that no S3 server gave."""
-        self.confirm({'ETag': headers.get('etag')}, bucket, key)
-        told = headers.get('content-range', '')
-        if first is not None and not told.startswith(f'bytes {first}-'):
+        self.confirm(answer, bucket, key)
+        content_range = answer.get('ContentRange', '')
+        if first is not None and not content_range.startswith(f'bytes {first}-'):
             raise self._not_s3(bucket, key)
-        size = told.rpartition('/')[2] if told else headers.get('content-length', '')
+        size = content_range.rpartition('/')[2] if content_range else str(answer.get('ContentLength', ''))
         if not (size.isascii() and size.isdigit()):
             raise self._not_s3(bucket, key)
         return int(size)
@@ -309,12 +316,18 @@ class S3Requests:
             raise problem from error
 
 
-def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -> tuple[Any, str | bool]:
-    """A botocore client without retries of its own, since delivery decides when to try again, and whom it trusts."""
+def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -> Any:
+    """A botocore client without retries, since delivery decides when to try again.
+
+    Bodies are not part of the signature: each has a checksum in the signed headers instead, which the server verifies, so that a
+    body is read once, at its pace. They are sent without ``Expect: 100-continue``: botocore loops forever if the connection ends
+    within the server's ``100 Continue``.
+    """
     if tuple(int(part) for part in botocore.__version__.split('.')[:2]) < OLDEST_BOTOCORE:
         raise SettingError('botocore', botocore.__version__, 'version 1.36 or later (`pip install --upgrade boto3`)')
     config = Config(
-        signature_version='s3v4', s3={'addressing_style': 'path'}, retries={'mode': 'standard', 'total_max_attempts': 1},
+        signature_version='s3v4', s3={'addressing_style': 'path', 'payload_signing_enabled': False},
+        retries={'mode': 'standard', 'total_max_attempts': 1},
         connect_timeout=upload.connect_timeout_s, read_timeout=upload.read_timeout_s, tcp_keepalive=True,
         max_pool_connections=max(10, upload.threads), user_agent=AGENT, parameter_validation=False,
         request_checksum_calculation='when_required', response_checksum_validation='when_required',
@@ -329,7 +342,8 @@ def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -
     except BotoCoreError as error:
         raise SettingError('the AWS configuration', type(error).__name__, f'one that botocore can read: {error}') from error
     client.meta.events.register_last('before-parameter-build.s3', _follow_no_redirect)
-    return client, trust
+    client.meta.events.unregister('before-call.s3', add_expect_header)
+    return client
 
 
 def _follow_no_redirect(context: dict[str, Any], **_: Any) -> None:

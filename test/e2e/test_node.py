@@ -124,18 +124,13 @@ def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
     ('parameters', 'words'),
     [
         ({'camera.rate_hertz': 2.0}, ('camera.rate_hertz = 2.0', 'camera.enabled', 'camera.rate_hz')),
-        ({'intake.poll_s': 0.1}, ('intake.poll_s = 0.1: this parameter no longer exists', 'remove it: topics are drained')),
-        (
-            {'imu.batch_count': 10},
-            ('imu.batch_count = 10: this parameter no longer exists', 'imu.batch_s limits an object in time'),
-        ),
         ({'queue.max_bytes': 17}, ('queue.max_bytes = 17', 'at least')),
         ({'imu.topics': ['no topic!']}, ("imu.topics = ['no topic!']", 'valid topic names')),
         ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'valid topic')),
         ({'imu.topics': ['/odom']}, ("odom.topics = ['odom']", '/odom is in imu.topics already')),
         ({'robot': '../x'}, ("robot = '../x'", 'letters, digits')),
     ],
-    ids=['unknown', 'gone', 'gone of a sensor', 'range', 'topic name', 'condition', 'topic twice', 'robot'],
+    ids=['unknown', 'range', 'topic name', 'condition', 'topic twice', 'robot'],
 )
 def test_a_wrong_parameter_refuses_the_start(processes: Processes, parameters: dict[str, Any], words: tuple[str, ...]) -> None:
     """Exit code 2, and one line with the name, its value and what is allowed; nothing is left behind."""

@@ -87,9 +87,8 @@ class Line:
     def close(self) -> None:
         """Nothing to release."""
 
-    def put(self, item: SpooledObject, body: bytes | IO[bytes], crc32: str, *, conditional: bool) -> Sent:
+    def put(self, item: SpooledObject, body: bytes | IO[bytes], *, conditional: bool) -> Sent:
         assert isinstance(body, bytes)
-        assert crc32
         info = ObjectInfo(item.bucket, item.key, len(body), item.sha256, object_metadata(item), item.content_type)
 
         def reach(fault: Fault) -> Sent:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from faults.front import Front
@@ -72,9 +73,9 @@ def item(tmp_path: Path) -> SpooledObject:
 
 def taken(front: Front, item: SpooledObject) -> list[int]:
     """Numbers of the parts that the server took, in order, repeats among them."""
-    start = f'/{BUCKET}/{item.key}?partNumber='
-    found = [(path, len(hashes)) for path, hashes in front.stored.items() if path.startswith(start)]
-    return sorted(number for path, count in found for number in [int(path.removeprefix(start).partition('&')[0])] * count)
+    found = [(urlsplit(path), len(hashes)) for path, hashes in front.stored.items()]
+    numbers = [(parse_qs(url.query).get('partNumber'), count) for url, count in found if url.path == f'/{BUCKET}/{item.key}']
+    return sorted(int(number[0]) for number, count in numbers if number for _ in range(count))
 
 
 def delivered(store: S3Store, item: SpooledObject) -> Put:

@@ -16,8 +16,7 @@ from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LATE_S, PIECE_S
 from shadowhound_data_logger.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
 from shadowhound_data_logger.model import Put
-from shadowhound_data_logger.stores.s3 import S3Store
-from shadowhound_data_logger.stores.s3_http import UNASKED_BYTES
+from shadowhound_data_logger.stores.s3 import LOOK_FIRST_BYTES, S3Store
 
 
 class Wire(ThreadingHTTPServer):
@@ -28,13 +27,11 @@ class Wire(ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(('127.0.0.1', 0), _Handler)
         self.arrivals: list[tuple[float, int]] = []
-        self.asked: list[bool] = []
-        """For each PUT whether the client waited for leave to send its body."""
         self.broken = 0
         self.answers: list[int] = []
         """Statuses of the next PUTs; then 200, or 412 for a key that is there."""
-        self.refuse_early = False
-        """Whether it holds other content under every key and says so before it has read a body."""
+        self.is_full = False
+        """Whether it holds other content under every key."""
         self.keys: set[str] = set()
 
     def handle_error(self, *_: object) -> None:
@@ -44,18 +41,6 @@ class Wire(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = 'HTTP/1.1'
     server: Wire
-
-    def handle_expect_100(self) -> bool:
-        self.server.asked[-1:] = [True]
-        if self.server.refuse_early:
-            self._answer(412, error('PreconditionFailed'))
-            return False
-        return super().handle_expect_100()
-
-    def parse_request(self) -> bool:
-        if self.raw_requestline.startswith(b'PUT'):
-            self.server.asked.append(False)
-        return super().parse_request()
 
     def do_PUT(self) -> None:
         left = int(self.headers['Content-Length'])
@@ -75,7 +60,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(status, error('PreconditionFailed' if status == 412 else 'SlowDown'))
 
     def do_HEAD(self) -> None:
-        if self.server.refuse_early:
+        if self.server.is_full:
             self._answer(200, b'', {**etag(b''), 'x-amz-meta-sha256': 'another'})
         else:
             self._answer(404, b'')
@@ -117,7 +102,6 @@ def proved(wire: Wire, spool: Spool) -> Iterator[S3Store]:
     store = opened(wire)
     store.put(spool('first', b'first'))
     wire.arrivals.clear()
-    wire.asked.clear()
     yield store
     store.close()
 
@@ -157,22 +141,21 @@ def test_what_is_counted_is_what_left(wire: Wire, spool: Spool, proved: S3Store)
     away.close()
 
 
-@pytest.mark.parametrize(('size', 'asks'), [(0, False), (1, False), (UNASKED_BYTES, False), (UNASKED_BYTES + 1, True)])
-def test_only_a_large_body_waits_for_leave(wire: Wire, spool: Spool, proved: S3Store, size: int, asks: bool) -> None:
-    """It costs a round trip, which a small body is not worth."""
+@pytest.mark.parametrize('size', [0, 1, LOOK_FIRST_BYTES, LOOK_FIRST_BYTES + 1])
+def test_a_body_of_any_size_arrives(wire: Wire, spool: Spool, proved: S3Store, size: int) -> None:
+    """Complete, and counted once."""
     assert proved.put(spool(f'{size}', bytes(size))) is Put.CREATED
-    assert wire.asked == [asks]
     assert sum(count for _, count in wire.arrivals) == size
 
 
 @pytest.mark.parametrize('max_mbps', [0.0, 0.1])
 def test_a_large_body_that_is_refused_stays_here(wire: Wire, spool: Spool, proved: S3Store, max_mbps: float) -> None:
     """The server says so before anything of it left, and nothing of it counts: it takes none of the time under a cap."""
-    wire.refuse_early = True
+    wire.is_full = True
     proved.pace.set(max_mbps)
     counted, began = proved.pace.sent_bytes, time.monotonic()
     with pytest.raises(ForeignObject):
-        proved.put(spool('there', bytes(4 * UNASKED_BYTES)))
+        proved.put(spool('there', bytes(4 * LOOK_FIRST_BYTES)))
     assert wire.arrivals == []
     assert proved.pace.sent_bytes == counted
     assert time.monotonic() - began < 60.0  # at this cap it would be 84 s
