@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
@@ -15,6 +18,9 @@ from missions.agent import jpeg
 from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.stores import open_store
 
 pytestmark = pytest.mark.seaweedfs
 
@@ -70,6 +76,144 @@ class MissionExecutor:
         except Exception as e:
             self.data_logger.end_mission(success=False, distance_m=0, duration_s=0)
             raise
+"""
+LOGGER: Final = '''
+# mission_data_logger.py (integrated with mission_agent)
+import mlflow
+import boto3
+import os
+from datetime import datetime
+
+class MissionDataLogger:
+    """Logs mission data to Tower MLflow + MinIO."""
+
+    def __init__(self):
+        # Configure MLflow
+        mlflow.set_tracking_uri(os.getenv('MLFLOW_TRACKING_URI'))  # http://TOWER_IP:5001
+
+        # Configure S3 for MLflow artifacts
+        os.environ['MLFLOW_S3_ENDPOINT_URL'] = os.getenv('AWS_ENDPOINT_URL')
+
+        self.s3 = boto3.client(
+            's3',
+            endpoint_url=os.getenv('AWS_ENDPOINT_URL'),
+            aws_access_key_id=os.getenv('AWS_ACCESS_KEY_ID'),
+            aws_secret_access_key=os.getenv('AWS_SECRET_ACCESS_KEY')
+        )
+
+        self.current_run = None
+
+    def start_mission(self, mission_type: str, mission_command: str):
+        """Start logging a new mission."""
+        experiment_name = "thor_missions"
+
+        # Get or create experiment
+        try:
+            experiment = mlflow.get_experiment_by_name(experiment_name)
+            experiment_id = experiment.experiment_id
+        except:
+            experiment_id = mlflow.create_experiment(experiment_name)
+
+        # Start MLflow run
+        run_name = f"{mission_type}_{datetime.now().strftime('%Y%m%d_%H%M%S')}"
+        self.current_run = mlflow.start_run(
+            experiment_id=experiment_id,
+            run_name=run_name
+        )
+
+        # Log mission parameters
+        mlflow.log_param("mission_type", mission_type)
+        mlflow.log_param("mission_command", mission_command)
+        mlflow.log_param("robot", "thor")
+        mlflow.log_param("timestamp", datetime.now().isoformat())
+
+        return self.current_run.info.run_id
+
+    def log_camera_frame(self, frame_data: bytes, frame_id: int):
+        """Log camera frame to MinIO and reference in MLflow."""
+        if not self.current_run:
+            return
+
+        # Upload to MinIO
+        s3_key = f"thor/missions/{self.current_run.info.run_id}/camera/frame_{frame_id:06d}.jpg"
+        self.s3.put_object(
+            Bucket='sensor-data',
+            Key=s3_key,
+            Body=frame_data,
+            ContentType='image/jpeg'
+        )
+
+        # Log artifact path in MLflow
+        mlflow.log_metric(f"camera_frame_{frame_id}", 1.0, step=frame_id)
+
+    def log_robot_state(self, battery_pct: float, temperature_c: float, step: int):
+        """Log robot state metrics to MLflow."""
+        if not self.current_run:
+            return
+
+        mlflow.log_metric("battery_pct", battery_pct, step=step)
+        mlflow.log_metric("temperature_c", temperature_c, step=step)
+
+    def log_trajectory(self, trajectory_csv_path: str):
+        """Upload trajectory CSV as MLflow artifact."""
+        if not self.current_run:
+            return
+
+        mlflow.log_artifact(trajectory_csv_path, artifact_path="trajectories")
+
+    def end_mission(self, success: bool, distance_m: float, duration_s: float):
+        """End mission logging."""
+        if not self.current_run:
+            return
+
+        # Log final metrics
+        mlflow.log_metric("success", 1.0 if success else 0.0)
+        mlflow.log_metric("distance_traveled_m", distance_m)
+        mlflow.log_metric("duration_s", duration_s)
+
+        # End MLflow run
+        mlflow.end_run()
+        self.current_run = None
+'''
+TRAINING: Final = """
+# train_navigation_policy.py (on Spark DGX)
+import boto3
+import mlflow
+import torch
+import os
+
+# Configure Tower access
+os.environ['MLFLOW_TRACKING_URI'] = 'http://TOWER_IP:5001'
+os.environ['AWS_ENDPOINT_URL'] = 'http://TOWER_IP:9000'
+
+# Download training data from MinIO
+s3 = boto3.client(
+    's3',
+    endpoint_url=os.getenv('AWS_ENDPOINT_URL'),
+    aws_access_key_id=os.getenv('AWS_ACCESS_KEY_ID'),
+    aws_secret_access_key=os.getenv('AWS_SECRET_ACCESS_KEY')
+)
+
+# Download all camera images from thor missions
+paginator = s3.get_paginator('list_objects_v2')
+for page in paginator.paginate(Bucket='sensor-data', Prefix='thor/camera/'):
+    for obj in page.get('Contents', []):
+        s3.download_file('sensor-data', obj['Key'], f"/data/{obj['Key']}")
+
+# Train model
+mlflow.set_experiment("navigation_policy_training")
+with mlflow.start_run(run_name="resnet50_v1"):
+    mlflow.log_param("architecture", "resnet50")
+    mlflow.log_param("dataset", "thor_camera_20251018")
+
+    model = train_model()  # Your training code
+
+    # Save checkpoint
+    torch.save(model.state_dict(), "checkpoint_1000.pth")
+    mlflow.log_artifact("checkpoint_1000.pth", artifact_path="checkpoints")
+
+    mlflow.log_metric("train_loss", 0.032)
+    mlflow.log_metric("val_accuracy", 0.94)
 """
 QUERY: Final = """
 import mlflow
@@ -151,6 +295,100 @@ def test_the_guide_s_executor_and_query(
         assert f'Run ID: {run_id}\n  Command: {command}\n  Distance: {distance} m\n  Success: {success}\n' in said
     run_id = server.run('patrol by the guide').info.run_id
     assert {'camera/frame_000000.jpg', 'trajectories/trajectory.csv', 'trajectory.png'} <= server.artifacts(run_id)
+
+
+RUN_LOGGER: Final = """
+import io, sys
+from pathlib import Path
+names = {}
+exec(sys.argv[1], names)
+logger = names['MissionDataLogger']()
+run_id = logger.start_mission('patrol', sys.argv[2])
+logger.log_camera_frame(b'a frame', 7)
+logger.log_robot_state(88.0, 41.5, 0)
+Path('trajectory.csv').write_text('timestamp,x,y,yaw')
+logger.log_trajectory('trajectory.csv')
+logger.end_mission(True, 12.5, 60.0)
+print(run_id)
+"""
+"""What calls the guide's own sketch, in a process of its own: MLflow's fluent client leaves threads behind."""
+RUN_TRAINING: Final = """
+import sys, types
+torch = types.ModuleType('torch')
+torch.save = lambda state, path: open(path, 'w').write(state)
+sys.modules['torch'] = torch
+model = types.SimpleNamespace(state_dict=lambda: 'weights')
+exec(sys.argv[1], {'train_model': lambda: model})
+"""
+"""The training itself is left out: torch stands for its one call."""
+
+
+def in_a_process(program: str, *arguments: str, folder: Path, **environ: str) -> subprocess.CompletedProcess[str]:
+    command, env = [sys.executable, '-c', program, *arguments], {**os.environ, **environ}
+    return subprocess.run(command, env=env, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def store(server: Server, folder: Path, objects: Mapping[str, bytes]) -> None:
+    """Put them into the bucket of the robot's data, which is made where it does not exist."""
+    with closing(open_store(server.tower.store_settings(), UploadSettings())) as opened:
+        for number, (key, content) in enumerate(objects.items()):
+            path, sha256 = folder / f'{number}.jpg', hashlib.sha256(content).hexdigest()
+            path.write_bytes(content)
+            opened.put(SpooledObject(id=number, bucket='sensor-data', key=key, path=path, size=len(content), sha256=sha256,
+                                     content_type='image/jpeg', metadata={}, priority=1, created_ns=0))  # fmt: skip
+
+
+@pytest.mark.long('a process that loads MLflow')
+def test_the_guide_s_own_logger(server: Server, tmp_path: Path) -> None:
+    """The sketch that this package replaces runs against the same Tower, and the guide's query finds its missions as well."""
+    store(server, tmp_path, {'thor/camera/20251018/120000_front.jpg': jpeg(120000)})
+    tracking = server.tower.tracking('thor')
+    done = in_a_process(RUN_LOGGER, LOGGER, 'patrol by the sketch', folder=tmp_path, **tracking)
+    assert not done.returncode, done.stderr
+    run_id = done.stdout.split()[-1]
+    run = server.run('patrol by the sketch')
+    assert run.info.run_id == run_id
+    assert {name: run.data.metrics[name] for name in ('success', 'distance_traveled_m', 'duration_s', 'camera_frame_7')} == {
+        'success': 1.0, 'distance_traveled_m': 12.5, 'duration_s': 60.0, 'camera_frame_7': 1.0,
+    }  # fmt: skip
+    assert server.artifacts(run_id) == {'trajectories/trajectory.csv'}
+    assert server.keys(f'thor/missions/{run_id}') == {f'thor/missions/{run_id}/camera/frame_000007.jpg': 1}
+    done = in_a_process('import sys; exec(sys.argv[1])', QUERY.replace('http://TOWER_IP:5001', server.tower.tracking_uri),
+                        folder=tmp_path, **tracking)  # fmt: skip
+    assert not done.returncode, done.stderr
+    assert f'Run ID: {run_id}\n  Command: patrol by the sketch\n  Distance: 12.5 m\n  Success: 1.0\n' in done.stdout
+
+
+@pytest.mark.long('a process that loads MLflow')
+def test_the_guide_s_training_script(server: Server, tmp_path: Path) -> None:
+    """It downloads what the robot stored into folders that must be there, and logs a run; docs/lake.md says which folders."""
+    spark = {**server.tower.environment('spark'), **server.tower.tracking('spark')}
+    frames = {f'thor/camera/20251018/{second:06d}_front.jpg': jpeg(second) for second in (120000, 120001)}
+    store(server, tmp_path, frames)
+    data, work = tmp_path / 'data', tmp_path / 'work'
+    work.mkdir()
+    script = TRAINING.replace('http://TOWER_IP:5001', server.tower.tracking_uri)
+    script = script.replace('http://TOWER_IP:9000', server.tower.endpoint_url).replace('/data/', f'{data}/')
+    done = in_a_process(RUN_TRAINING, script, folder=work, **spark)
+    assert 'FileNotFoundError' in done.stderr, 'boto3 makes no folders'
+    for key in server.keys('thor/camera/'):
+        (data / key).parent.mkdir(parents=True, exist_ok=True)
+    done = in_a_process(RUN_TRAINING, script, folder=work, **spark)
+    assert not done.returncode, done.stderr
+    assert {key: (data / key).read_bytes() for key in frames} == frames
+    done = in_a_process(TRAINED, server.tower.tracking_uri, folder=work, **spark)
+    assert done.stdout.split() == ['resnet50', '0.032', '0.94', 'checkpoints/checkpoint_1000.pth'], done.stderr
+
+
+TRAINED: Final = """
+import sys
+from mlflow import MlflowClient
+client = MlflowClient(sys.argv[1])
+experiment = client.get_experiment_by_name('navigation_policy_training')
+run = client.search_runs([experiment.experiment_id])[0]
+(artifact,) = client.list_artifacts(run.info.run_id, 'checkpoints')
+print(run.data.params['architecture'], run.data.metrics['train_loss'], run.data.metrics['val_accuracy'], artifact.path)
+"""
 
 
 @pytest.mark.long('a program of many imports that walks for seconds')
