@@ -23,6 +23,8 @@ MAX_FILE_NAME_BYTES: Final = 255
 """Of Linux' file systems."""
 MOST_DOCUMENT_BYTES: Final = 16 << 20
 """Of JSON that is read whole: a manifest of a day in slices of a minute has 2 MB. Python needs up to 24 times as much for it."""
+MOST_JSON_DEPTH: Final = 64
+"""Of JSON. Whoever reads a document may go into it by recursion, which Python ends at a depth of 1,000 or less."""
 MOST_SUMMARY_BYTES: Final = 1 << 20
 """Of a mission's ``summary.json``."""
 MOST_YAML_BYTES: Final = 4 << 20
@@ -40,6 +42,7 @@ MOST_PIXELS: Final = 1 << 25
 """Of a picture: 8K."""
 MOST_MEMBERS: Final = 20_000
 """Files in an archive, two a message: it is closed after 10,000 of them."""
+_TOO_DEEP: Final = f'it is deeper than {MOST_JSON_DEPTH} lists and objects in one another'
 _FORMULA: Final = frozenset('=+-@＝＋－＠')
 _NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
@@ -112,18 +115,32 @@ def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
     """Raises ValueError, also for a document that is too large or too deep."""
     check_size(len(content), most)
     try:
-        return json.loads(content)
+        return shallow(json.loads(content))
     except RecursionError:
-        raise ValueError('it is too deep') from None
+        raise ValueError(_TOO_DEEP) from None
 
 
 def from_strict_json(content: bytes, most: int) -> Any:
     """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for NaN."""
     check_size(len(content), most)
     try:
-        return json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number)
+        return shallow(json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number))
     except RecursionError:
-        raise ValueError('it is too deep') from None
+        raise ValueError(_TOO_DEEP) from None
+
+
+def shallow(document: Any) -> Any:
+    """The same value of JSON. Raises ValueError for one whose lists and objects lie in one another more than 64 times."""
+    level, depth = [document], 0
+    while level:
+        if depth >= MOST_JSON_DEPTH:
+            raise ValueError(_TOO_DEEP)
+        depth += 1
+        level = [
+            each for one in level if isinstance(one, (dict, list)) for each in (one.values() if isinstance(one, dict) else one)
+            if isinstance(each, (dict, list))
+        ]  # fmt: skip
+    return document
 
 
 def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

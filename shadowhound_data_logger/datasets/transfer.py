@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import mimetypes
 import re
 import time
@@ -20,7 +19,7 @@ from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import download
-from shadowhound_data_logger.untrusted import path_below
+from shadowhound_data_logger.untrusted import from_json, path_below
 
 SCHEME: Final = 's3://'
 BUCKET: Final = 'lerobot'
@@ -169,7 +168,7 @@ def catch_up(place: DatasetPlace, folder: Path, store: ObjectStore, say: Callabl
 def _digests(body: bytes) -> list[str]:
     """Raises LakeError."""
     try:
-        return [str(each['digest']) for each in json.loads(body)['digests']]
+        return [str(each['digest']) for each in from_json(body)['digests']]
     except (ValueError, LookupError, TypeError) as error:
         raise LakeError(f'{DIGESTS} of a data set cannot be read: {error}') from error
 

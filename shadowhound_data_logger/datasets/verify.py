@@ -31,7 +31,7 @@ from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import is_path
+from shadowhound_data_logger.untrusted import from_json, is_path
 
 THREADS: Final = 16
 FRAMES: Final = 5
@@ -193,7 +193,7 @@ class Seen:
 def seen_in_folder(folder: Path, key: str) -> Seen | None:
     """Raises LakeError for a folder that is none of ours."""
     try:
-        return _seen(str(folder), pq.read_table(folder / SOURCE_TABLE), json.loads((folder / DIGESTS).read_text()), key)
+        return _seen(str(folder), pq.read_table(folder / SOURCE_TABLE), from_json((folder / DIGESTS).read_bytes()), key)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise LakeError(f'{folder} is no data set of this program: {error}') from error
 
@@ -202,7 +202,7 @@ def seen_in_store(source: Bucket, place: DatasetPlace, key: str) -> Seen | None:
     """Raises StoreError, LakeError."""
     try:
         body = source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES)
-        told = json.loads(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
+        told = from_json(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
         return _seen(str(place), pq.read_table(io.BytesIO(body)), told, key)
     except (ValueError, pa.ArrowException) as error:
         raise LakeError(f'{place} is no data set of this program: {error}') from error

@@ -19,7 +19,7 @@ import orjson
 import simplejpeg
 
 from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image
+from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -167,7 +167,7 @@ def records(body: bytes) -> list[dict[str, Any]]:
     """The samples of a batch, or the one document as a list. Raises LakeError."""
     try:
         check_size(len(body), _MOST_JSON_BYTES)
-        document = orjson.loads(body)
+        document = shallow(orjson.loads(body))
         found = document.get('samples', [document])
         if not all(isinstance(each, dict) and _is_stamp(each['stamp_ns']) for each in found):
             raise ValueError('a sample has no stamp')
@@ -188,7 +188,7 @@ def _members(files: dict[str, bytes]) -> Iterator[ArchiveMember]:
     contents = {name.partition('.')[0]: name for name in files if not name.endswith('.json')}
     for name, body in files.items():
         if name.endswith('.json'):
-            told = orjson.loads(body)
+            told = shallow(orjson.loads(body))
             if not isinstance(told, dict) or not _is_stamp(told['stamp_ns']):
                 raise ValueError(f'{name} has no stamp')
             holder = told.get('repeat_of') or contents[name[:-5]]

@@ -5,7 +5,11 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import socket
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -452,3 +456,62 @@ def test_a_silent_connection_is_closed(tower: Tower, said: bytes) -> None:
                 continue
             except OSError:
                 break
+
+
+def _asgi_routes() -> list[tuple[str, str]]:
+    """Method and path of each route that MLflow serves beside Flask, whose paths Flask's check never sees."""
+    program = """
+import json
+from mlflow.server import app, fastapi_app
+for one in fastapi_app.create_fastapi_app(app).routes:
+    router = getattr(one, 'original_router', None)
+    for route in router.routes if router is not None else ():
+        for method in getattr(route, 'methods', None) or ['WEBSOCKET']:
+            print(json.dumps([method, one.include_context.prefix + route.path]))
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        environ = {name: value for name, value in os.environ.items() if not name.startswith(('MLFLOW_', '_MLFLOW_'))}
+        environ['_MLFLOW_SERVER_FILE_STORE'] = f'sqlite:///{folder}/a.db'
+        said = subprocess.run([sys.executable, '-c', program], env=environ, check=True, capture_output=True, text=True).stdout
+    return [(str(method), str(path)) for method, path in map(json.loads, said.splitlines())]
+
+
+@pytest.mark.long('imports all of MLflow')
+def test_no_route_beside_flask_opens(users: dict[str, User]) -> None:
+    """Each that this version has is refused to strangers, robots and Spark, however a robot spells its path."""
+    routes = _asgi_routes()
+    assert {'/v1/traces', '/gateway/proxy/{endpoint_name}/{path:path}'} < {path for _, path in routes}
+    assert len(routes) > 60
+    assert 'WEBSOCKET' not in {method for method, _ in routes}
+    public = {'/health', '/ajax-api/3.0/mlflow/server-info', '/api/3.0/mlflow/server-info'}
+    opened = []
+    for method, route in routes:
+        path = re.sub(r'\{[^}]*\}', 'x', route)
+        if route in public:
+            continue
+        spellings = [path, f'/{path}', f'{path}/', path.replace('/', '//', 2)[1:], f'/x/..{path}', path.replace('/', '/%2e/', 1),
+                     path.replace('gateway', 'Gateway').replace('api', '%61pi')]  # fmt: skip
+        for name in ('', 'thor', 'spark'):
+            for spelling in spellings if name == 'thor' else [path]:
+                status = users[name].status(method, spelling, None if method == 'GET' else b'{}')
+                if status < 400:
+                    opened.append((name, method, spelling, status))
+    assert opened == []
+
+
+@pytest.mark.parametrize('name', ['', 'thor', 'spark'])
+def test_nobody_has_the_server_fetch_an_address(users: dict[str, User], name: str) -> None:
+    """No webhook, no gateway's secret or endpoint, no scorer: whatever would have the server ask another one is refused."""
+    url = 'http://169.254.169.254/latest/meta-data/'
+    asked = [
+        ('POST', '/api/2.0/mlflow/webhooks', {'name': 'x', 'url': url, 'events': [{'entity': 'RUN', 'action': 'CREATED'}]}),
+        ('POST', '/api/2.0/mlflow/webhooks/test', {'webhook_id': '1'}),
+        ('POST', '/api/3.0/mlflow/gateway/secrets/create', {'secret_name': 'x', 'secret_value': {'api_base': url}}),
+        ('POST', '/ajax-api/3.0/mlflow/gateway/endpoints/create', {'name': 'x'}),
+        ('POST', '/ajax-api/3.0/mlflow/scorer/invoke', {'experiment_id': '1', 'serialized_scorer': '{}'}),
+        ('POST', '/ajax-api/2.0/mlflow/gateway-proxy', {'gateway_path': url}),
+        ('GET', f'/ajax-api/2.0/mlflow/gateway-proxy?gateway_path={url}', None),
+        ('PUT', '/ajax-api/3.0/mlflow/assistant/config', {'providers': {'x': {'base_url': url}}}),
+    ]  # fmt: skip
+    for method, path, body in asked:
+        assert users[name].status(method, path, body) in {401, 403}, path
