@@ -6,6 +6,7 @@ Where it contradicts them about the bag as a whole, that is a remark.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
 from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
 from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_summary, scan
+from shadowhound_data_logger.mcap.index import DATA_END_BYTES, McapIndex, check_crcs, read_end, read_summary, scan
 from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -209,25 +210,27 @@ def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileChe
 
 
 def _check_content(source: Ranged, expected: _Expected, deep: bool, told: Telling) -> FileCheck:
-    """Reads all of it once; ``deep`` unpacks every chunk on the way, which checks its CRC-32, and counts."""
+    """Reads all of it once; ``deep`` unpacks every chunk on the way, checks every CRC-32, and counts."""
     once = _Once(source, told)
     checked, info = 'content' if expected.sha256 else 'size', None
-    if expected.name.endswith(MCAP):
+    if expected.name.endswith(MCAP) and deep:
+        checked += ' and chunks'
         try:
-            index = read_index(source)
-            info = index.info(Path(source.name), source.size)
-            if deep:
-                checked += ' and chunks'
-                finding = _difference(scan(once, index.data_end), index, expected)
-                if finding:
-                    return FileCheck(expected.name, finding, checked)
+            summary, data_end = read_end(source)
+            once.crc_end = data_end - DATA_END_BYTES
+            counted = scan(once, data_end)
+            info = counted.info(Path(source.name), source.size)
+            if counted.data_end == data_end:
+                return FileCheck(expected.name, 'has no record that ends its data', checked)
+            if finding := _difference(counted, summary or counted, expected):
+                return FileCheck(expected.name, finding, checked)
+            once.rest()
+            check_crcs(source, data_end, once.crc)
         except BagDamaged as error:
             return FileCheck(expected.name, reason(error, source.name), checked)
     found = once.rest()
     if expected.sha256 and found != expected.sha256:
         return FileCheck(expected.name, f'has content of the SHA-256 {found}, {expected.sha256} was recorded', checked)
-    if info is not None and expected.messages not in {None, info.messages}:
-        return FileCheck(expected.name, f'has {info.messages:,} messages, {expected.messages:,} were recorded', checked)
     return FileCheck(expected.name, '', checked, info)
 
 
@@ -236,7 +239,7 @@ def _difference(counted: McapIndex, index: McapIndex, expected: _Expected) -> st
     promised = index.messages if expected.messages is None else expected.messages
     if counted.messages != promised:
         return f'has {counted.messages:,} messages, {promised:,} were recorded'
-    if counted.counts != index.counts or dict(counted.channels) != {each: index.channels[each] for each in counted.channels}:
+    if counted.counts != index.counts or any(counted.channels[each] != index.channels[each] for each in counted.counts):
         return 'has other channels, or other numbers of messages on them, than its summary'
     if (counted.t_start_ns, counted.t_end_ns) != (index.t_start_ns, index.t_end_ns):
         return 'has messages of other times than its summary'
@@ -253,6 +256,8 @@ class _Once:
         self._told = told
         self._digest = sha256_new()
         self._at = 0
+        self.crc, self.crc_end = 0, 0
+        """Of the bytes before ``crc_end``, when it is read beyond."""
 
     def read(self, start: int, length: int) -> bytes:
         while self._at < start:
@@ -260,6 +265,8 @@ class _Once:
         assert start == self._at, 'out of order'
         found = self._source.read(start, length)
         self._digest.update(found)
+        if start < self.crc_end:
+            self.crc = zlib.crc32(found[: self.crc_end - start], self.crc)
         self._at += length
         self._told(length)
         return found

@@ -181,7 +181,7 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
 
 
 @bag.command('verify', epilog=examples('bag verify patrol_20251018_120000 --deep'))
-@click.option('--deep', is_flag=True, help='Read every byte: content against checksums, and the CRC of every chunk.')
+@click.option('--deep', is_flag=True, help='Read every byte: checksums, every CRC, and the summary against the messages.')
 @_bag_or_folder
 @_robot
 @as_json

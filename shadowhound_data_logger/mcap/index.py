@@ -33,6 +33,8 @@ from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
 
 FOOTER_BYTES: Final = 20
 TAIL_BYTES: Final = RECORD.size + FOOTER_BYTES + len(MAGIC)
+_DATA_END: Final = struct.Struct('<BQI')
+DATA_END_BYTES: Final = _DATA_END.size
 FIRST_READ: Final = 64 << 10
 """From the end: the whole summary of most slices, so that one request does."""
 MOST_SUMMARY_BYTES: Final = 64 << 20
@@ -86,7 +88,7 @@ class McapIndex:
     metadata: tuple[str, ...]
     """The names of its metadata records; empty where the summary has their number alone, or nothing."""
     data_end: int
-    """Where the messages end."""
+    """Where the messages end: with the record for that, if it was read."""
 
     def info(self, path: Path, size: int, sha256: str = '') -> SliceInfo:
         """The same without places."""
@@ -162,14 +164,34 @@ def read_index(source: Ranged) -> McapIndex:
 
     Raises BagDamaged for a file that is not a complete MCAP file.
     """
-    summary, data_end = _read_summary(source)
-    return _index(summary, data_end, source) or scan(source, data_end)
+    found, data_end = read_end(source)
+    return scan(source, data_end) if found is None else found
 
 
 def read_summary(source: Ranged) -> McapIndex | None:
     """By the summary alone; None if it does not have everything, including the place of each chunk. Raises BagDamaged."""
-    found = _index(*_read_summary(source), source)
+    found, _ = read_end(source)
     return found if found is not None and found.chunks is not None else None
+
+
+def read_end(source: Ranged) -> tuple[McapIndex | None, int]:
+    """What the summary has, if it has the counts of every channel, and where the data ends. Raises BagDamaged."""
+    summary, data_end = _read_summary(source)
+    return _index(summary, data_end, source), data_end
+
+
+def check_crcs(source: Ranged, data_end: int, data_crc: int) -> None:
+    """Raises BagDamaged if the CRC-32 of the summary, or of the data (``data_crc``), is not the one in the file; 0 is none.
+
+    That of the data is of everything before the ``DATA_END_BYTES`` that end it, unless these have extra bytes.
+    """
+    tail = source.read(data_end - DATA_END_BYTES, source.size - len(MAGIC) - data_end + DATA_END_BYTES)
+    kind, length, wanted = _DATA_END.unpack_from(tail)
+    if (kind, length) == (Opcode.DATA_END, 4) and wanted not in {0, data_crc}:
+        raise BagDamaged(f'{source.name} is damaged: the CRC-32 of its data does not match', path=source.name)
+    wanted = int.from_bytes(tail[-4:], 'little')
+    if wanted not in {0, zlib.crc32(tail[DATA_END_BYTES:-4])}:
+        raise BagDamaged(f'{source.name} is damaged: the CRC-32 of its summary does not match', path=source.name)
 
 
 def read_profile(source: Ranged) -> str:
@@ -190,6 +212,7 @@ def scan(source: Ranged, data_end: int) -> McapIndex:
     declared, chunks, attachments, metadata = Schemas(), list[_Tally](), 0, list[str]()
     for kind, start, size, content in walk(source, data_end, _SCANNED):
         if kind == Opcode.DATA_END:
+            data_end = start
             break
         if kind == Opcode.CHUNK:
             chunks.append(_Tally(start, size, is_chunk=True))

@@ -227,3 +227,34 @@ def test_folders_of_any_name(tmp_path: Path, name: str, monkeypatch: pytest.Monk
     if not name.startswith('-'):
         ran = CliRunner().invoke(bag, ['info', f'{name}_0.mcap'], standalone_mode=False)
         assert '1 on 1 topic' in ran.output
+
+
+@pytest.mark.parametrize('is_chunked', [True, False])
+def test_every_checksum_of_a_file_is_checked(tmp_path: Path, is_chunked: bool) -> None:
+    """By ``verify --deep``: a bit that flipped anywhere but in the length of a record or the magic is found."""
+
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel('/x', 'cdr', writer.register_schema(*STRING))
+        writer.add_message(channel, 1, CDR * 9, 1)
+        writer.add_attachment(1, 1, 'a', 'b', b'c' * 99)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill, use_chunking=is_chunked, enable_data_crcs=True)
+    content = (folder / 'b_0.mcap').read_bytes()
+    assert verify_folder(folder, deep=True).is_sound
+    for place in range(8, len(content) - 8, 3):
+        (folder / 'b_0.mcap').write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+        assert not verify_folder(folder, deep=True).is_sound, place
+
+
+def test_schemas_of_one_name(tmp_path: Path) -> None:
+    """Are told apart, on one topic or on two."""
+
+    def fill(writer: Writer) -> None:
+        schemas = [writer.register_schema(STRING[0], STRING[1], text) for text in (b'string data', b'string other', b'')]
+        for topic, number in (('/a', 0), ('/a', 1), ('/b', 1), ('/b', 2)):
+            writer.add_message(writer.register_channel(topic, 'cdr', schemas[number]), number, CDR, 1)
+
+    folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
+    assert topics(folder) == {('/a', STRING[0]): 2, ('/b', STRING[0]): 2}
+    cut_folder(folder, tmp_path / 'piece', Choice())
+    assert read(tmp_path / 'piece' / 'piece_0.mcap') == read(folder / 'b_0.mcap')

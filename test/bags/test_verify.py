@@ -51,7 +51,7 @@ def test_a_store_is_asked_for_little(folder: Path) -> None:
     bag = find_bag(store, 'thor', NAME)
     size = sum(file.size for file in bag.slices)
     assert verify_remote(store, bag).read_bytes <= 3 * (64 << 10)
-    assert size <= verify_remote(store, bag, deep=True).read_bytes <= size + 3 * (64 << 10)
+    assert size <= verify_remote(store, bag, deep=True).read_bytes <= 1.01 * size + 3 * (64 << 10)
 
 
 def flip(folder: Path) -> None:
