@@ -297,6 +297,16 @@ class BagReader:
                 for message in self._parts[name].messages(wanted):
                     yield self._plain(message, name)
 
+    def latched_since(self, before_ns: int) -> int:
+        """From when on everything that is latched at a time can be read: the start of the file of that time, if it repeats it."""
+        for name in reversed(list(self._parts)):
+            if name not in self._recorded:
+                self._open([name])
+            known = self._infos.get(name) or self._recorded.get(name)
+            if known is not None and known.messages and known.t_start_ns <= before_ns:
+                return known.t_start_ns if known.repeated else 0
+        return 0
+
     def _open(self, names: Sequence[str]) -> None:
         """Several at a time."""
 
@@ -432,22 +442,29 @@ def check_tables(path: Path) -> None:
     """Raises BagDamaged for a SQLite file in which a table is a program, or has a row that is larger than any message."""
     try:
         with closing(sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
-            why = _refusal(database)
+            why = check_schema(database) or _too_large(database)
     except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
         raise BagDamaged(f'{path} cannot be read: {error}', path=str(path)) from error
     if why:
         raise BagDamaged(f'{path} is not an SQLite bag: {why}', path=str(path))
 
 
-def _refusal(database: sqlite3.Connection) -> str:
+def check_schema(database: sqlite3.Connection) -> str:
+    """Why the tables are not to be read: one is a program of whoever wrote the file. Empty if they are."""
     kinds = database.execute('SELECT type, name, sql FROM sqlite_master').fetchmany(1000)
     found = {name for kind, name, made in kinds if kind == 'table' and not str(made).upper().startswith('CREATE VIRTUAL')}
     if not {'messages', 'topics'} <= found or any(kind == 'view' for kind, _, _ in kinds):
         return 'it has other tables'
     for table in sorted(_TABLES & found):
-        columns = database.execute(f'PRAGMA table_xinfo({table})').fetchall()
-        if any(hidden for *_, hidden in columns):
+        if any(hidden for *_, hidden in database.execute(f'PRAGMA table_xinfo({table})')):
             return f'it computes a column of {table}'
+    return ''
+
+
+def _too_large(database: sqlite3.Connection) -> str:
+    there = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    for table in sorted(_TABLES & there):
+        columns = database.execute(f'PRAGMA table_info({table})').fetchall()
         names = [str(name) for _, name, *_ in columns if str(name).isidentifier()]
         longest = [database.execute(f'SELECT max(length("{name}")) FROM {table}').fetchone()[0] for name in names]  # noqa: S608 - checked
         if max(filter(None, longest), default=0) > MOST_CHUNK_BYTES:

@@ -15,25 +15,31 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.contents import BagReader, open_folder
-from shadowhound_data_logger.bags.description import BagPart, Description, of_metadata
+from shadowhound_data_logger.bags.description import BagPart, Description, is_latched, of_metadata, profiles
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
+from shadowhound_data_logger.bags.latched import MAX_LATCHED_BYTES, MAX_PER_TOPIC, Latched
 from shadowhound_data_logger.bags.naming import BUCKET, MCAP, METADATA
+from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, read_manifest
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagError, SettingError
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
-from shadowhound_data_logger.mcap.messages import MessageFilter
+from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
 from shadowhound_data_logger.mcap.ranges import Meter, StoredFile
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.times import moment_in_bag
 
@@ -41,6 +47,8 @@ UNFINISHED: Final = '.part'
 COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'
 ANY_END: Final = 1 << 64
 """After every time that MCAP has."""
+ACCUMULATED: Final = frozenset({'tf2_msgs/msg/TFMessage'})
+"""Types of which a subscriber needs all latched messages, not only the last: each transform is in one of them."""
 SOURCE: Final = 'source'
 """Of what has to be downloaded whole."""
 
@@ -82,6 +90,8 @@ class Cut:
     """Attachments and metadata records in the slices that were read, which are not copied."""
     remarks: tuple[str, ...] = ()
     """Where metadata.yaml contradicts the files."""
+    latched: int = 0
+    """Of the messages, those from before the start that were latched then."""
 
 
 def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
@@ -127,12 +137,16 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
     if end_ns <= start_ns:
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
     least, most = start_ns if choice.start else 0, end_ns if choice.end else ANY_END  # the bag's own times may be incomplete
+    latched = _LatchedBefore(reader, {topic.name for topic in bag.topics if is_latched(topic.qos)} & chosen)
     writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666, profile=reader.profile())
     try:
         for first, last in ((least, most),) if choice.spans is None else choice.spans:
             if (begin := max(first, least)) < (end := min(last, most)):
-                for message in reader.messages(MessageFilter(begin, end, lambda channel: channel.topic in chosen)):
+                for message in latched.before(begin) if begin > first_ns else ():
                     writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
+                for message in reader.messages(MessageFilter(begin, end, lambda channel: channel.topic in chosen)):
+                    if latched.is_new(message):
+                        writer.copy(message.channel, message.log_ns, message.publish_ns, message.sequence, message.cdr)
         info = writer.close()
     finally:
         writer.abort()
@@ -146,8 +160,52 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
     return Cut(
         out, info.messages, sum(count > 0 for count in info.counts.values()), info.bytes, info.t_start_ns, info.t_end_ns,
         meter.bytes, meter.requests, bag_bytes, absent, missing, reader.damaged,
-        reader.extras(), bag.remarks,
+        reader.extras(), bag.remarks, latched.count,
     )  # fmt: skip
+
+
+class _LatchedBefore:
+    """The latched messages with which a piece begins, so that it can be played on its own.
+
+    They are on channels of their own, as those with which the slices of a bag begin; what a slice repeats in the middle of the
+    piece is not copied again. New for each cut.
+    """
+
+    def __init__(self, reader: BagReader, topics: set[str]) -> None:
+        self._reader = reader
+        self._topics = topics
+        self._seen: set[tuple[str, str, bytes]] = set()
+        self.count = 0
+
+    def before(self, start_ns: int) -> list[RecordedMessage]:
+        """In the order of the bag, with the log time ``start_ns`` and their own publish time."""
+        if not self._topics:
+            return []
+        latched, channels, repeats = Latched(MAX_LATCHED_BYTES), dict[tuple[str, str], Channel](), Counter[str]()
+        wanted = MessageFilter(self._reader.latched_since(start_ns), start_ns, lambda channel: channel.topic in self._topics)
+        for channel, log_ns, publish_ns, sequence, cdr in self._reader.messages(wanted):
+            channels[channel.topic, channel.type] = channel
+            repeats[channel.topic] += channel.repeated
+            publishers = sum(is_latched([each]) for each in profiles(channel.qos))
+            count = MAX_PER_TOPIC if channel.type in ACCUMULATED else max(publishers, repeats[channel.topic], 1)
+            latched.keep(Lot(channel.topic, channel.type, '', [Taken(cdr, publish_ns, None, sequence, log_ns)], count))
+        kept = [
+            RecordedMessage(replace(channels[lot.topic, lot.type], repeated=True), start_ns, source_ns, number or 0, cdr)
+            for lot in latched for cdr, source_ns, _, number, _ in lot.messages
+        ]  # fmt: skip
+        found = [message for message in kept if self.is_new(message)]
+        self.count += len(found)
+        return found
+
+    def is_new(self, message: RecordedMessage) -> bool:
+        """Whether a message is not the repetition of one that is in the piece."""
+        channel = message.channel
+        if not channel.repeated and channel.topic not in self._topics:
+            return True
+        seen = channel.topic, channel.type, sha256(message.cdr).digest()
+        is_new = not channel.repeated or seen not in self._seen
+        self._seen.add(seen)
+        return is_new
 
 
 def _span(bag: Description) -> tuple[int, int]:

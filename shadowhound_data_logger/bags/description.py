@@ -23,6 +23,7 @@ MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
 MOST_BOOT_ID: Final = 100
 """Letters."""
+_INFINITE_S: Final = 9_000_000_000
 _LATEST_NS: Final = 1 << 64
 
 
@@ -183,6 +184,17 @@ def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
         except ValueError:
             return ()
     return tuple(each for each in qos if isinstance(each, Mapping)) if isinstance(qos, list) else ()
+
+
+def is_latched(qos: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a publisher with one of these profiles keeps messages for later subscribers, and for good."""
+    return any(profile.get('durability') in {1, 'transient_local'} and _is_infinite(profile.get('lifespan')) for profile in qos)
+
+
+def _is_infinite(lifespan: object) -> bool:
+    """0 and rmw's infinity both mean that none is set."""
+    seconds = lifespan.get('sec') if isinstance(lifespan, Mapping) else 0
+    return not isinstance(seconds, int) or not 0 < seconds < _INFINITE_S
 
 
 def _described(found: Mapping[str, Any], there: Container[str]) -> Description:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.latched import Latched
+from shadowhound_data_logger.bags.latched import MAX_LATCHED_BYTES, Latched
 from shadowhound_data_logger.bags.manifest import EventOf, Missing, MissionOf
 from shadowhound_data_logger.bags.naming import slice_file
 from shadowhound_data_logger.bags.objects import finish, ros_distro, slice_object
@@ -33,8 +33,6 @@ from shadowhound_data_logger.spool.retention import NO_ROOM
 
 log = logging.getLogger(__name__)
 
-MAX_LATCHED_BYTES: Final = 64 << 20
-"""Of all latched messages that are kept for the next slice; never more than a slice may have."""
 REPEAT_LEAD_NS: Final = 300_000_000
 """How much earlier than the first message of a slice the latched ones are logged. The intake drains topics one after the other,
 up to a quarter of a second apart, so the next topic's messages may be older than this first one."""

@@ -23,6 +23,7 @@ from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.mcap.messages import RecordedMessage
 from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.mcap.slice_info import Channel
 from shadowhound_data_logger.mcap.writer import SliceWriter
 from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
@@ -264,3 +265,72 @@ def test_a_damaged_chunk_is_not_copied(origin: Path, tmp_path: Path) -> None:
     with pytest.raises(BagDamaged, match='chunk'):
         cut_folder(folder, tmp_path / 'piece', Choice())
     assert not (tmp_path / 'piece').exists()
+
+
+QOS = """- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+"""
+STATIC = Channel('/tf_static', 'tf2_msgs/msg/TFMessage', 'ros2msg', 'x', '', QOS)
+MAP = Channel('/map', 'nav_msgs/msg/OccupancyGrid', 'ros2msg', 'x', '', QOS)
+
+
+def write_latched(folder: Path, *, repeats: bool) -> None:
+    """Three slices of a second: two transforms and a map in the first, another map in the second; with or without repeats."""
+    folder.mkdir()
+    infos, latched = [], list[tuple[Channel, bytes]]()
+    for number in range(3):
+        writer = SliceWriter(folder / f'{folder.name}_{number}.mcap')
+        for channel, content in latched if repeats else ():
+            writer.write(replace(channel, repeated=True), T0 + number * 10**9, T0, 7, content)
+        new = {0: [(STATIC, b'left'), (STATIC, b'right'), (MAP, b'old')], 1: [(MAP, b'new')], 2: []}[number]
+        for channel, content in new:
+            writer.write(channel, T0 + number * 10**9 + 5, T0, 7, content)
+        latched = [*(each for each in latched if not new or each[0] is not MAP), *new]
+        for place in range(100):
+            at = T0 + number * 10**9 + place * STEP_NS
+            writer.write(IMU, at, at, place, b'imu')
+        infos.append(writer.close())
+    (folder / 'metadata.yaml').write_bytes(metadata_yaml(infos, ros_distro=''))
+
+
+@pytest.mark.parametrize('repeats', [True, False], ids=['ours', 'another recorder'])
+def test_a_piece_begins_with_what_is_latched(tmp_path: Path, *, repeats: bool) -> None:
+    """All transforms, the last map, with their publish time, and each once, wherever the piece begins and how long it is."""
+    bag = tmp_path / 'bag'
+    write_latched(bag, repeats=repeats)
+    for start, end, early, late in (
+        ('0.5', '0.9', [b'left', b'right', b'old'], []), ('0.5', '', [b'left', b'right', b'old'], [b'new']),
+        ('1.5', '', [b'left', b'right', b'new'], []), ('2.5', '2.9', [b'left', b'right', b'new'], []),
+        ('', '', [], [b'left', b'right', b'old', b'new']),
+    ):  # fmt: skip
+        piece = tmp_path / f'piece{start}{end}'
+        found = cut_folder(bag, piece, Choice(start, end))
+        messages = [one for one in messages_of([piece / f'{piece.name}_0.mcap']) if one.channel.topic != '/imu']
+        assert [one.cdr for one in messages if one.channel.repeated] == early
+        assert [one.cdr for one in messages if not one.channel.repeated] == late
+        assert found.latched == len(early)
+        began_ns = T0 + round(float(start or 0) * 1e9)
+        assert {(one.log_ns, one.publish_ns, one.sequence) for one in messages if one.channel.repeated} <= {(began_ns, T0, 7)}
+        assert found.t_start_ns == (began_ns if start else T0)
+
+
+def test_a_piece_of_other_topics_has_nothing_that_is_latched(tmp_path: Path) -> None:
+    """It has the topics that were chosen."""
+    write_latched(tmp_path / 'bag', repeats=True)
+    found = cut_folder(tmp_path / 'bag', tmp_path / 'piece', Choice('1.5', topics=['/imu']))
+    assert (found.latched, found.topics) == (0, 1)
+
+
+def test_one_slice_alone_keeps_what_it_repeats(tmp_path: Path) -> None:
+    """There is nothing else that has it."""
+    write_latched(tmp_path / 'bag', repeats=True)
+    found = cut_folder(tmp_path / 'bag' / 'bag_2.mcap', tmp_path / 'piece', Choice())
+    assert {one.cdr for one in messages_of([tmp_path / 'piece' / 'piece_0.mcap'])} == {b'imu', b'left', b'right', b'new'}
+    assert found.latched == 0
