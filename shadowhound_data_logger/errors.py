@@ -127,7 +127,9 @@ class BagError(DataLoggerError):
 class BagDamaged(BagError):
     """A file of a bag is not whole, or its content contradicts itself; ``data['path']`` names it."""
 
-    DEFAULT_REMEDY = 'shadowhound-data bag verify says which files are sound; bag fetch downloads the others again'
+    DEFAULT_REMEDY = (
+        'shadowhound-data bag verify lists damaged files; bag repair recovers what they hold, bag fetch downloads them again'
+    )
 
 
 class LakeError(DataLoggerError):

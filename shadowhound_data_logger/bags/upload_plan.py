@@ -88,7 +88,7 @@ def finished(folder: Path) -> FinishedBag:
         raise BagError(f'{folder} is not a folder', remedy=remedy, path=str(folder))
     names = {path.name: path for path in folder.iterdir()}
     if METADATA not in names:
-        remedy = 'ros2 bag record writes it when it ends; after a crash, `ros2 bag reindex` makes it'
+        remedy = 'ros2 bag record writes it when it ends; after a crash, `shadowhound-data bag repair --in-place` makes it'
         raise BagError(f'{folder} is not a finished bag: it has no {METADATA}', remedy=remedy, path=str(folder))
     for name, path in names.items():
         if name.endswith(_UNFINISHED) and path.stat().st_size:

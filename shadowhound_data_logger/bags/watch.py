@@ -123,7 +123,8 @@ class Watch:
         elif path.name not in self._left:
             self._left.add(path.name)
             reason = f'it has no {METADATA}, and nothing in it has changed for {UNFINISHED_S / 60:.0f} min'
-            yield WatchStep(path.name, 'refused', f'{reason} (if nobody records into it: `ros2 bag reindex` makes it)')
+            remedy = f'if no recorder is writing to it: `shadowhound-data bag repair {path} --in-place` makes it'
+            yield WatchStep(path.name, 'refused', f'{reason} ({remedy})')
 
     def _is_settled(self, path: Path) -> bool:
         look = _look(path)

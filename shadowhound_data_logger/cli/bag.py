@@ -24,6 +24,7 @@ from shadowhound_data_logger.bags.naming import SLICES, safe_bag
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
 from shadowhound_data_logger.bags.remote import FOREIGN, GROWING, find_bag
+from shadowhound_data_logger.bags.repair import BagRepair, FileRepair, repair_bag
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
 from shadowhound_data_logger.bags.watch import Watch, WatchStep
@@ -65,6 +66,9 @@ STORE_THREADS: Final = 8
 LOCAL_REMEDY: Final = 'shadowhound-data bag verify DIR --deep shows what is damaged'
 LEAST_RATED_S: Final = 0.01
 """A bag that is shorter has no rates."""
+REPAIR: Final = 'In a folder, `shadowhound-data bag repair` recovers what a damaged file still holds.'
+MOST_LOSSES: Final = 20
+"""Of a repaired file that are printed."""
 LOOK_S: Final = 5.0
 """Between two looks for bags that are finished."""
 STATES: Final = {'complete': 'green', 'growing': 'cyan', 'recovered': 'yellow', 'gaps': 'yellow', 'foreign': 'dim'}
@@ -211,6 +215,32 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
     return exit_code(finding=not (found.is_sound and found.state != GROWING))
 
 
+@bag.command('repair', epilog=examples('bag repair my_bag', 'bag repair my_bag/my_bag_3.mcap -o whole.mcap'))
+@click.argument('path', metavar='PATH', type=click.Path(path_type=Path, exists=True))
+@click.option('-o', '--output', type=click.Path(path_type=Path), help='New folder or file  [default: PATH_repaired]')
+@click.option('--in-place', is_flag=True, help='Replace the damaged files. What is damaged in them is gone then.')
+@click.option('--keep-damaged', is_flag=True,
+              help='Also keep the messages of chunks whose checksum does not match: some of them are wrong.')  # fmt: skip
+@as_json
+def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged: bool, as_json: bool) -> ExitCode:
+    """Repair a bag or one of its files.
+
+    PATH is a folder or an MCAP or SQLite file of any recorder: torn by a crash or a full disk, without its end or summary, with
+    damaged bytes or bytes added. Everything that is intact is copied, metadata.yaml is rebuilt, and what is lost is listed.
+
+    Nothing is written if nothing is damaged. Exit code 1 means that something was.
+    """
+    if in_place and output is not None:
+        raise BadUsage('--in-place and --output exclude each other', 'leave one of them out')
+    with progress('read', of='bytes') as bar:
+        found = repair_bag(path, output, in_place=in_place, unverified=keep_damaged, told=bar)
+    if as_json:
+        print_json({**asdict(found), 'is_damaged': found.is_damaged})
+    else:
+        print_page(*_told_repair(found, keep_damaged=keep_damaged))
+    return exit_code(finding=found.is_damaged)
+
+
 @bag.command('fetch', epilog=examples('bag fetch patrol_20251018_120000 --to bags'))
 @click.argument('bag', metavar='BAG')
 @click.option(
@@ -339,7 +369,7 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     else:
         damaged = (plain(f'{name} {why}; it was uploaded as it is.', 'red') for name, why in sent.damaged.items())
         renamed = (f'{name} is {stored} in the store.' for name, stored in sent.renamed.items())
-        print_lines(_told_upload(found), *renamed, *damaged, *_remarks(sent.remarks))
+        print_lines(_told_upload(found), *renamed, *damaged, *([REPAIR] if sent.damaged else []), *_remarks(sent.remarks))
     return exit_code(finding=not found.is_delivered or sent.damaged)
 
 
@@ -453,6 +483,7 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
     yield ''
     yield _files(found)
     yield from (plain(f'{name} {why}; it is not counted.', 'red') for name, why in told.damaged.items())
+    yield from [REPAIR] if told.damaged else []
     if found.missing:
         yield plain(f'{"Not here yet" if found.robot else "Not here"}: {", ".join(found.missing)}', 'yellow')
     yield from _remarks(told.remarks)
@@ -541,6 +572,7 @@ def _info_json(found: BagInfo) -> dict[str, Any]:
 def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
     for check in found.findings:
         yield plain(f'{check.name} {check.finding}', 'red')
+    yield from [REPAIR] if any(check.checked != 'presence' for check in found.findings) else []
     sound = [check for check in found.checks if not check.finding]
     how = ', '.join(sorted({check.checked for check in sound}))
     are = 'is' if len(sound) == 1 else 'are'
@@ -557,6 +589,7 @@ def _verdict(found: VerifiedBag) -> Iterator[RenderableType]:
 def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
     length = duration((found.t_end_ns - found.t_start_ns) / 1e9)
     what = f'{counted(found.messages, "message")} on {counted(found.topics, "topic")}, {volume(found.bytes)}'
+    what += f', {number(found.latched)} of them latched before' if found.latched else ''
     yield f'{found.folder}: {what}, {shown_time(found.t_start_ns)} to {shown_time(found.t_end_ns)} UTC ({length})'
     if is_remote:
         requests = counted(found.read_requests, 'request')
@@ -566,6 +599,7 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
             share = f'all {volume(found.bag_bytes)}'
         yield f'Read {share} in {requests}.'
     yield from (plain(f'{name} {why}; nothing of it was copied.', 'red') for name, why in found.damaged.items())
+    yield from [REPAIR] if found.damaged else []
     if found.extras:
         what = 'attachment or metadata record' if found.extras == 1 else 'attachments or metadata records'
         yield f'Not copied: {number(found.extras)} {what}.'
@@ -574,6 +608,47 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
     if found.missing:
         yield plain(f'Not all of that time: {", ".join(found.missing)} is not there{f"; {COMES}" if is_remote else ""}', 'yellow')
     yield from _remarks(found.remarks)
+
+
+def _told_repair(found: BagRepair, *, keep_damaged: bool) -> Iterator[RenderableType]:
+    if not found.is_damaged:
+        yield f'{found.path}: nothing is damaged in {counted(len(found.files), "file")}.'
+        return
+    damaged = [file for file in found.files if file.is_damaged]
+    messages = sum(file.messages or 0 for file in found.files)
+    where = found.out if found.out is not None else found.path
+    yield Text.assemble(plain(where, 'bold'), f': {counted(messages, "message")} in {counted(len(found.files), "file")}, ',
+                        f'{number(len(damaged))} of them damaged')  # fmt: skip
+    for file in damaged:
+        yield ''
+        yield from _told_file(file, keep_damaged=keep_damaged)
+    for remark in found.metadata:
+        yield plain(f'metadata.yaml was rebuilt: {remark}', 'yellow')
+    if found.absent:
+        yield plain(f'Not there, and no longer in metadata.yaml: {", ".join(found.absent)}', 'yellow')
+
+
+def _told_file(file: FileRepair, *, keep_damaged: bool) -> Iterator[RenderableType]:
+    if file.failed:
+        yield plain(f'{file.name} cannot be repaired: {file.failed}', 'red')
+        return
+    lost = 'an unknown number is lost' if file.lost_messages is None else f'{number(file.lost_messages)} lost'
+    yield plain(f'{file.name}: {counted(file.messages or 0, "message")}, {lost}', 'yellow')
+    for loss in file.losses[:MOST_LOSSES]:
+        count = '' if loss.messages is None else f', {counted(loss.messages, "message")}'
+        span = '' if loss.from_ns is None else f', after {shown_time(loss.from_ns)}'
+        span += '' if loss.to_ns is None else f', until {shown_time(loss.to_ns)}'
+        yield plain(f'  lost at {number(loss.at)}: {volume(loss.bytes)}, {loss.what}{count}{span}')
+    if len(file.losses) > MOST_LOSSES:
+        yield f'  and {number(len(file.losses) - MOST_LOSSES)} more places: --json lists them'
+    if file.rebuilt:
+        yield plain(f'  rebuilt: {", ".join(file.rebuilt)}')
+    if file.is_cut:
+        yield plain('  Its end is missing: it is unknown whether more followed.')
+    if file.unverified:
+        what = f'  {counted(file.unverified, "message")} of chunks whose checksum does not match'
+        kept = 'are in it, some of them wrong' if keep_damaged else 'are lost; --keep-damaged keeps them, some of them wrong'
+        yield plain(f'{what} {kept}', 'red' if keep_damaged else 'yellow')
 
 
 def _told_upload(found: Uploaded) -> str:

@@ -101,6 +101,8 @@ class Contents:
     """Chunk index records, in the order of the file."""
     metadata: list[bytes] = field(default_factory=list)
     """Metadata index records, the same."""
+    attachments: list[bytes] = field(default_factory=list)
+    """Attachment index records, the same."""
     messages: int = 0
     t_start_ns: int = 0
     t_end_ns: int = 0
@@ -126,7 +128,7 @@ class Contents:
 
     def chunk(self, at: int, packed: ChunkPacking, tracks: Sequence[ChannelTrack]) -> bytes:
         """Take in a chunk that begins at the offset ``at``: the message index records that follow it, one for each track."""
-        start, end = span(tracks)
+        start, end = span(tracks) if tracks else (0, 0)
         length = RECORD.size + CHUNK.size + 4 + len(packed.compression) + 8 + packed.compressed
         indexes, offsets, messages = bytearray(), bytearray(), self.messages
         for track in tracks:
@@ -136,13 +138,18 @@ class Contents:
             track.count += len(track.index) // 2
             messages += len(track.index) // 2
             track.index = array('Q')
-        self.t_start_ns, self.t_end_ns = (min(self.t_start_ns, start), max(self.t_end_ns, end)) if self.messages else (start, end)
+        if tracks:
+            self.extend(start, end)
         self.messages = messages
         self.chunks.append(record(
             Opcode.CHUNK_INDEX, struct.pack('<QQQQI', start, end, at, length, len(offsets)), bytes(offsets),
             struct.pack('<Q', len(indexes)), text(packed.compression), struct.pack('<QQ', packed.compressed, packed.size),
         ))  # fmt: skip
         return bytes(indexes)
+
+    def extend(self, start: int, end: int) -> None:
+        """Include the log times of messages that are about to be counted."""
+        self.t_start_ns, self.t_end_ns = (min(self.t_start_ns, start), max(self.t_end_ns, end)) if self.messages else (start, end)
 
     def add_metadata(self, at: int, length: int, name: str) -> None:
         """Take in a metadata record that begins at the offset ``at``; ``length`` is that of the whole record."""
@@ -153,16 +160,24 @@ class Contents:
         channels = counted((track.channel, track.count) for track in self.tracks.values())
         return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, channels, damage)
 
-    def ending(self, at: int, metadata: str) -> bytes:
+    def add_attachment(self, at: int, length: int, name: str, media_type: str, size: int, times: tuple[int, int]) -> None:
+        """Take in an attachment record; ``size`` is that of its content, ``times`` are log and creation time."""
+        numbers = struct.pack('<QQQQQ', at, length, *times, size)
+        self.attachments.append(record(Opcode.ATTACHMENT_INDEX, numbers, text(name), text(media_type)))
+
+    def ending(self, at: int, metadata: str | None) -> bytes:
         """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
-        said = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
+        said = b''
+        if metadata is not None:
+            said = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
+            self.add_metadata(at, len(said), 'rosbag2')
         data = said + record(Opcode.DATA_END, struct.pack('<I', 0))
-        self.add_metadata(at, len(said), 'rosbag2')
         groups = {
             Opcode.SCHEMA: b''.join(self.schemas.values()),
             Opcode.CHANNEL: b''.join(self.declared.values()),
             Opcode.STATISTICS: self._statistics(),
             Opcode.CHUNK_INDEX: b''.join(self.chunks),
+            Opcode.ATTACHMENT_INDEX: b''.join(self.attachments),
             Opcode.METADATA_INDEX: b''.join(self.metadata),
         }
         start = position = at + len(data)
@@ -177,6 +192,6 @@ class Contents:
 
     def _statistics(self) -> bytes:
         counted = b''.join(_PLACE.pack(number, track.count) for number, track in self.tracks.items())
-        numbers = self.messages, len(self.schemas), len(self.tracks), 0, len(self.metadata), len(self.chunks)
+        numbers = self.messages, len(self.schemas), len(self.tracks), len(self.attachments), len(self.metadata), len(self.chunks)
         body = _STATISTICS.pack(*numbers, self.t_start_ns, self.t_end_ns)
         return record(Opcode.STATISTICS, body, struct.pack('<I', len(counted)), counted)

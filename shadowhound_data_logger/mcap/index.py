@@ -111,14 +111,21 @@ def parsed(kind: RecordKind[_Record], content: bytes | memoryview) -> _Record:
     return kind.read(ReadDataStream(_Exact(content)))
 
 
+def length_of(kind: RecordKind[_Record], content: bytes | memoryview) -> int:
+    """How long the fields of a record are; the format allows further ones after them. Raises as ``parsed``."""
+    stream = _Exact(content)
+    kind.read(ReadDataStream(stream))
+    return stream.tell()
+
+
 class _Exact(io.BytesIO):
     """Gives all that is asked for: `mcap` takes less of a record that is cut off for the whole of it."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        found = super().read(size)
-        if size is None or len(found) != size:
-            raise EOFError(f'{size} bytes are wanted, {len(found)} are left')
-        return found
+        left = len(self.getbuffer()) - self.tell()
+        if size is None or size > left:
+            raise EOFError(f'{size} bytes are required, {left} are left')
+        return super().read(size)
 
 
 @dataclass(slots=True)
@@ -341,7 +348,7 @@ def _read_summary(source: Ranged) -> tuple[memoryview, int]:
     tail_start = source.size - tail_length
     tail = source.read(tail_start, tail_length)
     if not tail.endswith(MAGIC):
-        remedy = 'it was cut off; slices of this package are recovered when the node starts again, for others see `mcap recover`'
+        remedy = 'it was cut off: shadowhound-data bag repair recovers it; a node recovers its own slices when it restarts'
         raise BagDamaged(f'{source.name} has no end of an MCAP file', remedy=remedy, path=source.name)
     kind, length = RECORD.unpack_from(tail, tail_length - TAIL_BYTES)
     if (kind, length) != (Opcode.FOOTER, FOOTER_BYTES):

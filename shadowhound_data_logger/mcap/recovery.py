@@ -111,7 +111,9 @@ class _Scanner:
         if suspects is not None and piece.at - suspects.at < RECORD.size:
             return False  # there is no room for a record
         after = piece.at + piece.size
-        if isinstance(piece, IntactChunk) and piece.contents.messages and not piece.contents.declarations:
+        if isinstance(piece, IntactChunk):
+            if not piece.contents.messages or not piece.contents.index.keys() <= self._tracks.keys():
+                return False
             after = self._chunk(piece)
         elif not isinstance(piece, IntactRecord) or not self._take(piece):
             return False
@@ -145,7 +147,7 @@ class _Scanner:
             return False
         known = contents.schemas if piece.op == Opcode.SCHEMA else contents.declared
         number, schema = int.from_bytes(piece.content[:2], 'little'), int.from_bytes(piece.content[2:4], 'little')
-        if number in known or (piece.op == Opcode.CHANNEL and schema not in contents.schemas):
+        if number in known or (piece.op == Opcode.CHANNEL and schema and schema not in contents.schemas):
             return False
         try:
             self._schemas.add(piece.op, piece.content)

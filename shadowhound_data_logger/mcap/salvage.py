@@ -16,14 +16,15 @@ import struct
 import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, Header, Metadata, Schema, Statistics
 
 from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, RECORD, ChunkPacking
-from shadowhound_data_logger.mcap.index import UNREADABLE, parsed
+from shadowhound_data_logger.mcap.index import UNREADABLE, length_of, parsed
 from shadowhound_data_logger.untrusted import partly_unpacked, unpacked
 
 MOST_CHUNK_BYTES: Final = 128 << 20
@@ -32,6 +33,8 @@ MOST_SUMMARY_BYTES: Final = 64 << 20
 PRIVATE: Final = 0x80
 """Opcodes from here on are private: readers skip them. ``recovery.py`` adds it to the opcode of a damaged record."""
 BLOCK_BYTES: Final = 1 << 20
+HINT_BYTES: Final = 4 << 20
+"""Of the end of a file, where its footer is searched."""
 SEARCHES: Final = 4
 """How often the search for intact records may read the file, on average."""
 _LEAST: Final[Mapping[int, int]] = {
@@ -48,6 +51,10 @@ _SUMMARY: Final = frozenset({
 _START: Final = re.compile(rb'(?=[\x02-\x07\x09\x0c\x0f].{5}\x00{3})', re.DOTALL)
 """Of a record that the search may find: one with content of its own, shorter than a terabyte."""
 _CHUNK_FIELDS: Final = 40
+_IN_CHUNKS: Final = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
+_FOOTER: Final = RECORD.pack(Opcode.FOOTER, _LEAST[Opcode.FOOTER])
+_DATA_END: Final = RECORD.pack(Opcode.DATA_END, _LEAST[Opcode.DATA_END])
+_COMPRESSIONS: Final = ('', 'zstd', 'lz4')
 _INDEX_HEAD: Final = 6
 _INDEX_ENTRY: Final = 16
 _DECLARED: Final[Mapping[int, type[Schema | Channel]]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
@@ -73,6 +80,8 @@ class ChunkContents:
     """Of each channel with messages, in the order of the first ones: log time, offset, ..."""
     declarations: tuple[tuple[int, bytes], ...]
     """Opcode and content of its schemas and channels."""
+    needs: frozenset[int]
+    """Channels of its messages that it does not declare before them."""
     lost: int = 0
     """Messages of channels that are not declared anywhere: they are not in ``raw`` and ``index``."""
 
@@ -156,9 +165,17 @@ class Salvage:
         self.size = os.fstat(file).st_size
         self.hints = Declarations()
         """Of the summary, where the end of the file is intact: some may be damaged in the data."""
+        self.statistics: Statistics | None = None
+        """Of the summary, the same."""
+        self.is_verified = False
+        """Whether the checksum of the summary matches: then its schemas and channels replace others outside of chunks."""
         self.known = Declarations()
         """Found in the data so far."""
+        self.unverified = Declarations()
+        """Found in damaged chunks: without them, intact chunks could not be read."""
         self._told = told
+        self._follows_chunk = False
+        """Whether the piece before was a chunk or the index of one."""
         self._left = SEARCHES * self.size + (16 << 20)
         """Bytes that the search may still read."""
 
@@ -170,13 +187,18 @@ class Salvage:
             piece: Piece | None = self._first() if not at else self._piece(at)
             if piece is None or (isinstance(piece, IntactRecord) and self._is_doubtful(piece)):
                 piece = self._damaged(at)
+                if piece.op == Opcode.CHUNK and (contents := self.salvaged(piece).contents) is not None:
+                    for op, content in contents.declarations:
+                        self.unverified.add(op, content)
             elif isinstance(piece, IntactRecord) and piece.op in _DECLARED and piece.content is not None:
-                self.known.add(piece.op, piece.content)
+                piece = replace(piece, content=self._corrected(piece.op, piece.content))
+                self.known.add(piece.op, piece.content or b'')
             elif isinstance(piece, IntactChunk):
                 for op, content in piece.contents.declarations:
                     self.known.add(op, content)
             if self.known.size > MOST_SUMMARY_BYTES:
                 piece = Damaged(at, self.size - at, 0, f'its schemas and channels have more than {MOST_SUMMARY_BYTES:,} bytes')
+            self._follows_chunk = isinstance(piece, IntactChunk) or piece.op in {Opcode.CHUNK, Opcode.MESSAGE_INDEX}
             yield piece
             self._told(piece.size)
             at = piece.at + piece.size
@@ -189,15 +211,21 @@ class Salvage:
     # -- one piece -------------------------------------------------------------------------------------------------
 
     def _first(self) -> IntactRecord | None:
-        """The magic bytes with the header."""
+        """The magic bytes with the header; its own fields give its length where that is damaged."""
         at = len(MAGIC)
         op, length = self._head(at)
-        if self.read(0, at) != MAGIC or op != Opcode.HEADER or not self._fits(at, op, length) or length > BLOCK_BYTES:
+        content = self.read(at + RECORD.size, min(length, BLOCK_BYTES))
+        if self.read(0, at) != MAGIC or op != Opcode.HEADER:
             return None
-        content = self.read(at + RECORD.size, length)
-        if not _can_parse(Header, content):
-            return None
-        return IntactRecord(0, at + RECORD.size + length, op, content)
+        known = _length(Header, content)
+        start = at + RECORD.size
+        if known is None or (length != known and not self._is_strong(start + length)):
+            content = self.read(start, BLOCK_BYTES)
+            known = _length(Header, content)
+            if known is None or not self._is_strong(start + known):
+                return None
+            return IntactRecord(0, start + known, op, content[:known])
+        return IntactRecord(0, start + length, op, content) if length <= BLOCK_BYTES else None
 
     def _piece(self, at: int) -> IntactRecord | IntactChunk | None:
         """The intact piece that begins there; None if there is none."""
@@ -222,18 +250,23 @@ class Salvage:
             content = self.read(start, length)
         elif op == Opcode.FOOTER:
             is_intact = length == _LEAST[op] and self.read(at + size, len(MAGIC)) == MAGIC
+        elif op == Opcode.MESSAGE_INDEX or (op == Opcode.MESSAGE and self._follows_chunk and self._is_index(at, length)):
+            is_intact, op = self._is_index(at, length), Opcode.MESSAGE_INDEX  # a message there would be one by a damaged opcode
         elif op == Opcode.MESSAGE:
             is_intact = length <= MOST_CHUNK_BYTES and self._knows(int.from_bytes(self.read(start, 2), 'little'))
             content = self.read(start, length) if is_intact else None
-        elif op == Opcode.MESSAGE_INDEX:
-            entries = int.from_bytes(self.read(start + 2, 4), 'little')
-            is_intact = entries + _INDEX_HEAD == length and not entries % _INDEX_ENTRY
         elif op in _DECLARED or op == Opcode.METADATA:
             content = self.read(start, length) if length <= MOST_SUMMARY_BYTES else None
-            is_intact = content is not None and _can_parse(_DECLARED.get(op, Metadata), content)
+            known = _length(_DECLARED.get(op, Metadata), content) if content is not None else None
+            is_intact = known is not None and (known == length or self._is_strong(at + size))
         else:
             is_intact = op > Opcode.DATA_END
         return IntactRecord(at, size, op, content) if is_intact else None
+
+    def _is_index(self, at: int, length: int) -> bool:
+        """Whether a record can be a message index."""
+        entries = int.from_bytes(self.read(at + RECORD.size + 2, 4), 'little')
+        return entries + _INDEX_HEAD == length and not entries % _INDEX_ENTRY
 
     def _is_attachment(self, at: int, length: int) -> bool:
         """Whether the lengths in it add up, and its CRC-32 matches if it has one."""
@@ -257,29 +290,34 @@ class Salvage:
         return found
 
     def _chunk(self, at: int, length: int) -> IntactChunk | None:
+        found = self._unpacked(at, length)
+        if found is None:
+            return None
+        packing, raw, times = found
+        contents, end = self._walk(raw)
+        if end != len(raw) or len(contents.raw) != end:
+            return None
+        return IntactChunk(at, RECORD.size + length, packing, times, contents)
+
+    def _unpacked(self, at: int, length: int) -> tuple[ChunkPacking, memoryview, tuple[int, int]] | None:
+        """A chunk's records, if its checksum does not contradict them; also its times, as its header has them."""
         try:
             chunk = parsed(Chunk, self.read(at + RECORD.size, length))
             packing = ChunkPacking(chunk.compression, len(chunk.data), chunk.uncompressed_size)
             raw = unpacked(chunk.compression, chunk.data, packing.size) if chunk.compression else chunk.data
         except (*UNREADABLE, ValueError):
             return None
-        if len(raw) != packing.size or (chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc):
+        if length != _CHUNK_FIELDS + len(chunk.compression.encode()) + packing.compressed or len(raw) != packing.size:
             return None
-        contents, end = self._walk(memoryview(raw))
-        if end != len(raw) or contents.lost:
+        if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             return None
-        return IntactChunk(at, RECORD.size + length, packing, (chunk.message_start_time, chunk.message_end_time), contents)
+        return packing, memoryview(raw), (chunk.message_start_time, chunk.message_end_time)
 
     def _misnamed_chunk(self, at: int) -> IntactChunk | None:
         """A chunk whose opcode or length is damaged: its own fields give its length, and its CRC-32 confirms it."""
-        head = self.read(at + RECORD.size, _CHUNK_FIELDS + 4)
-        if len(head) < _CHUNK_FIELDS:
+        length = self._chunk_length(at)
+        if not length or self.read(at + RECORD.size + CHUNK.size - 4, 4) == bytes(4):
             return None
-        name_length = int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
-        if name_length not in {0, 3, 4} or not int.from_bytes(head[CHUNK.size - 4 : CHUNK.size], 'little'):
-            return None
-        place = CHUNK.size + 4 + name_length
-        length = place + 8 + int.from_bytes(head[place : place + 8], 'little')
         if length > MOST_CHUNK_BYTES or at + RECORD.size + length > self.size or not self._spend(length):
             return None
         return self._chunk(at, length)
@@ -290,6 +328,7 @@ class Salvage:
         declared = Declarations()
         declarations: list[tuple[int, bytes]] = []
         parts: list[memoryview] = []
+        needs = set[int]()
         at, start, removed, lost, end = 0, 0, 0, 0, len(raw)
         while at + RECORD.size <= end:
             op, length = RECORD.unpack_from(raw, at)
@@ -302,18 +341,29 @@ class Salvage:
                     parts.append(raw[start:at])
                     removed, start, lost = removed + after - at, after, lost + 1
                 else:
+                    if number not in index and number not in declared.channels:
+                        needs.add(number)
                     index.setdefault(number, array('Q')).extend((log_ns, at - removed))
             elif op in _DECLARED:
                 content = bytes(raw[at + RECORD.size : after])
-                if not _can_parse(_DECLARED[op], content):
-                    break
-                declared.add(op, content)
-                declarations.append((op, content))
+                if _length(_DECLARED[op], content) != length:
+                    break  # also where more follows its fields: the reference reader loses its way there
+                if op == Opcode.CHANNEL and not any(each.has_schema_of(content) for each in (declared, *self._sources())):
+                    parts.append(raw[start:at])
+                    removed, start = removed + after - at, after
+                else:
+                    declared.add(op, content)
+                    declarations.append((op, content))
             at = after
         kept = raw[start:at]
         if parts:
             kept = memoryview(b''.join([*parts, kept]))
-        return ChunkContents(kept, index, tuple(declarations), lost), at
+        return ChunkContents(kept, index, tuple(declarations), frozenset(needs), lost), at
+
+    def _corrected(self, op: int, content: bytes) -> bytes:
+        """A schema or channel outside of chunks, for which there is no checksum but that of the summary."""
+        hints = self.hints.schemas if op == Opcode.SCHEMA else self.hints.channels
+        return hints.get(int.from_bytes(content[:2], 'little'), content) if self.is_verified else content
 
     # -- damage ----------------------------------------------------------------------------------------------------
 
@@ -335,7 +385,7 @@ class Salvage:
             return Damaged(0, end, 0, 'the beginning of the file is missing')
         end = at + RECORD.size + length
         if not fits or (end < self.size and not self._is_strong(end)):
-            end = self._search(at + 1)
+            end = self._search(at + 1, at + RECORD.size + self._chunk_length(at) if op == Opcode.CHUNK else 0)
         is_torn = end == self.size and not fits and bool(op)
         if op == Opcode.CHUNK:
             return Damaged(at, end - at, op, 'a chunk', is_torn)
@@ -350,27 +400,31 @@ class Salvage:
             return Salvaged(what, None, False, False, None)
         start_ns, end_ns, size, crc = CHUNK.unpack_from(head)
         times = (start_ns, end_ns) if start_ns <= end_ns else None
-        place = CHUNK.size + 4 + int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
-        if place + 8 > len(head) or size > MOST_CHUNK_BYTES:
-            return Salvaged(what, None, False, False, times)
-        name = head[CHUNK.size + 4 : place].decode(errors='replace')
-        packed = min(int.from_bytes(head[place : place + 8], 'little'), damaged.size - RECORD.size - place - 8, MOST_CHUNK_BYTES)
-        data = self.read(start + place + 8, packed)
-        if is_torn:
-            try:
-                raw = partly_unpacked(name, data, size) if name else data
-            except ValueError as error:
-                return Salvaged(f'a chunk: {error}', None, False, False, times)
-            return Salvaged(what, self._walk(memoryview(raw))[0], True, False, times)
-        return self._contradictory(name, data, size, crc, times)
+        length = int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
+        name = head[CHUNK.size + 4 : CHUNK.size + 4 + length].decode(errors='replace')
+        if not is_torn:
+            return self._contradictory(damaged, name, size, crc, times)
+        if name not in _COMPRESSIONS or size > MOST_CHUNK_BYTES:
+            return Salvaged(f'{what}, and compressed with {name[:20]!r}', None, False, False, times)
+        data = self._packed(damaged, name, head)
+        raw = partly_unpacked(name, data, size) if name else data
+        return Salvaged(what, self._walk(memoryview(raw))[0], True, False, times)
 
-    def _contradictory(self, name: str, data: bytes, size: int, crc: int, times: tuple[int, int] | None) -> Salvaged:
-        """A chunk that is all there: its checksum says which of its fields are wrong."""
+    def _packed(self, damaged: Damaged, compression: str, head: bytes) -> bytes:
+        """The content of a chunk that is compressed so, as far as it is there."""
+        place = CHUNK.size + 4 + len(compression)
+        length = min(int.from_bytes(head[place : place + 8], 'little'), damaged.size - RECORD.size - place - 8, MOST_CHUNK_BYTES)
+        return self.read(damaged.at + RECORD.size + place + 8, max(length, 0))
+
+    def _contradictory(self, damaged: Damaged, name: str, size: int, crc: int, times: tuple[int, int] | None) -> Salvaged:
+        """A chunk that is all there: its checksum tells which of its fields are wrong."""
         best, what = None, f'a chunk that is compressed with {name[:20]!r}, which is not supported'
-        for compression in dict.fromkeys((name, 'zstd', 'lz4', '')):
-            if compression not in {'zstd', 'lz4', ''}:
-                continue
-            raw = partly_unpacked(compression, data, MOST_CHUNK_BYTES if crc else size) if compression else data
+        head = self.read(damaged.at + RECORD.size, _CHUNK_FIELDS + 4)
+        for compression in sorted(_COMPRESSIONS, key=lambda each: each != name):
+            data = self._packed(damaged, compression, head)
+            likely = 16 * len(data) + BLOCK_BYTES  # also where the size is what is wrong
+            most = size if likely < size <= MOST_CHUNK_BYTES else min(likely, MOST_CHUNK_BYTES)
+            raw = partly_unpacked(compression, data, most) if compression else data
             contents, end = self._walk(memoryview(raw))
             if crc and zlib.crc32(raw) == crc:
                 what = f'{contents.lost} messages of unknown channels' if contents.lost else 'wrong fields of a chunk'
@@ -382,13 +436,26 @@ class Salvage:
                 best = Salvaged(what, contents, is_whole, is_whole, times)
         return best or Salvaged(what, None, False, False, times)
 
-    def _search(self, start: int) -> int:
-        """Where the next intact piece begins; the end of the file if there is none, or it would take too long to find it."""
+    def _chunk_length(self, at: int) -> int:
+        """Of a chunk's content, by its own fields; 0 if they make no sense."""
+        head = self.read(at + RECORD.size, _CHUNK_FIELDS + 4)
+        name_length = int.from_bytes(head[CHUNK.size : CHUNK.size + 4], 'little')
+        place = CHUNK.size + 4 + name_length
+        if head[CHUNK.size + 4 : place].decode(errors='replace') not in _COMPRESSIONS or place + 8 > len(head):
+            return 0
+        return place + 8 + int.from_bytes(head[place : place + 8], 'little')
+
+    def _search(self, start: int, chunk_end: int = 0) -> int:
+        """Where the next intact piece begins; the end of the file if there is none, or it would take too long to find it.
+
+        Up to ``chunk_end`` there is a chunk, whose own records are no pieces.
+        """
         while start < self.size and self._spend(BLOCK_BYTES // 16):
             block = self.read(start, BLOCK_BYTES + RECORD.size)
             for match in _START.finditer(block, 0, min(BLOCK_BYTES, len(block)) + RECORD.size):
                 at = start + match.start()
-                if match.start() < BLOCK_BYTES and self._is_strong(at):
+                is_outside = at >= chunk_end or block[match.start()] not in _IN_CHUNKS
+                if match.start() < BLOCK_BYTES and is_outside and self._is_strong(at):
                     return at
                 if self._left <= 0:
                     return self.size
@@ -401,12 +468,12 @@ class Salvage:
         op, length = self._head(at)
         if not self._fits(at, op, length) or not self._spend(min(length, MOST_CHUNK_BYTES)):
             return False
+        if op == Opcode.CHUNK and self.read(at + RECORD.size + CHUNK.size - 4, 4) != bytes(4):
+            return length <= MOST_CHUNK_BYTES and self._unpacked(at, length) is not None  # also one of unknown channels
         piece = self._piece(at)
         if piece is None:
             return False
         after = at + piece.size
-        if isinstance(piece, IntactChunk) and self.read(at + RECORD.size + 24, 4) != bytes(4):
-            return True
         if after >= self.size:
             return op != Opcode.MESSAGE_INDEX if isinstance(piece, IntactRecord) else bool(piece.contents.messages)
         return op == Opcode.FOOTER or self._is_record(after)
@@ -431,38 +498,56 @@ class Salvage:
 
     def _knows(self, channel: int, more: Declarations | None = None) -> bool:
         """Whether a channel is declared, with its schema."""
-        every = [self.known, self.hints] if more is None else [more, self.known, self.hints]
+        every = [*([] if more is None else [more]), *self._sources()]
         content = next((each.channels[channel] for each in every if channel in each.channels), None)
         return content is not None and any(each.has_schema_of(content) for each in every)
+
+    def _sources(self) -> tuple[Declarations, ...]:
+        return self.known, self.hints, self.unverified
 
     def _spend(self, count: int) -> bool:
         self._left -= count
         return self._left > 0
 
     def _read_hints(self) -> None:
-        """The schemas and channels of the summary, as far as there is one."""
-        tail = self.read(max(self.size - RECORD.size - 20 - len(MAGIC), 0), RECORD.size + 20 + len(MAGIC))
-        if not tail.endswith(MAGIC) or tail[:9] != RECORD.pack(Opcode.FOOTER, 20):
+        """The schemas and channels of the summary, as far as there is one; bytes may follow the end of the file, or be lost."""
+        start = max(self.size - HINT_BYTES, 0)
+        tail = self.read(start, HINT_BYTES)
+        footer_at = tail.rfind(_FOOTER)
+        if footer_at < 0 or footer_at + len(_FOOTER) + _LEAST[Opcode.FOOTER] > len(tail):
             return
-        at = parsed(Footer, tail[9:29]).summary_start
+        content = tail[footer_at + len(_FOOTER) :][: _LEAST[Opcode.FOOTER]]
+        footer, end = parsed(Footer, content), start + footer_at + len(_FOOTER) + len(content) - 4
+        after_data = tail.rfind(_DATA_END, 0, footer_at)
+        for at in (footer.summary_start, start + after_data + len(_DATA_END) + 4 if after_data >= 0 else 0):
+            if len(MAGIC) <= at < end and end - at <= MOST_SUMMARY_BYTES:
+                self.is_verified = bool(footer.summary_crc) and self._crc(at, end) == footer.summary_crc
+                self._read_summary(at)
+                if self.is_verified:
+                    return
+
+    def _read_summary(self, at: int) -> None:
         while len(MAGIC) <= at < self.size and self.hints.size < MOST_SUMMARY_BYTES:
             op, length = self._head(at)
             if op not in _SUMMARY or not self._fits(at, op, length) or op == Opcode.FOOTER or length > MOST_SUMMARY_BYTES:
                 return
             if op in _DECLARED:
                 content = self.read(at + RECORD.size, length)
-                if not _can_parse(_DECLARED[op], content):
+                if _length(_DECLARED[op], content) is None:
                     return
                 self.hints.add(op, content)
+            elif op == Opcode.STATISTICS:
+                with suppress(*UNREADABLE):
+                    self.statistics = parsed(Statistics, self.read(at + RECORD.size, length))
             at += RECORD.size + length
 
 
-def _can_parse(kind: type[Schema | Channel | Metadata | Header], content: bytes) -> bool:
+def _length(kind: type[Schema | Channel | Metadata | Header], content: bytes) -> int | None:
+    """Of a record's fields; None where they are not complete."""
     try:
-        parsed(kind, content)
+        return length_of(kind, content)
     except UNREADABLE:
-        return False
-    return True
+        return None
 
 
 def _name(op: int, *, is_torn: bool) -> str:

@@ -212,3 +212,41 @@ def test_pages_of_a_bag_whose_times_are_a_counter(tmp_path: Path) -> None:
         ran = run(home, verb, f'{folder}/', *(('-o', tmp_path / 'other') if verb == 'cut' else ()))
         assert isinstance(ran.exception, BagDamaged)
         assert 'fetch' not in str(ran.exception)
+
+
+def test_repair(tmp_path: Path) -> None:
+    """It says what was damaged, lost and rebuilt, in words and as JSON; exit code 1 if something was, 0 if nothing is."""
+    folder = tmp_path / NAME
+    write_ours(folder)
+    whole = run(tmp_path, 'repair', folder)
+    assert (whole.return_value, 'nothing is damaged in 3 files' in whole.output) == (0, True)
+    torn = folder / f'{NAME}_1.mcap'
+    torn.write_bytes(torn.read_bytes()[:-100_000])
+    found = run(tmp_path, 'repair', folder)
+    assert found.return_value == 1
+    for text in (f'{NAME}_repaired: ', '1 of them damaged', 'a chunk that is torn', 'rebuilt: the summary and the footer'):
+        assert text in found.output
+    assert run(tmp_path, 'verify', f'{folder}_repaired', '--deep').return_value == 0
+    told = said(run(tmp_path, 'repair', folder, '-o', tmp_path / 'other', '--json'))
+    assert isinstance(told, dict)
+    assert (told['out'], told['is_damaged']) == (str(tmp_path / 'other'), True)
+    (file,) = [each for each in told['files'] if each['losses']]
+    assert (file['name'], file['messages'] + file['lost_messages'], file['losses'][0]['messages']) == (torn.name, 550, None)
+    assert 'exists already' in str(run(tmp_path, 'repair', folder).exception)
+    assert 'exclude each other' in str(run(tmp_path, 'repair', folder, '--in-place', '-o', 'x').exception)
+    assert run(tmp_path, 'repair', folder, '--in-place').return_value == 1
+    assert run(tmp_path, 'repair', folder, '--in-place').return_value == 0
+
+
+def test_a_torn_bag_says_how_it_is_repaired(tmp_path: Path) -> None:
+    """Whichever verb comes upon it."""
+    folder = tmp_path / NAME
+    write_ours(folder)
+    torn = folder / f'{NAME}_1.mcap'
+    torn.write_bytes(torn.read_bytes()[:-100_000])
+    (folder / 'manifest.json').unlink()
+    for arguments in (('cut', folder, '-o', tmp_path / 'piece'), ('verify', folder), ('info', folder)):
+        found = run(tmp_path, *arguments)
+        assert found.return_value == 1
+        assert torn.name in found.output
+        assert 'bag repair' in found.output, arguments

@@ -159,6 +159,17 @@ def test_a_slice_that_was_being_closed(tmp_path: Path, opened: bytes) -> None:
         assert again.damage == Damage(0, 0, 0)
 
 
+def test_a_channel_that_the_summary_alone_has(tmp_path: Path, opened: bytes) -> None:
+    """Nothing can be inserted into a slice in place: the messages of a channel whose record is damaged are lost, and counted."""
+    info, _ = closed(tmp_path / 'bag_0.mcap', COUNT, sync_every=A_CHUNK)
+    content = bytearray(info.path.read_bytes())
+    content[content.index(b'/echo') - 4] ^= 0xFF
+    info = recovered(tmp_path, bytes(content))
+    assert info.messages == 0
+    assert info.damage is not None
+    assert info.damage.chunks + info.damage.tail_bytes > 0
+
+
 class Killed(BaseException):
     """What no handler may catch."""
 

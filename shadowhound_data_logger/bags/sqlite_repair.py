@@ -1,0 +1,128 @@
+"""Copies the rows of a damaged file of rosbag2's SQLite storage that can still be read into a new one.
+
+Rows that a recorder had committed but that are still in its write-ahead log (``-wal``, next to the file) are included.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.bags.contents import check_schema
+from shadowhound_data_logger.durable_files import sync
+from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES
+
+TABLES: Final = ('schema', 'metadata', 'topics', 'message_definitions', 'messages')
+_TYPES: Final = frozenset({'INTEGER', 'TEXT', 'BLOB'})
+_LAST: Final = 1 << 62
+LOST: Final = 'rows that cannot be read'
+
+
+def salvage_tables(source: Path, target: Path) -> str:
+    """Make ``target``, which must not exist; what was lost in words, or empty. Raises BagDamaged if nothing can be read."""
+    with tempfile.TemporaryDirectory(prefix='.shadowhound-', dir=target.parent) as folder:
+        copy = Path(folder, 'source.db3')
+        shutil.copyfile(source, copy)
+        _fit(copy)
+        if (log := source.with_name(f'{source.name}-wal')).is_file():
+            shutil.copyfile(log, copy.with_name(f'{copy.name}-wal'))
+        try:
+            with closing(sqlite3.connect(copy)) as database, closing(sqlite3.connect(target)) as new:
+                lost = _copy(database, new)
+        except (sqlite3.Error, UnicodeDecodeError, ValueError) as error:
+            target.unlink(missing_ok=True)
+            raise BagDamaged(f'{source} cannot be read: {error}', path=str(source)) from error
+    sync(target)
+    return LOST if lost else ''
+
+
+def _fit(path: Path) -> None:
+    """SQLite opens no file that is shorter than its header says: have the header say how many complete pages there are.
+
+    Then a row with a page that is missing cannot be read, instead of being read as zeros.
+    """
+    with path.open('r+b') as file:
+        head = file.read(32)
+        page = int.from_bytes(head[16:18], 'big')
+        page = 65_536 if page == 1 else page
+        pages = path.stat().st_size // page if page else 0
+        if head.startswith(b'SQLite format 3\0') and 0 < pages < int.from_bytes(head[28:32], 'big'):
+            file.seek(28)
+            file.write(pages.to_bytes(4, 'big'))
+            file.truncate(pages * page)
+
+
+def _copy(database: sqlite3.Connection, new: sqlite3.Connection) -> bool:
+    """Whether something was lost."""
+    if why := check_schema(database):
+        raise ValueError(why)
+    there = {str(name) for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    is_lost = False
+    for table in TABLES:
+        if table not in there:
+            continue
+        columns = [(str(name), str(kind).upper(), bool(key)) for _, name, kind, _, _, key in
+                   database.execute(f'PRAGMA table_info({table})')]  # fmt: skip
+        if not all(name.isidentifier() for name, _, _ in columns):
+            raise ValueError(f'{table} has a column without a name')
+        fields = (f'"{name}" {kind if kind in _TYPES else ""}{" PRIMARY KEY" * key}' for name, kind, key in columns)
+        new.execute(f'CREATE TABLE {table} ({", ".join(fields)})')
+        rows = _Rows(database, table, [name for name, _, _ in columns])
+        marks = ', '.join('?' * len(columns))
+        new.executemany(f'INSERT OR IGNORE INTO {table} VALUES ({marks})', rows)  # noqa: S608 - of TABLES, and question marks
+        is_lost |= rows.is_lost
+    new.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
+    new.commit()
+    return is_lost
+
+
+class _Rows:
+    """The rows of a table, by their number; those that cannot be read are skipped."""
+
+    def __init__(self, database: sqlite3.Connection, table: str, columns: list[str]) -> None:
+        names = ', '.join(f'"{name}"' for name in columns)
+        small = ' AND '.join(f'ifnull(length("{name}"), 0) <= {MOST_CHUNK_BYTES}' for name in columns)
+        if table == 'messages':
+            small += " AND typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+        self._query = f'SELECT rowid, {names} FROM {table} WHERE rowid > ? AND {small} ORDER BY rowid'  # noqa: S608 - checked by the caller
+        self._database = database
+        self.is_lost = False
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        last = -1
+        while last < _LAST:
+            try:
+                for number, *fields in self._database.execute(self._query, (last,)):
+                    last = number
+                    yield tuple(fields)
+            except sqlite3.DatabaseError:
+                self.is_lost = True
+                last = self._skip(last)
+            else:
+                return
+
+    def _skip(self, last: int) -> int:
+        """The number after which there is a row again that can be read."""
+        step = 1
+        while not self._is_readable(last + step):
+            step *= 2
+            if last + step >= _LAST:
+                return _LAST
+        low, high = last + step // 2, last + step
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._is_readable(middle) else (middle, high)
+        return high
+
+    def _is_readable(self, number: int) -> bool:
+        """Whether the first row after this number can be read."""
+        try:
+            return self._database.execute(f'{self._query} LIMIT 1', (number,)).fetchone() is not None
+        except sqlite3.DatabaseError:
+            return False
