@@ -23,6 +23,7 @@ from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.content import warn_of
 
 THREADS: Final = 16
 """Requests on their way at a time; each waits, most of its time, for the server."""
@@ -48,8 +49,8 @@ class Bucket:
     def folders(self, prefix: str) -> Sequence[str]:
         return self._ask(lambda store: store.folders(self.name, prefix))
 
-    def list(self, prefix: str) -> Sequence[ObjectInfo]:
-        return self._ask(lambda store: [*store.list(self.name, prefix)])
+    def list(self, prefix: str, skipped: Callable[[str, str], None] = warn_of) -> Sequence[ObjectInfo]:
+        return self._ask(lambda store: [*store.list(self.name, prefix, skipped)])
 
     def get(self, key: str, most: int) -> bytes:
         return self._ask(lambda store: store.get(self.name, key, most))

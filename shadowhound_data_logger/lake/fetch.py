@@ -72,8 +72,10 @@ class _Done:
 
 
 def under(source: Bucket, prefix: str) -> list[Wish]:
-    """All whose keys begin so. Raises StoreError."""
-    return [Wish(source.name, entry.key, entry.size, etag=entry.etag) for entry in source.list(prefix)]
+    """All whose keys start with the prefix, also those that ``fetch`` refuses because they are not paths. Raises StoreError."""
+    odd: list[Wish] = []
+    found = source.list(prefix, lambda bucket, key: odd.append(Wish(bucket, key, 0)))
+    return [*(Wish(source.name, entry.key, entry.size, etag=entry.etag) for entry in found), *odd]
 
 
 def fetch(

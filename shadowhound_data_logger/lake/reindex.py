@@ -62,7 +62,8 @@ def reindex(
     known = _keys(source, robot, findings)
     for bucket in buckets:
         place = Bucket(source.settings, bucket)
-        entries = (entry for entry in place.list(f'{robot}/') if is_row(bucket, entry.key))
+        listed = place.list(f'{robot}/', lambda bucket, key: findings.add(f'{bucket}/{key}', 'its key is not a path'))
+        entries = (entry for entry in listed if is_row(bucket, entry.key))
         while page := list(islice(entries, PAGE)):
             found.listed += len(page)
             new = [entry for entry in page if (bucket, entry.key) not in known]

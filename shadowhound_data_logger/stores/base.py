@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 from shadowhound_data_logger.bandwidth import Pace
 from shadowhound_data_logger.errors import ObjectRefused
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.content import warn_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -90,11 +91,14 @@ class ObjectStore(Protocol):
         The one thing that is ever overwritten: a mailbox. Raises ObjectRefused (``missing``) where there is no such object.
         """
 
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
-        """The objects whose keys begin so, in key order, without ``sha256`` and metadata; none where there is no such bucket."""
+    def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
+        """The objects whose keys start with the prefix, in key order, without ``sha256`` and metadata; none without the bucket.
+
+        An object whose key is not a path is skipped: ``skipped`` is called with its bucket and key.
+        """
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
-        """The names of the folders right below a prefix that ends with ``/`` or is empty, sorted."""
+        """The names of the folders directly below a prefix that ends with ``/`` or is empty, sorted; of paths alone."""
 
     def delete(self, bucket: str, key: str) -> None:
         """For good; one that is gone already is not an error. No stage of the robot deletes."""

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.keys import check_key, check_name
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.untrusted import is_path
+from shadowhound_data_logger.untrusted import is_path, visible
 
 _PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
 """Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""
@@ -27,6 +29,8 @@ PART_BYTES: Final = 8 << 20
 """What a broken connection costs at most: eight seconds of a link of 1 MB/s. S3 allows no smaller one than 5 MiB."""
 MOST_PARTS: Final = 10_000
 """S3's own limit."""
+
+log = logging.getLogger(__name__)
 
 
 def check_target(bucket: str, key: str) -> None:
@@ -46,6 +50,25 @@ def check_read(bucket: str, key: str) -> None:
         raise ObjectRefused(str(error), reason='name', bucket=bucket, key=key) from error
     if not is_path(key):
         raise ObjectRefused(f'the key {key[:200]!r} is not a path below a folder', reason='name', bucket=bucket, key=key)
+
+
+@lru_cache(maxsize=1024)
+def warn_of(bucket: str, key: str) -> None:
+    """Once per process and object."""
+    log.warning('%s/%s is skipped: its key is not a path', bucket, visible(key))
+
+
+def paths(entries: Iterable[ObjectInfo], skipped: Callable[[str, str], None]) -> Iterator[ObjectInfo]:
+    """The objects whose keys are paths; ``skipped`` is called with bucket and key of each of the others.
+
+    Such keys (``a//b``, ``a/``, with a control character) are made by other programs: no file can have such a name, and some
+    clients ask for another object than the one that was listed.
+    """
+    for entry in entries:
+        if is_path(entry.key):
+            yield entry
+        else:
+            skipped(entry.bucket, entry.key)
 
 
 def chunks(item: SpooledObject) -> Iterator[bytes]:

@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from operator import itemgetter
@@ -30,8 +30,10 @@ from shadowhound_data_logger.stores.content import (
     chunks,
     identical_or_foreign,
     object_metadata,
+    paths,
+    warn_of,
 )
-from shadowhound_data_logger.untrusted import from_json
+from shadowhound_data_logger.untrusted import from_json, is_path
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'
@@ -120,19 +122,23 @@ class DirectoryStore:
             sync(self._path(bucket, key).parent)
         return True
 
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+    def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
         folder = prefix.rpartition('/')[0]
         with self._reading(bucket, folder or 'any'):
             found = [(key, seen) for key, seen in _files(self._directory / bucket, folder) if key.startswith(prefix)]
         for key, seen in sorted(found, key=itemgetter(0)):
             modified = datetime.fromtimestamp(seen.st_mtime, timezone.utc)
-            yield ObjectInfo(bucket, key, seen.st_size, None, etag=str(seen.st_mtime_ns), modified=modified)
+            yield from paths(
+                (ObjectInfo(bucket, key, seen.st_size, None, etag=str(seen.st_mtime_ns), modified=modified),), skipped
+            )
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
         below = prefix.rstrip('/')
         with self._reading(bucket, below or 'any'):
             folder = self._path(bucket, below)
-            return sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+            return (
+                sorted(path.name for path in folder.iterdir() if is_path(path.name) and path.is_dir()) if folder.is_dir() else []
+            )
 
     def delete(self, bucket: str, key: str) -> None:
         with self._reading(bucket, key):

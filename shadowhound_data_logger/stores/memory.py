@@ -20,6 +20,8 @@ from shadowhound_data_logger.stores.content import (
     chunks,
     identical_or_foreign,
     object_metadata,
+    paths,
+    warn_of,
 )
 
 
@@ -102,11 +104,12 @@ class MemoryStore:
             self._objects[bucket, key] = new, body
         return True
 
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+    def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
         with self._lock:
             held = sorted(where for where in self._objects if where[0] == bucket and where[1].startswith(prefix))
             infos = [self._objects[where][0] for where in held]
-        return (ObjectInfo(info.bucket, info.key, info.size, None, etag=info.etag, modified=info.modified) for info in infos)
+        found = (ObjectInfo(info.bucket, info.key, info.size, None, etag=info.etag, modified=info.modified) for info in infos)
+        return paths(found, skipped)
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
         below = (info.key[len(prefix) :].partition('/') for info in self.list(bucket, prefix))

@@ -32,9 +32,10 @@ from shadowhound_data_logger.errors import (
 )
 from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.base import Content, joined
-from shadowhound_data_logger.stores.content import check_read, check_target, chunks, identical_or_foreign, opened
+from shadowhound_data_logger.stores.content import check_read, check_target, chunks, identical_or_foreign, opened, paths, warn_of
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
+from shadowhound_data_logger.untrusted import is_path
 
 STREAM_BYTES: Final = 4 << 20
 """Larger objects are read twice from the disk (hash, send) instead of once into memory, of which each thread takes so much."""
@@ -116,13 +117,13 @@ class S3Store:
         check_target(bucket, key)
         return self._asking(lambda: self._s3.replace(bucket, key, body, version))
 
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+    def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
         check_read(bucket, 'any')
-        yield from sorted(self._s3.list(bucket, prefix), key=attrgetter('key'))
+        yield from sorted(paths(self._s3.list(bucket, prefix), skipped), key=attrgetter('key'))
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
         check_read(bucket, 'any')
-        return sorted(self._s3.folders(bucket, prefix))
+        return sorted(filter(is_path, self._s3.folders(bucket, prefix)))
 
     def delete(self, bucket: str, key: str) -> None:
         check_read(bucket, key)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import timedelta
@@ -32,7 +32,7 @@ from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
-from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read
+from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read, paths, warn_of
 from shadowhound_data_logger.stores.s3_metadata import from_headers
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ _CLIENTS: Final = 16
 _CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
 _MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
 _STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')
+REPLACED: Final = '\N{REPLACEMENT CHARACTER}'
 NOTHING_THERE: Final = 416
 """Behind the first byte that was asked for."""
 _HEADERS: Final = {
@@ -136,20 +137,36 @@ class ObstoreStore:
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
         return self._plain.replace(bucket, key, body, version)
 
-    def list(self, bucket: str, prefix: str = '') -> Iterator[ObjectInfo]:
+    def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
+        try:
+            found = self._listed(bucket, prefix)
+        except ObjectRefused as error:
+            if error.data.get('reason') != 'name':
+                raise
+            found = None  # obstore refuses a whole page for one key that is not a path
+        if found is None or any(not each.size or REPLACED in each.key for each in found):
+            # obstore drops the slash of a folder's marker, and gets what XML cannot hold replaced
+            found = self._plain.list(bucket, prefix, skipped)
+        yield from sorted(paths(found, skipped), key=attrgetter('key'))
+
+    def _listed(self, bucket: str, prefix: str) -> Iterable[ObjectInfo]:
         folder, _, begin = prefix.rpartition('/')
         if not begin:
-            yield from sorted(self._all(bucket, folder), key=attrgetter('key'))
-            return
+            return self._all(bucket, folder)
         below = self._below(bucket, folder)  # S3 knows any prefix, obstore whole names alone
         found = [_entry(bucket, each) for each in below['objects'] if each['path'].startswith(prefix)]
         for each in below['common_prefixes']:
             if each.startswith(prefix):
                 found += self._all(bucket, each)
-        yield from sorted(found, key=attrgetter('key'))
+        return found
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
-        return sorted(folder.rpartition('/')[2] for folder in self._below(bucket, prefix)['common_prefixes'])
+        try:
+            return sorted(folder.rpartition('/')[2] for folder in self._below(bucket, prefix)['common_prefixes'])
+        except ObjectRefused as error:
+            if error.data.get('reason') != 'name':
+                raise
+            return self._plain.folders(bucket, prefix)
 
     def delete(self, bucket: str, key: str) -> None:
         self._ask(bucket, key, lambda client: obstore.delete(client, key))
@@ -317,5 +334,5 @@ def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> S
     if isinstance(error, refused.UnauthenticatedError):
         return s3_errors.refused('InvalidAccessKeyId', 401, message, request)
     if isinstance(error, (refused.InvalidPathError, ValueError)):
-        return ObjectRefused(f'the key {bucket}/{key:.80} cannot be asked for', reason='name', bucket=bucket, key=key)
+        return ObjectRefused(f'the key {bucket}/{key:.80} is not a path', reason='name', bucket=bucket, key=key)
     return s3_errors.away(str(error), request)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,7 @@ from shadowhound_data_logger.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.content import warn_of
 
 NOON_NS: Final = 1_793_188_800 * SECOND
 """2026-10-28T12:00:00Z."""
@@ -123,9 +124,9 @@ class Watched:
         self._ask('folders', prefix)
         return self.inner.folders(prefix)
 
-    def list(self, prefix: str) -> Sequence[ObjectInfo]:
+    def list(self, prefix: str, skipped: Callable[[str, str], None] = warn_of) -> Sequence[ObjectInfo]:
         self._ask('list', prefix)
-        return self.inner.list(prefix)
+        return self.inner.list(prefix, skipped)
 
     def get(self, key: str, most: int) -> bytes:
         self._ask('get', key)
