@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from bags.conformance import DATA, Recorded, variants
-from bags.test_foreign import metadata_yaml, read
+from bags.reference import metadata_yaml, read
 from mcap.reader import NonSeekingReader
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote

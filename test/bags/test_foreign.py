@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 from bags.real_bags import T0
+from bags.reference import BARE, CDR, INT, STRING, S, metadata_yaml, read, ten, topics, write
 from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
@@ -26,48 +25,6 @@ from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.mcap.index import read_index, read_summary
 from shadowhound_data_logger.mcap.ranges import LocalFile
 from shadowhound_data_logger.stores.directory import DirectoryStore
-
-S = 10**9
-STRING = ('std_msgs/msg/String', 'ros2msg', b'string data\n')
-INT = ('std_msgs/msg/Int32', 'ros2msg', b'int32 data\n')
-CDR = b'\0\1\0\0\2\0\0\0a\0'
-BARE: dict[str, Any] = {
-    'index_types': IndexType.NONE, 'use_statistics': False, 'use_summary_offsets': False, 'repeat_channels': False,
-    'repeat_schemas': False,
-}  # fmt: skip
-
-
-def write(path: Path, fill: Callable[[Writer], None], *, profile: str = 'ros2', **options: Any) -> Path:
-    """A file of the reference writer, in a folder of its own; returns the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open('wb') as file:
-        writer = Writer(file, **options)
-        writer.start(profile, 'other')
-        fill(writer)
-        writer.finish()
-    return path.parent
-
-
-def ten(writer: Writer) -> None:
-    """Ten messages on two topics, a second apart."""
-    schema = writer.register_schema(*STRING)
-    channels = [writer.register_channel(topic, 'cdr', schema) for topic in ('/chat', '/talk')]
-    for n in range(10):
-        writer.add_message(channels[n % 2], T0 + n * S, CDR, T0 + n * S, n)
-
-
-def read(path: Path) -> list[tuple[object, ...]]:
-    """As the `mcap` package reads a file: everything of each message and of its channel but their numbers."""
-    with path.open('rb') as file:
-        return [
-            (channel.topic, channel.message_encoding, channel.metadata, schema and (schema.name, schema.encoding, schema.data),
-             message.log_time, message.publish_time, message.sequence, message.data)
-            for schema, channel, message in make_reader(file).iter_messages(log_time_order=False)
-        ]  # fmt: skip
-
-
-def topics(folder: Path) -> dict[tuple[str, str], int | None]:
-    return {(topic.name, topic.type): topic.messages for topic in info_folder(folder).description.topics}
 
 
 @pytest.mark.parametrize('options', [
@@ -149,24 +106,6 @@ def test_channels_are_counted_not_topics(tmp_path: Path) -> None:
         (text,) = (topic for topic in info_folder(each).description.topics if topic.type == STRING[0])
         assert {profile['history'] for profile in text.qos} == {1, 2}
     assert len({str(one[2]) for one in read(tmp_path / 'piece' / 'piece_0.mcap') if one[3][0] == STRING[0]}) == 2  # type: ignore[index]
-
-
-def metadata_yaml(folder: Path, files: Mapping[str, tuple[int, int, int]] | None = None, **changed: Any) -> None:
-    """As rosbag2 4 or 5 writes it; ``files`` has messages, start and duration of each."""
-    names = sorted(path.name for path in folder.glob('*_[0-9].*'))
-    told = {
-        'version': 5, 'storage_identifier': 'mcap', 'relative_file_paths': names, 'duration': {'nanoseconds': 9 * S},
-        'starting_time': {'nanoseconds_since_epoch': T0}, 'message_count': 10, 'compression_format': '', 'compression_mode': '',
-        'topics_with_message_count': [
-            {'topic_metadata': {'name': topic, 'type': STRING[0], 'serialization_format': 'cdr', 'offered_qos_profiles': ''},
-             'message_count': 5} for topic in ('/chat', '/talk')
-        ],
-        'files': [
-            {'path': name, 'starting_time': {'nanoseconds_since_epoch': start}, 'duration': {'nanoseconds': length},
-             'message_count': count} for name, (count, start, length) in (files or {}).items()
-        ],
-    }  # fmt: skip
-    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': {**told, **changed}}))
 
 
 @pytest.mark.parametrize('start', [T0, T0 + 20 * S], ids=['Humble', 'Galactic'])
@@ -272,7 +211,7 @@ def test_a_message_at_0_that_the_statistics_do_not_have(tmp_path: Path) -> None:
             writer.add_message(channel, n, CDR, n)
 
     for options in ({}, {'use_chunking': False}):
-        folder = write(tmp_path / f'b{len(options)}' / 'b_0.mcap', fill, **options)
+        folder = write(tmp_path / f'b{len(options)}' / 'b_0.mcap', fill, enable_crcs=False, **options)
         content = (folder / 'b_0.mcap').read_bytes()
         statistics = b'\0' * 8 + (2).to_bytes(8, 'little')
         assert content.count(statistics + b'\x0a\0\0\0\1\0') == 1

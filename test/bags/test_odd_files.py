@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import pytest
 import zstandard
-from bags.test_foreign import CDR, STRING, read, topics, write
+from bags.reference import CDR, STRING, read, topics, write
 from click.testing import CliRunner
 from lz4.frame import compress as lz4_compress
 from mcap.data_stream import RecordBuilder

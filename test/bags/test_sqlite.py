@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zstandard
 from bags.real_bags import T0
-from bags.test_foreign import CDR, read
+from bags.reference import CDR, read
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import pytest
 from bags.real_bags import NAME, stored, write_ours
-from bags.test_foreign import write
+from bags.reference import write
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
 from stores.spooled import QUICK
