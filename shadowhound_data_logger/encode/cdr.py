@@ -28,7 +28,7 @@ _SLACK_BYTES: Final = 4
 returns as many bytes as rmw_fastrtps estimates, which aligns an empty sequence of float64 and adds a NUL to a wstring."""
 _ENCAPSULATIONS: Final = {0: ('>', 8), 1: ('<', 8), 6: ('>', 4), 7: ('<', 4)}
 """Second byte -> byte order and maximum alignment: CDR, and XCDR2 of final types (DDS-XTypes 1.3, table 60). The others have
-headers in front of members; no RMW sends them."""
+headers in front of members; no RMW sends them, nor XCDR2."""
 _CODES: Final = {
     'bool': '?', 'byte': 'b', 'char': 'B', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I',
     'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
@@ -75,10 +75,13 @@ class _Reader:
             name = of[0]
             return self._text() if name == 'string' else self._wide_text() if name == 'wstring' else self._number(_CODES[name])
         inner, count = of
+        is_primitive = inner[0] == Nodetype.BASE and inner[1][0] in _CODES
+        if self._max_align < 8 and not is_primitive:
+            self._number('I')  # XCDR2: the bytes that follow
         if kind == Nodetype.SEQUENCE:
             count = self._number('I')
             self.slack += 0 if count else _SLACK_BYTES
-        if inner[0] == Nodetype.BASE and inner[1][0] in _CODES:
+        if is_primitive:
             return self._numbers(_CODES[inner[1][0]], count)
         return [self._value(inner) for _ in range(count)]  # ends with the bytes: each takes at least one
 
