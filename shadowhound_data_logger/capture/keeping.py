@@ -41,7 +41,7 @@ class Keeping:
 
     def __init__(self, settings: KeepSettings, sensors: Mapping[str, SensorSettings], robot: str) -> None:
         """``sensors`` are the settings in force."""
-        self._always = settings.missions
+        self._always = always_shipped(settings)
         self._period_ns = round(settings.preview_s * SECOND)
         self._sensors = sensors
         self._robot = robot
@@ -92,7 +92,12 @@ class Keeping:
 def keeps_bag(settings: BagSettings, keep: KeepSettings, state: BagState) -> bool:
     """Whether the slices of a bag stay on the robot until somebody asks for them; those of events never do."""
     mission = state.mission
-    return settings.ship == ON_REQUEST and (mission is None or mission.type not in keep.missions)
+    return settings.ship == ON_REQUEST and (mission is None or mission.type not in always_shipped(keep))
+
+
+def always_shipped(settings: KeepSettings) -> frozenset[str]:
+    """Types of missions of which nothing stays on the robot."""
+    return frozenset(filter(None, settings.missions))
 
 
 def _picture(body: bytes, content_type: str) -> bytes | None:

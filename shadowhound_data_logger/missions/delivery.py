@@ -13,6 +13,7 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final
 
@@ -63,6 +64,8 @@ class Delivery:
         self._monotonic = monotonic
         self._asked_s: float | None = None
         self._made_by_s = monotonic() + AGENT_S
+        self.awaits_agent = False
+        """Whether nothing was sent because the agent is creating the run."""
 
     @property
     def sent(self) -> MissionSent:
@@ -231,10 +234,13 @@ class Delivery:
 
     def _agent_makes_run(self) -> bool:
         """Whether the agent is creating the run at this moment (new_run.py)."""
-        if self.run is not None or self._monotonic() > self._made_by_s or not journal.is_locked(self.folder.path):
+        self.awaits_agent = False
+        if self.run is None and self._monotonic() <= self._made_by_s:
+            with suppress(OSError):  # a file system that locks no folders: there the agent leaves it to this process
+                self.awaits_agent = journal.is_locked(self.folder.path)
+        if not self.awaits_agent:
             self.run = self.run or self.folder.run()
-            return False
-        return True
+        return self.awaits_agent
 
     def _send(self, run: Run, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
         send(self._tracking, run.run_id, (points, params, tags), self._refuse)

@@ -180,7 +180,7 @@ def stamped(mission_type: str, start_ns: int) -> str:
 
 def run_name(mission_type: str, start_ns: int) -> str:
     """The name of the run in MLflow: the same, with the type as the agent spelled it."""
-    return f'{mission_type}_{utc(start_ns):%Y%m%d_%H%M%S}'
+    return f'{mission_type or "mission"}_{utc(start_ns):%Y%m%d_%H%M%S}'
 
 
 def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:

@@ -45,7 +45,11 @@ class NewRun:
         """Whether no server answered: nobody else will have a run soon."""
         self.is_settled = threading.Event()
         self._descriptor = os.open(folder.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        lock(self._descriptor, wait=False)
+        try:
+            lock(self._descriptor, wait=False)
+        except OSError:
+            os.close(self._descriptor)
+            raise
 
     def settle(self, run: Run | None = None, *, is_hopeless: bool = False) -> None:
         """Note the run, if there is one, and unlock the folder."""

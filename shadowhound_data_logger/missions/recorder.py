@@ -301,7 +301,8 @@ class Beginning:
         try:
             folder = new_folder(self.home, given, time_ns)
             if self.runs is not None and time_ns >= EARLIEST_SANE_NS:
-                new_run = NewRun(folder)  # before the sender sees the journal
+                with suppress(OSError):  # a file system that locks no folders: the sender creates the run
+                    new_run = NewRun(folder)  # before the sender sees the journal
             journal = _begun(folder, start)
         except OSError as error:
             if new_run is not None:

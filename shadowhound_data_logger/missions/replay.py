@@ -154,7 +154,8 @@ class Replay:
     @property
     def owes(self) -> bool:
         """Whether something could not be sent yet."""
-        return any(gate.error for gate in self.gates.values()) or self._spooler.owes or self._drawing.busy or bool(self._waiting)
+        waits = bool(self._waiting) or any(delivery.awaits_agent for delivery in self._deliveries.values())
+        return waits or any(gate.error for gate in self.gates.values()) or self._spooler.owes or self._drawing.busy
 
     def hurry(self) -> None:
         for gate in self.gates.values():

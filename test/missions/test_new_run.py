@@ -9,16 +9,18 @@ from pathlib import Path
 
 import pytest
 from e2e.wire import HANG, PASS, REFUSE
-from missions.fakes import FakeSpooler, FakeTracking, journalling
+from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 from missions.server import Server, complete, until
 from stores.certificates import Authority
 from stores.tls_front import behind_tls
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.missions import journal, recorder
+from shadowhound_data_logger.missions import journal, new_run, recorder
+from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import AGENT_S, Delivery
-from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.new_run import NewRun, RunRequests
+from shadowhound_data_logger.missions.replay import Replay
 from shadowhound_data_logger.missions.tracking import MISSION_TAG
 
 RUN = Run('0123456789abcdef0123456789abcdef', '1', 'mlflow-artifacts:/1/0123/artifacts')
@@ -97,6 +99,7 @@ def test_without_a_server_the_mission_starts_at_once(server: Server, home: Path,
     assert logger.start_mission('patrol', 'no server').startswith('patrol_')
     assert time.monotonic() - began < 5.0
     ended(logger)
+    until(lambda: read_json(home / MISSIONS / 'replay.json').get('pid'), 'the sender is there, which the test must end')
 
 
 @pytest.mark.seaweedfs
@@ -196,6 +199,40 @@ def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, 
         new.settle()
 
 
+def test_the_sender_stays_for_the_agent_s_request(tmp_path: Path, folder: MissionFolder) -> None:
+    """The agent may have closed its logger meanwhile: what its request leaves is still to be sent."""
+    new, tracking = NewRun(folder), FakeTracking()
+    replay = Replay(tmp_path, tracking, FakeSpooler(), FakeDrawing())  # type: ignore[arg-type]
+    replay.step()
+    assert replay.owes
+    new.settle()
+    while replay.step():
+        pass
+    assert not replay.owes
+    assert folder.sent().complete
+
+
+def test_a_file_system_that_locks_no_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Missions are logged and sent as if there were no shortcut."""
+    is_locked = journal.is_locked
+
+    def refuse(where: Path | int, **_: object) -> bool:
+        if isinstance(where, int) or where.is_dir():
+            raise OSError(9, 'Bad file descriptor')
+        return is_locked(where)
+
+    monkeypatch.setattr(Replayer, 'start', lambda _: None)
+    monkeypatch.setattr(new_run, 'lock', refuse)
+    monkeypatch.setattr(journal, 'is_locked', refuse)
+    logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0, tracking_uri='http://127.0.0.1:9', replay=True)
+    logger.start_mission('patrol', '')
+    ended(logger)
+    (found,) = missions(tmp_path)
+    assert [(line.record or {})['k'] for line in found.lines()] == ['start', 'end']
+    delivery = Delivery(found, FakeTracking(), FakeSpooler())  # type: ignore[arg-type]
+    assert not delivery._agent_makes_run()
+
+
 def test_a_fork_does_not_hold_the_mission(folder: MissionFolder) -> None:
     """A process that was forked during the request has a copy of the lock, which ends with the request."""
     new = NewRun(folder)
@@ -213,6 +250,7 @@ def test_a_mission_without_a_date_has_no_run(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(RunRequests, 'prepare', lambda _: None)
     monkeypatch.setattr(RunRequests, 'create', lambda *arguments: asked.append(arguments))
     monkeypatch.setattr(recorder, 'now_ns', lambda _: 10**9)
+    monkeypatch.setattr(Replayer, 'start', lambda _: None)
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0, tracking_uri='http://127.0.0.1:9')
     logger.start_mission('patrol', '')
     logger.close()
