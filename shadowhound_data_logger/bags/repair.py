@@ -23,7 +23,7 @@ from shadowhound_data_logger.bags.description import Description, of_files, of_m
 from shadowhound_data_logger.bags.fetch import Told, on_disk
 from shadowhound_data_logger.bags.manifest import RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural
-from shadowhound_data_logger.bags.sqlite_repair import salvage_tables
+from shadowhound_data_logger.bags.sqlite_repair import LEFT, salvage_tables
 from shadowhound_data_logger.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.mcap.ranges import LocalFile, read_whole
@@ -138,7 +138,7 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
                 each.report = _with_claim(each.report, claimed)
         _check_unchanged(found)
         if not in_place:
-            _copy_others(files, {each.name for each in found if each.report.is_damaged} | {METADATA, MANIFEST}, folder)
+            _copy_others(files, {METADATA, MANIFEST, *(name for each in found for name in _replaced(each))}, folder)
         _describe(folder, raw, files, found)
     return replace(result, out=out, files=tuple(each.report for each in found), metadata=remarks or (CHANGED,))
 
@@ -159,6 +159,8 @@ def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified:
         _repair(found, told, unverified=unverified)
         _check_unchanged([found])
         os.replace(found.new, out)
+        if in_place:
+            _remove_left(found)
         if in_place and out != path:
             path.unlink()
         sync(out.absolute().parent)
@@ -243,6 +245,17 @@ def _report(name: str, found: McapRepair, *more: str) -> FileRepair:
                       found.unverified, found.is_cut)  # fmt: skip
 
 
+def _replaced(found: _Found) -> Sequence[str]:
+    """Names of the files that a repaired one stands for."""
+    return [found.name, *(found.name + suffix for suffix in LEFT)] if found.report.is_damaged else []
+
+
+def _remove_left(found: _Found) -> None:
+    """What a database that was not closed had next to it is in the repaired one."""
+    for suffix in LEFT if found.name.endswith(SQLITE) else ():
+        found.path.with_name(found.path.name + suffix).unlink(missing_ok=True)
+
+
 def _copy_others(files: Mapping[str, Path], skipped: Container[str], folder: Path) -> None:
     for name, source in files.items():
         if name not in skipped:
@@ -305,6 +318,7 @@ def _describe(folder: Path, raw: Mapping[str, Any], files: Mapping[str, Path], f
     for each in found:
         if each.new is not None and each.new.name.endswith(UNFINISHED):
             os.replace(each.new, folder / each.out_name)
+            _remove_left(each)
             if each.name != each.out_name:
                 each.path.unlink()
     sync(folder)

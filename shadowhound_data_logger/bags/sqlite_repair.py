@@ -1,6 +1,7 @@
 """Copies the rows of a damaged file of rosbag2's SQLite storage that can still be read into a new one.
 
-Rows that a recorder had committed but that are still in its write-ahead log (``-wal``, next to the file) are included.
+Rows that a recorder had committed but that are still in its write-ahead log (``-wal``, next to the file) are included, and a
+transaction that it had not committed is rolled back (``-journal``).
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES
 TABLES: Final = ('schema', 'metadata', 'topics', 'message_definitions', 'messages')
 _TYPES: Final = frozenset({'INTEGER', 'TEXT', 'BLOB'})
 _LAST: Final = 1 << 62
+_LOGS: Final = ('-wal', '-journal')
+LEFT: Final = (*_LOGS, '-shm')
+"""What the names of files end with that are left of a database which was not closed; they belong to that file alone."""
 LOST: Final = 'rows that cannot be read'
 
 
@@ -30,8 +34,9 @@ def salvage_tables(source: Path, target: Path) -> str:
         copy = Path(folder, 'source.db3')
         shutil.copyfile(source, copy)
         _fit(copy)
-        if (log := source.with_name(f'{source.name}-wal')).is_file():
-            shutil.copyfile(log, copy.with_name(f'{copy.name}-wal'))
+        for suffix in _LOGS:
+            if (log := source.with_name(source.name + suffix)).is_file():
+                shutil.copyfile(log, copy.with_name(copy.name + suffix))
         try:
             with closing(sqlite3.connect(copy)) as database, closing(sqlite3.connect(target)) as new:
                 lost = _copy(database, new)

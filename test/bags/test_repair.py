@@ -145,6 +145,33 @@ def test_a_damaged_page_of_a_database(tmp_path: Path) -> None:
     assert 250 < file.messages < 300
 
 
+WAL = """
+import os, sqlite3, sys
+database = sqlite3.connect(sys.argv[1])
+database.execute('PRAGMA journal_mode = WAL')
+database.execute('PRAGMA wal_autocheckpoint = 0')
+database.execute('INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 1, data FROM messages')
+database.commit()
+database.execute('INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 2, data FROM messages')
+os._exit(0)
+"""
+
+
+@pytest.mark.parametrize('in_place', [False, True])
+def test_a_database_that_was_not_closed(tmp_path: Path, *, in_place: bool) -> None:
+    """What its recorder had committed to the write-ahead log is in the result, and the log is not."""
+    bag = tmp_path / 'bag'
+    write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
+    subprocess.run([sys.executable, '-c', WAL, str(bag / 'bag.db3')], check=True)
+    assert (bag / 'bag.db3-wal').stat().st_size > 1000
+    found = repair_bag(bag, in_place=in_place)
+    assert found.out is not None
+    assert (found.files[0].messages, found.files[0].lost_messages, found.files[0].losses) == (600, 0, ())
+    assert count(found.out) == 600
+    assert sorted(content(found.out)) == ['bag.db3', 'metadata.yaml']
+    assert not repair_bag(found.out).is_damaged
+
+
 def test_one_file(tmp_path: Path, ours: Path) -> None:
     """Beside it, where it is asked for, or in place; a slice that is still open gets its name."""
     path = ours / f'{NAME}_1.mcap'

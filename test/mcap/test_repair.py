@@ -20,6 +20,9 @@ from mcap.reader import SeekingReader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from profiles import examples
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.format import CHUNK, head, record, text
@@ -96,6 +99,28 @@ def test_cut_at_every_byte(tmp_path: Path, kind: str) -> None:
         most = len(held)
         assert found is None or found.is_damaged
     assert most == MESSAGES
+
+
+@pytest.mark.parametrize('mode', [pytest.param(CompressionMode.NONE, marks=MORE), CompressionMode.STORAGE])
+def test_a_file_of_rosbags_cut_at_every_byte(tmp_path: Path, mode: CompressionMode) -> None:
+    """Its chunks have no checksum; both packages read what is recovered."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = RosbagsWriter(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    kind = store.types['std_msgs/msg/String']
+    with writer:
+        connection = writer.add_connection('/talk', 'std_msgs/msg/String', typestore=store)
+        for number in range(20):
+            writer.write(connection, NOON_NS + number, store.serialize_cdr(kind(f'{number}' * 5), kind.__msgtype__))
+    content = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    complete = spans(content)
+    for length in range(len(content)):
+        _, held = repaired(tmp_path, content[:length])
+        assert len(held) >= sum(len(span.sequences) for span in complete if span.end <= length)
+        assert [each.log_ns for each in held] == [NOON_NS + number for number in range(len(held))]
+        if held and not length % 20:
+            with Reader(tmp_path / 'out.mcap') as reader:
+                assert sum(1 for _ in reader.messages()) == len(held)
 
 
 @pytest.mark.parametrize('kind', SWEPT)
