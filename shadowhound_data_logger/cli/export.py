@@ -96,6 +96,8 @@ def _missions(command: _Command) -> _Command:
 )
 @click.option('--codec', type=click.Choice(['av1', 'h264']), default='av1', show_default=True, help='Codec of the videos.')
 @click.option('--lossless', is_flag=True, help='Keep the pictures as they were published, instead of videos.')
+@click.option('--layout', type=click.Choice(['episode', 'shared']), default='episode', show_default=True,
+              help='Videos: a file for each episode, or one for each camera, which can also be streamed.')  # fmt: skip
 @click.option('--resample', multiple=True, metavar='SENSOR=HOW', help='hold (default) or linear: between the last two messages.')
 @click.option('--max-age', multiple=True, metavar='SENSOR=S', help='Older messages are stale  [default: 1.5 periods]')
 @click.option('--max-gap', type=click.FloatRange(0.0), default=5.0, show_default=True, metavar='S',
@@ -197,8 +199,9 @@ def _options(how: Mapping[str, Any]) -> ExportOptions:
         raise BadUsage(f'--fps {fps} is refused', 'allowed is auto, or a whole number of frames a second')
     return ExportOptions(
         fps=None if fps == 'auto' else int(fps), state=_words(how['state']), action=how['action'], cameras=_words(how['cameras']),
-        codec=how['codec'], is_lossless=how['lossless'], resample=_pairs('--resample', how['resample'], str),
-        max_age_s=_pairs('--max-age', how['max_age'], float), max_gap_s=how['max_gap'], max_stale=how['max_stale'],
+        codec=how['codec'], is_lossless=how['lossless'], layout=how['layout'],
+        resample=_pairs('--resample', how['resample'], str), max_age_s=_pairs('--max-age', how['max_age'], float),
+        max_gap_s=how['max_gap'], max_stale=how['max_stale'],
         allow_gaps=how['allow_gaps'], validation=how['validation'],
         labels=how['labels'], validation_label=how['validation_label'],
         arm=how['arm'], clock_pairs=pairs,

@@ -202,8 +202,8 @@ def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int 
         return options, options.fps, options.action
     now = {**options.told(), 'fps': options.fps or made.settings['fps'],
            'action': made.settings['action'] if options.action == 'auto' else options.action}  # fmt: skip
-    if other := [name for name, value in made.settings.items() if now.get(name) != value]:
-        said = ', '.join(f'{name} {made.settings[name]}' for name in other)
+    if other := [name for name in {**made.settings, **now} if now.get(name) != made.settings.get(name)]:
+        said = ', '.join(f'{name} {made.settings.get(name, "none")}' for name in other)
         raise LakeError(f'{made.folder} was begun with {said}', remedy='export to another folder, or with the same settings')
     return options, made.settings['fps'], made.settings['action']
 
@@ -295,7 +295,7 @@ def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
 def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
                   recorded: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
     folder = made.folder
-    report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(folder), 'dropped': made.dropped}
+    report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(made), 'dropped': made.dropped}
     new: dict[str, Path] = {}
     for plan, told, work in built:
         mission = plan.mission.mission_id
@@ -319,6 +319,7 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
         return
     if new or not (folder / INFO).is_file() or report != _json_of(folder / REPORT):
         if new:
+            made.join_videos()
             draw(made, _made_folder(folder / 'meta') / 'report.png')
         made.commit(report, new)
     result.digest = made.digest
@@ -332,9 +333,10 @@ def split_of(mission_id: str, validation: float) -> str:
     return VALIDATION if int(hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
-def _told_before(folder: Path) -> list[dict[str, Any]]:
-    found = _json_of(folder / REPORT) if (folder / INFO).is_file() else {}
-    return list(found.get('episodes', []))
+def _told_before(made: Lerobot) -> list[dict[str, Any]]:
+    """Of the episodes that it has: a report was written before ``info.json``, and a kill may have come between."""
+    found = _json_of(made.folder / REPORT) if made.info else {}
+    return [each for each in found.get('episodes', []) if each['mission_id'] in made.mission_ids]
 
 
 def _json_of(path: Path) -> dict[str, Any]:

@@ -65,6 +65,8 @@ LABEL_FEATURE: Final = 'shadowhound.labels'
 """The column with the labels of a frame, a JSON list."""
 HOLD, LINEAR = 'hold', 'linear'
 AV1, H264 = 'av1', 'h264'
+OWN_FILES, SHARED = 'episode', 'shared'
+"""Layouts of the videos."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +80,8 @@ class ExportOptions:
     cameras: tuple[str, ...] = ('camera',)
     codec: str = AV1
     is_lossless: bool = False
+    layout: str = OWN_FILES
+    """``episode``: videos of an episode in files of its own; ``shared``: those of all episodes in one file for each camera."""
     resample: Mapping[str, str] | None = None
     """Sensor -> ``hold`` or ``linear``; of those that are not named, hold."""
     max_age_s: Mapping[str, float] | None = None
@@ -116,7 +120,7 @@ class ExportOptions:
             'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
             'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
             'max_gap_s': self.max_gap_s, **({'arm': self.arm} if self.arm else {}),
-            **({'labels': True} if self.labels else {}),
+            'layout': self.layout, **({'labels': True} if self.labels else {}),
         }  # fmt: skip
 
 

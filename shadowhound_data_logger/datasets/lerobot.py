@@ -1,9 +1,10 @@
 """A data set in LeRobot's format v3.0, as lerobot 0.6.1 reads it, in a folder: whole while it has ``meta/info.json``.
 
 https://github.com/huggingface/lerobot, src/lerobot/datasets: utils.py has the paths, dataset_metadata.py and io_utils.py what is
-read. Each episode has a data file, a video for each camera and an episodes file of its own, which are never written again; what
-speaks of all of them is written anew, ``info.json`` last. Ours are the columns ``shadowhound/...`` of the episodes and the files
-``meta/shadowhound_*``, which lerobot keeps and does not look at.
+read. Each episode has a data file, a video for each camera and an episodes file of its own, which are never written again, except
+that with the layout ``shared`` there is one video for each camera (docs/decisions/0022). What speaks of all of them is written
+anew, ``info.json`` last. Ours are the columns ``shadowhound/...`` of the episodes and the files ``meta/shadowhound_*``, which
+lerobot keeps and does not look at.
 """
 
 from __future__ import annotations
@@ -37,11 +38,12 @@ from shadowhound_data_logger.datasets.features import (
     DERIVED,
     JOINT_STATE,
     LABEL_FEATURE,
+    SHARED,
     STATE_PARTS,
     ExportOptions,
     StatePart,
 )
-from shadowhound_data_logger.datasets.video import feature_info, frames_at, video_frames
+from shadowhound_data_logger.datasets.video import Clip, count_frames, feature_info, frames_at, frames_of, join
 from shadowhound_data_logger.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
@@ -51,6 +53,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 VERSION: Final = 'v3.0'
+ANY_SIZE_MB: Final = 1_000_000
+"""So that lerobot's own writer, too, puts what it adds into the one file."""
 CHUNK: Final = 1000
 """Files in a folder."""
 DATA: Final = 'data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
@@ -86,6 +90,8 @@ class Lerobot:
         self.dropped: list[str] = report.get('dropped', [])
         """SHA-256 of the ids of missions that must not come back."""
         self.rows: list[EpisodeRow] = list(self._rows()) if self.info else []
+        self._joined: dict[Path, list[Clip]] = {}
+        """Shared video -> what it is to be made of."""
         self._is_changed = False
         """Whether earlier episodes were."""
 
@@ -102,6 +108,16 @@ class Lerobot:
         place = {each: row[f'{what}/{each}'] for each in ('chunk_index', 'file_index')}
         return self.folder / pattern.format(**place, **names)
 
+    @property
+    def fps(self) -> int:
+        assert self.info is not None
+        return int(self.info['fps'])
+
+    def clip(self, row: EpisodeRow, key: str) -> Clip:
+        """The frames of an episode in the video that they are in."""
+        path = self.path(VIDEO, row, f'videos/{key}', video_key=key)
+        return Clip(path, round(row[f'videos/{key}/from_timestamp'] * self.fps), row['length'])
+
     def video_keys(self) -> list[str]:
         return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] == 'video']
 
@@ -115,15 +131,15 @@ class Lerobot:
     def pictures(self, row: EpisodeRow, key: str) -> Iterator[NDArray[np.uint8]]:
         """(height, width, 3) RGB of each frame of an episode. Raises LakeError."""
         if key in self.video_keys():
-            yield from (pixels for _, pixels in video_frames(self.path(VIDEO, row, f'videos/{key}', video_key=key)))
+            yield from frames_of(self.clip(row, key), self.fps)
         else:
             yield from (decode.image(body) for body in self.bodies(row, key))
 
     def pictures_at(self, row: EpisodeRow, key: str, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         """Those of these frames, counted from 0 within the episode, in rising order. Raises LakeError."""
         if key in self.video_keys():
-            assert self.info is not None
-            yield from frames_at(self.path(VIDEO, row, f'videos/{key}', video_key=key), self.info['fps'], numbers)
+            clip = self.clip(row, key)
+            yield from frames_at(clip.path, self.fps, [clip.first + number for number in numbers])
         else:
             yield from (decode.image(body) for number, body in enumerate(self.bodies(row, key)) if number in numbers)
 
@@ -148,7 +164,7 @@ class Lerobot:
         """
         features = features_of(told, options)
         if self.info is None:
-            self.info = _empty_info(told, features)
+            self.info = _empty_info(told, features, is_shared=options.layout == SHARED)
         if (other := different(self.info['features'], features)) or self.info['fps'] != told['fps']:
             raise LakeError(f'its {other or "frames a second"} differ from those of the episodes before it')
         number = int(self.rows[-1]['data/file_index'] + CHUNK * self.rows[-1]['data/chunk_index'] + 1) if self.rows else 0
@@ -159,10 +175,11 @@ class Lerobot:
             **{f'data/{name}': value for name, value in place.items()},
             'dataset_from_index': begin, 'dataset_to_index': begin + told['frames'],
         }  # fmt: skip
+        is_shared = options.layout == SHARED
         for key, feature in features.items():
             if feature['dtype'] == 'video':
-                row |= {f'videos/{key}/{name}': value for name, value in place.items()}
-                row |= {f'videos/{key}/from_timestamp': 0.0, f'videos/{key}/to_timestamp': told['frames'] / told['fps']}
+                row |= {f'videos/{key}/{name}': 0 if is_shared else value for name, value in place.items()}
+                row |= _times(key, begin if is_shared else 0, told['frames'], told['fps'])
         self.rows.append(row)
         target = self.path(DATA, row, 'data')
         values = _write_data(made / ROWS, target, row, self._tasks().index(told['task']), features)
@@ -172,7 +189,11 @@ class Lerobot:
             row[f'{OURS}histogram/observation.{name}'] = np.array(histogram).ravel().tolist()
             if not options.is_lossless:
                 video = self.path(VIDEO, row, f'videos/observation.{name}', video_key=f'observation.{name}')
-                _take(made / f'{name}.mp4', video)
+                if is_shared:
+                    before = [Clip(video, 0, begin)] if begin else []
+                    self._joined.setdefault(video, before).append(Clip(made / f'{name}.mp4', 0, told['frames']))
+                else:
+                    _take(made / f'{name}.mp4', video)
         row |= {f'stats/{key}/{name}': value for key, each in stats.items() for name, value in each.items()}
         row |= {f'meta/episodes/{name}': value for name, value in place.items()}
         row |= _ours(told, split)
@@ -187,11 +208,20 @@ class Lerobot:
         """In the order in which they first appear."""
         return list(dict.fromkeys(task for row in self.rows for task in row['tasks']))
 
+    def join_videos(self) -> None:
+        """Write the shared videos of the episodes that were added; those before them stay in their place. Raises LakeError."""
+        for path, clips in self._joined.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path, is_synced=True) as file:
+                join(clips, self.fps, file)
+        self._joined.clear()
+
     # -- what speaks of all ----------------------------------------------------------------------------------------
 
     def commit(self, report: Mapping[str, Any], made: Mapping[str, Path]) -> str:
         """Write what speaks of all episodes, ``info.json`` last; returns the digest. ``made`` are the folders of new ones."""
         assert self.info is not None
+        assert not self._joined, 'join_videos comes first'
         tasks = self._tasks()
         self.info |= {
             'total_episodes': len(self.rows), 'total_frames': sum(row['length'] for row in self.rows), 'total_tasks': len(tasks),
@@ -269,8 +299,7 @@ class Lerobot:
 
     def paths(self) -> Iterator[Path]:
         """The files that belong to it, but for ``info.json`` and the list of them."""
-        for row in self.rows:
-            yield from self._files_of(row)
+        yield from dict.fromkeys(path for row in self.rows for path in self._files_of(row))
         optional = ('meta/report.png', LABEL_TABLE)
         yield from (self.folder / name for name in (STATS, TASKS, SOURCE_TABLE, GAP_TABLE, REPORT, DIGESTS))
         yield from (self.folder / name for name in optional if (self.folder / name).is_file())
@@ -283,6 +312,7 @@ class Lerobot:
         self._is_changed = True
         (self.folder / INFO).unlink(missing_ok=True)  # in between it is none
         gone = [row for row in self.rows if row[f'{OURS}mission_id'] == mission_id]
+        shared = self._cut_videos(mission_id)
         self.rows = [row for row in self.rows if row[f'{OURS}mission_id'] != mission_id]
         tasks, begin = self._tasks(), 0
         self.dropped.append(hashlib.sha256(mission_id.encode()).hexdigest())
@@ -299,16 +329,33 @@ class Lerobot:
                 _write(path, new)
             known = dict(row)
             row |= {'episode_index': number, 'dataset_from_index': begin, 'dataset_to_index': begin + count}
+            row.update((name, value) for key in shared for name, value in _times(key, begin, count, self.fps).items())
             for name in wanted:
                 row |= {f'stats/{name}/{each}': value for each, value in vector_stats(matrix(new[name])).items()}
             if row != known:  # also where a kill came between its rows and this
                 self._write_row(row)
             begin += count
-        for path in (path for row in gone for path in self._files_of(row)):
+        used = {path for row in self.rows for path in self._files_of(row)}
+        for path in (path for row in gone for path in self._files_of(row) if path not in used):
             path.unlink(missing_ok=True)
         kept = (_json(self.folder / DIGESTS) or {'digests': []})['digests']
         _put_json(self.folder / DIGESTS, {'digests': [
             {**each, 'missions': [name for name in each['missions'] if name != mission_id]} for each in kept]})  # fmt: skip
+
+    def _cut_videos(self, mission_id: str) -> list[str]:
+        """Take the frames of a mission out of the shared videos; the cameras that have one. Again, it changes nothing."""
+        if self.settings is None or self.settings['layout'] != SHARED:
+            return []
+        lengths = [row['length'] for row in self.rows]
+        begins = np.cumsum([0, *lengths[:-1]]).tolist() if lengths else []  # not of the rows: some may be numbered again already
+        for key in self.video_keys():
+            for path in {self.path(VIDEO, row, f'videos/{key}', video_key=key) for row in self.rows}:
+                kept = [Clip(path, begin, row['length']) for row, begin in zip(self.rows, begins, strict=True)
+                        if row[f'{OURS}mission_id'] != mission_id]  # fmt: skip
+                if kept and count_frames(path) != sum(clip.frames for clip in kept):
+                    with replacing(path, is_synced=True) as file:
+                        join(kept, self.fps, file)
+        return self.video_keys()
 
     def _files_of(self, row: EpisodeRow) -> Iterator[Path]:
         """What says that they are there, last."""
@@ -381,11 +428,17 @@ def different(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     return ', '.join(sorted(key for key in {*one, *plain} if one.get(key) != plain.get(key)))
 
 
-def _empty_info(told: Mapping[str, Any], features: Mapping[str, Any]) -> dict[str, Any]:
+def _times(key: str, first: int, frames: int, fps: int) -> EpisodeRow:
+    """Where the frames of an episode are in their video, s."""
+    return {f'videos/{key}/from_timestamp': first / fps, f'videos/{key}/to_timestamp': (first + frames) / fps}
+
+
+def _empty_info(told: Mapping[str, Any], features: Mapping[str, Any], *, is_shared: bool) -> dict[str, Any]:
     has_video = any(feature['dtype'] == 'video' for feature in features.values())
     return {
         'codebase_version': VERSION, 'fps': told['fps'], 'features': json.loads(json.dumps(features)), 'total_episodes': 0,
-        'total_frames': 0, 'total_tasks': 0, 'chunks_size': CHUNK, 'data_files_size_in_mb': 100, 'video_files_size_in_mb': 200,
+        'total_frames': 0, 'total_tasks': 0, 'chunks_size': CHUNK, 'data_files_size_in_mb': 100,
+        'video_files_size_in_mb': ANY_SIZE_MB if is_shared else 200,
         'data_path': DATA, 'video_path': VIDEO if has_video else None, 'robot_type': 'go2', 'splits': {},
     }  # fmt: skip
 
@@ -425,6 +478,7 @@ def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features
             table = table.append_column('episode_index', pa.array([row['episode_index']] * count, pa.int64()))
             table = table.append_column('index', pa.array(range(first, first + count), pa.int64()))
             table = table.append_column('task_index', pa.array([task] * count, pa.int64())).select(order)
+            table = table.replace_schema_metadata(_kinds_of(features))
             writer = writer or pq.ParquetWriter(out, table.schema, compression='snappy')
             writer.write_table(table)
             begin += count
@@ -434,6 +488,12 @@ def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features
         assert writer is not None
         writer.close()
     return {key: np.concatenate(parts) for key, parts in found.items()}
+
+
+def _kinds_of(features: Mapping[str, Any]) -> dict[str, str] | None:
+    """What the ``datasets`` library takes columns for that it streams: without it, pictures are bytes to it."""
+    pictures = {key: {'_type': 'Image'} for key, feature in features.items() if feature['dtype'] == 'image'}
+    return {'huggingface': json.dumps({'info': {'features': pictures}})} if pictures else None
 
 
 def matrix(column: pa.ChunkedArray) -> NDArray[Any]:

@@ -12,7 +12,7 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from shutil import copyfileobj, rmtree
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -24,9 +24,10 @@ from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.clocks import ClockOffset
 from shadowhound_data_logger.datasets.episodes import EPISODE
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS
-from shadowhound_data_logger.datasets.lerobot import OURS, SOURCE_TABLE, VIDEO, EpisodeRow, Lerobot
+from shadowhound_data_logger.datasets.lerobot import OURS, SOURCE_TABLE, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
+from shadowhound_data_logger.datasets.video import join
 from shadowhound_data_logger.durable_files import replacing
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.keys import is_name, printable
@@ -91,8 +92,8 @@ def synchronize(task: Path) -> list[str]:
             target = _folder(task, GO2, row[f'{OURS}mission_id']) / f'camera_{key.rpartition(".")[2]}.mp4'
             target.parent.mkdir(parents=True, exist_ok=True)
             if not target.is_file():
-                with made.path(VIDEO, row, f'videos/{key}', video_key=key).open('rb') as video, replacing(target) as file:
-                    copyfileobj(video, file)
+                with replacing(target) as file:
+                    join([made.clip(row, key)], made.fps, file)
     with replacing(task / TIMESTAMPS) as file:
         text = io.TextIOWrapper(file, 'utf-8', newline='')
         _write_timestamps(made, text)

@@ -10,10 +10,12 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import av
 import numpy as np
@@ -91,15 +93,77 @@ def _same_scheduling() -> Iterator[None]:
                 os.sched_setscheduler(int(thread.name), before, parameters)
 
 
-def video_frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """(seconds, pixels RGB) of each frame. Raises LakeError for what is no video."""
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Some frames of a video that we wrote: of an episode, the first of them is a key frame."""
+
+    path: Path
+    first: int
+    frames: int
+
+
+def frames_of(clip: Clip, fps: int) -> Iterator[NDArray[np.uint8]]:
+    """Pixels RGB of each of its frames. Raises LakeError for what is no video."""
+    try:
+        with av.open(str(clip.path)) as file:
+            stream = file.streams.video[0]
+            first = round(clip.first / (fps * stream.time_base))
+            if clip.first:
+                file.seek(first, stream=stream)
+            found = (frame for frame in file.decode(stream) if frame.pts >= first)
+            yield from (frame.to_ndarray(format='rgb24') for frame in islice(found, clip.frames))
+    except (av.error.FFmpegError, IndexError, OSError) as error:
+        raise LakeError(f'{clip.path} is not a video that can be read: {error}') from error
+
+
+def count_frames(path: Path) -> int:
+    """By the index of the file. Raises LakeError for what is no video."""
     try:
         with av.open(str(path)) as file:
-            stream = file.streams.video[0]
-            for frame in file.decode(stream):
-                yield float(frame.pts * stream.time_base), frame.to_ndarray(format='rgb24')
+            return int(file.streams.video[0].frames)
     except (av.error.FFmpegError, IndexError, OSError) as error:
         raise LakeError(f'{path} is not a video that can be read: {error}') from error
+
+
+def join(clips: Sequence[Clip], fps: int, target: IO[bytes]) -> None:
+    """The frames of all clips one after the other, as they were encoded; the same clips give the same bytes. Raises LakeError."""
+    stream, extradata, count = None, None, 0
+    try:
+        with av.open(target, 'w', format='mp4', options={'write_btrt': '0'}) as out:  # a bit rate that depends on the sources
+            for clip in clips:
+                with av.open(str(clip.path)) as file:
+                    source = file.streams.video[0]
+                    if stream is None:
+                        extradata = source.codec_context.extradata
+                        stream = out.add_stream_from_template(source, opaque=True)
+                        stream.time_base = Fraction(1, fps)
+                    elif source.codec_context.extradata != extradata:
+                        raise LakeError(f'{clip.path} was encoded by another version or in another way than the videos before it',
+                                        remedy='export to another folder')  # fmt: skip
+                    for packet in _packets(file, clip, fps):
+                        packet.stream, packet.time_base = stream, Fraction(1, fps)
+                        packet.pts = packet.dts = count
+                        packet.duration = 1
+                        out.mux(packet)
+                        count += 1
+    except (av.error.FFmpegError, IndexError) as error:
+        raise LakeError(f'videos cannot be joined: {error}', remedy=', '.join(str(clip.path) for clip in clips)) from error
+    if count != (wanted := sum(clip.frames for clip in clips)):
+        raise LakeError(f'the videos have {count} of {wanted} frames', remedy='export verify names the file')
+
+
+def _packets(file: Any, clip: Clip, fps: int) -> Iterator[Any]:
+    stream = file.streams.video[0]
+    if clip.first:
+        file.seek(round(clip.first / (fps * stream.time_base)), stream=stream)
+    for packet in file.demux(stream):
+        if packet.pts is None:
+            return  # the end
+        number = round(packet.pts * stream.time_base * fps)
+        if number >= clip.first + clip.frames:
+            return
+        if number >= clip.first:
+            yield packet
 
 
 def frames_at(path: Path, fps: int, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import av
 import numpy as np
 import simplejpeg
 from lake.gap_parts import tell
@@ -159,6 +160,13 @@ def cdr_of(ros: Any, sensor: str, stamp: int) -> bytes:
     if sensor == 'cmd_vel':
         return bytes(ros.cdr(TWIST, linear={'x': x, 'y': 0.5}, angular={'z': -x}))
     return bytes(ros.cdr(JOINTS, name=[f'leg{n}' for n in range(12)], position=np.full(12, x), header=header(stamp)))
+
+
+def video_frames(path: Path) -> list[tuple[float, Any]]:
+    """(seconds, pixels RGB) of each frame of a video."""
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        return [(float(frame.pts * stream.time_base), frame.to_ndarray(format='rgb24')) for frame in file.decode(stream)]
 
 
 def header(stamp: int) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from datasets.recorded import House, Mission, lost, x_of
+from datasets.recorded import House, Mission, lost, video_frames, x_of
 from PIL import Image, ImageColor
 
 from shadowhound_data_logger.cli import export as verb
@@ -29,7 +29,7 @@ from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, SOURCE_TABLE, Lerobot, matrix
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
-from shadowhound_data_logger.datasets.video import VideoWriter, frames_at, video_frames
+from shadowhound_data_logger.datasets.video import VideoWriter, frames_at
 from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from pathlib import Path
@@ -13,8 +14,10 @@ import pytest
 from datasets.recorded import House, Mission, x_of
 from datasets.test_arm import record_arm
 
+from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.datasets.export import export
-from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.features import SHARED, ExportOptions
+from shadowhound_data_logger.datasets.imports import Imported, bring, of_lerobot
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.lake import decode
@@ -38,7 +41,8 @@ pytestmark = [
 
 
 def with_lerobot(folder: Path, *arguments: str) -> None:
-    environ = {'PATH': os.environ['PATH'], 'HOME': str(folder), 'HF_HOME': str(folder / 'hf')}
+    libraries = os.pathsep.join([str(PYTHON.parent.parent / 'ffmpeg'), os.environ.get('LD_LIBRARY_PATH', '')])
+    environ = {'PATH': os.environ['PATH'], 'HOME': str(folder), 'HF_HOME': str(folder / 'hf'), 'LD_LIBRARY_PATH': libraries}
     ran = subprocess.run(
         [str(PYTHON), str(PROGRAM), *arguments], env=environ, capture_output=True, text=True, check=False, timeout=1200
     )
@@ -79,7 +83,7 @@ def test_lerobot_reads_what_was_recorded(house: House, tmp_path: Path, options: 
     """Every frame of every kind: numbers as in their sources, pictures as close as the codec keeps them, windows padded right."""
     found = export(tmp_path / 'set', house.source, PATROLS, options)
     assert (found.refused, found.waiting) == ({}, {})
-    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
+    with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
     told = np.load(tmp_path / 'out.npz', allow_pickle=False)
     count = sum(each['frames'] for each in found.added)
     assert (int(told['episodes']), len(told['index'])) == (2, count)
@@ -106,17 +110,17 @@ def test_two_exports_are_merged_by_lerobot(house: House, tmp_path: Path) -> None
     """Its own function takes them, and our columns are in the episodes still."""
     for number in range(2):
         export(tmp_path / f'set{number}', house.source, {'mission': f'm{number}'}, ExportOptions())
-    with_lerobot(tmp_path, '--merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
+    with_lerobot(tmp_path, 'merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
     rows = pq.read_table(next((tmp_path / 'all/meta/episodes').rglob('*.parquet'))).to_pylist()
     assert [row['shadowhound/mission_id'] for row in rows] == ['m0', 'm1']
-    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
+    with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
     assert int(np.load(tmp_path / 'out.npz')['episodes']) == 2
 
 
 def test_what_was_exported_is_proved(house: House, tmp_path: Path) -> None:
     """After lerobot has read it, too: it changes nothing."""
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions())
-    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
+    with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'set'))
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
 
 
@@ -128,10 +132,99 @@ def test_a_robot_with_its_arm(tmp_path: Path) -> None:
         export(
             tmp_path / f'set{number}', place.source, {'mission': f'm{number}'}, ExportOptions(state=('velocity',), arm='soarm')
         )
-    with_lerobot(tmp_path, '--merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
-    with_lerobot(tmp_path, str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
+    with_lerobot(tmp_path, 'merge', str(tmp_path / 'all'), str(tmp_path / 'set0'), str(tmp_path / 'set1'))
+    with_lerobot(tmp_path, 'load', str(tmp_path / 'out.npz'), str(tmp_path / 'all'))
     told, made = np.load(tmp_path / 'out.npz'), [Lerobot(tmp_path / f'set{number}') for number in range(2)]
     for key in ('observation.state', 'action'):
         written = np.concatenate([each.numbers(each.rows[0], key) for each in made])
         assert written.shape[1] == 9
         assert told[key] == pytest.approx(written)
+
+
+LAYOUTS: Final = {
+    'episode': ExportOptions(), 'shared': ExportOptions(layout=SHARED), 'shared-h264': ExportOptions(layout=SHARED, codec='h264'),
+    'lossless': ExportOptions(is_lossless=True),
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def three(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A data set of three episodes, of 11, 21 and 16 frames, in each layout."""
+    made = House(tmp_path_factory.mktemp('three'))
+    for number, seconds in enumerate((1.0, 2.0, 1.5)):
+        sensors = ('camera', 'odom')
+        made.record(Mission(f'm{number}', begin_s=100 * number, seconds=seconds, task=f'walk {number % 2}', sensors=sensors))
+    for name, options in LAYOUTS.items():
+        assert len(export(made.folder / name, made.source, PATROLS, options).added) == 3
+    return {name: made.folder / name for name in LAYOUTS}
+
+
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_lerobot_reads_a_set_in_every_way(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
+    """By index, with torchcodec and with PyAV; windows in two workers; and streamed, but for a video of each episode.
+
+    lerobot#4524: where this fails because lerobot can stream them, the layout ``shared`` is not needed any more.
+    """
+    with_lerobot(tmp_path, 'read', str(tmp_path / 'out.json'), str(three[layout]))
+    said = json.loads((tmp_path / 'out.json').read_text())
+    streamed = {name: said.pop(name) for name in ('streamed', 'streamed delta')}
+    assert said == {f'{how} {backend}': {'seen': 48, 'wrong': [], 'error': ''}
+                    for backend in ('torchcodec', 'pyav') for how in ('index', 'delta')}  # fmt: skip
+    for each in streamed.values():
+        if layout == 'episode':
+            assert each['error'].startswith('IndexError: Invalid frame index=')
+        else:
+            assert each == {'seen': 48, 'wrong': [], 'error': ''}
+
+
+@pytest.mark.parametrize('layout', ['episode', 'shared', 'lossless'])
+def test_lerobots_tools_take_a_set(three: dict[str, Path], tmp_path: Path, layout: str) -> None:
+    """Each frame that is left has its numbers, and its picture as close as another encoding keeps it."""
+    with_lerobot(tmp_path, 'tools', str(tmp_path / 'made'), str(three[layout]))
+    said = json.loads((tmp_path / 'made/said.json').read_text())
+    streamed = said.pop('two files, streamed')
+    assert {name: each['frames'] for name, each in said.items()} == {
+        'deleted': 37, 'split/first': 11, 'split/others': 37, 'merged': 48, 'added': 48, 'removed': 48, 'tasks': 48, 'stats': 48,
+        'encoded': 48, 'two files': 48,
+    }  # fmt: skip
+    assert {each['numbers'] for each in said.values()} == {0.0}
+    assert max(each['pictures'] for each in said.values()) < 0.02
+    assert all(each['pictures'] == 0 for name, each in said.items() if name in {'added', 'removed', 'tasks', 'stats'})
+    assert (said['tasks']['tasks'], said['stats']['tasks']) == (['sit'], ['walk 0', 'walk 1'])
+    if layout != 'lossless':  # what lerobot itself puts into two files it cannot stream either
+        assert streamed['wrong'] or streamed['error']
+
+
+def test_lerobots_viewer_shows_a_set(three: dict[str, Path], tmp_path: Path) -> None:
+    """Its recording for Rerun has an episode that is in the middle of a shared video."""
+    with_lerobot(tmp_path, 'view', str(tmp_path / 'shown'), str(three['shared']))
+    (path,) = (tmp_path / 'shown').iterdir()
+    assert path.name == 'local_set_episode_1.rrd'
+    assert path.read_bytes()[:4] == b'RRF2'
+    assert path.stat().st_size > 21 * 64 * 96 * 3 // 2
+
+
+def test_an_arms_set_that_lerobot_recorded_and_edited(tmp_path: Path) -> None:
+    """An episode is the same after it has grown and after each tool, whatever the files and numbers are now."""
+    with_lerobot(tmp_path, 'arm', str(tmp_path / 'arm'))
+    house = House(tmp_path / 'house')
+    house.settings.directory.mkdir(parents=True)
+    store = DirectoryStore(house.settings.directory)
+    begins = [Mission('', begin_s=100.0 * number).begin_ns for number in range(3)]
+
+    def brought(name: str, *recordings: int) -> tuple[Imported, tuple[int, int, int, int]]:
+        times = {episode: begins[recording] for episode, recording in enumerate(recordings)}
+        found = bring(of_lerobot(tmp_path / 'arm' / name, times, is_degrees=False), 'arm', store)
+        return found, (found.episodes, found.unchanged, len(found.refused), len(found.absent))
+
+    assert brought('two', 0, 1)[1] == (2, 0, 0, 0)
+    assert brought('grown', 0, 1, 2)[1] == (1, 2, 0, 0)
+    for name in ('grown', 'tasks', 'stats', 'encoded'):
+        assert brought(name, 0, 1, 2)[1] == (0, 3, 0, 0), name
+    assert brought('deleted', 0, 2)[1] == (0, 2, 0, 1)
+    assert brought('split/first', 0)[1] == (0, 1, 0, 2)
+    assert brought('split/others', 1, 2)[1] == (0, 2, 0, 1)
+    assert brought('merged', 1, 2, 0)[1] == (0, 3, 0, 0)
+    assert brought('merged', 0, 1, 2)[1] == (0, 0, 3, 0)
+    late = {0: begins[0] + SECOND // 2}
+    assert len(bring(of_lerobot(tmp_path / 'arm/split/first', late, is_degrees=False), 'arm', store).refused) == 1

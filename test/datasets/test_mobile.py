@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets.recorded import House, Mission, x_of
+from datasets.recorded import House, Mission, video_frames, x_of
 from datasets.test_arm import CLOCK, arm_stamps, record_arm
 from rosbags.highlevel import AnyReader
 
@@ -20,7 +20,6 @@ from shadowhound_data_logger.datasets.export import Exported, drop, export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.mobile import SET, forget
-from shadowhound_data_logger.datasets.video import video_frames
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.sim import so_arm
 from shadowhound_data_logger.stores import open_store
