@@ -111,3 +111,9 @@ def test_the_live_page_reads_what_the_logger_writes() -> None:
     for name in ('User', 'EnvironmentFile', 'Restart', 'RestartPreventExitStatus', 'ReadWritePaths', 'UMask'):
         assert live[name] == logger[name], name
     assert not [name for name in live if name == 'Environment']
+
+
+@pytest.mark.parametrize('unit', UNITS, ids=lambda unit: unit.stem)
+def test_no_service_leaves_its_memory_on_the_disk(unit: Path) -> None:
+    """A core dump would have the keys of the store and the passwords of MLflow in it."""
+    assert section(unit)['LimitCORE'] == '0'

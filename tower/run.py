@@ -11,6 +11,7 @@ import argparse
 import hashlib
 import os
 import pwd
+import resource
 import shlex
 import shutil
 import signal
@@ -330,6 +331,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--offset', type=int, default=0, help='add this to all ports, to run beside another Tower')
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the memory of its servers has keys and passwords in it
     try:
         if (options.folder / '.env').exists():
             make_secrets.make(options.folder, None, [], offset=options.offset)  # what a newer version needs besides

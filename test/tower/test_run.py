@@ -124,6 +124,15 @@ def test_no_environment_and_no_command_line_has_the_key_of_the_store(folder: Pat
     assert keys.stat().st_uid in {server.stat().st_uid for server in servers}
 
 
+def test_no_server_leaves_its_memory_on_the_disk(folder: Path) -> None:
+    """However a server ends, no core dump has its keys and passwords."""
+    numbers = list(processes_of(folder))
+    limits = [line for number in numbers for line in Path(f'/proc/{number}/limits').read_text().splitlines()
+              if line.startswith('Max core file size')]  # fmt: skip
+    assert len(limits) == len(numbers) > 2
+    assert {tuple(line.split()[4:6]) for line in limits} == {('0', '0')}
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason='another user is needed')
 @pytest.mark.parametrize('user', ['nobody', 'postgres'])
 def test_another_service_of_the_machine_reads_nothing_of_mlflow(folder: Path, offset: int, user: str) -> None:
