@@ -286,7 +286,7 @@ def of_statement(row: Mapping[str, Any]) -> SinkDocument:
         found[name] = None if row[name] is None else _iso(row[stamp])
     found['time'] = found['t_from'] or found['t_to']
     return SinkDocument(
-        GAP_ROWS, _digest(row['robot'], row['id']), found, 2 * max(row['revision'], 0) + (row['what'] != WITHDRAWN)
+        GAP_ROWS, _digest(row['robot'], row['id']), found, _version(row['revision'], is_later=row['what'] != WITHDRAWN)
     )
 
 
@@ -300,8 +300,16 @@ def of_label(row: Mapping[str, Any]) -> SinkDocument:
         'made': _iso(row['made_ns']),
     }
     return SinkDocument(
-        LABEL_ROWS, _digest(row['robot'], row['id']), found, 2 * max(row['made_ns'], 0) + (row['what'] == REMOVED)
+        LABEL_ROWS, _digest(row['robot'], row['id']), found, _version(row['made_ns'], is_later=row['what'] == REMOVED)
     )
+
+
+def _version(number: int, *, is_later: bool) -> int:
+    """Of a document: that of the higher number stays, and of two with the same one the later. Never more than 63 bits.
+
+    A server refuses a whole request in which one version is larger, and a robot writes its numbers as it likes.
+    """
+    return 2 * min(max(number, 0), (1 << 62) - 1) + is_later
 
 
 def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[SinkDocument]:

@@ -477,3 +477,11 @@ def test_a_process_that_is_killed_goes_on(url: str, settings: StoreSettings, tmp
 
 
 RUN = 'from shadowhound_data_logger.cli.main import main; main()'
+
+
+@pytest.mark.parametrize('number', [0, 1, 1 << 40, (1 << 62) - 1, 1 << 62, (1 << 63) - 1, -1, -(1 << 63)])
+def test_no_version_is_larger_than_a_server_reads(number: int) -> None:
+    """One row of a hostile robot would have the server refuse the documents of all others in the same request."""
+    earlier, later = sink._version(number, is_later=False), sink._version(number, is_later=True)
+    assert 0 <= earlier < later < 1 << 63
+    assert number < 0 or number >= 1 << 62 or earlier == 2 * number

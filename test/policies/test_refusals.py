@@ -29,7 +29,7 @@ from shadowhound_data_logger.policies import active, packing, smoke, sync
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, parse_manifest
-from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, run_smoke
+from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX, SmokeRun, run_smoke
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 
@@ -567,22 +567,22 @@ def test_the_smoke_run(tmp_path: Path, reason: str, change: dict[str, Any]) -> N
     (packed / MANIFEST).write_text(json.dumps(told))
     manifest = parse_manifest((packed / MANIFEST).read_bytes())
     if not reason:
-        assert run_smoke(packed, manifest).p99_ms > 0.0
+        assert run_smoke(packed, manifest, LIMITS).p99_ms > 0.0
         return
     with pytest.raises(PolicyRefused) as raised:
-        run_smoke(packed, manifest)
+        run_smoke(packed, manifest, LIMITS)
     assert raised.value.reason == reason
 
 
 def test_a_smoke_run_that_crashes_or_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     packed, manifest = Spark(tmp_path).packed(1)
     with pytest.raises(PolicyRefused) as raised:
-        run_smoke(packed, manifest, limit_s=0.0)
+        run_smoke(packed, manifest, LIMITS, limit_s=0.0)
     assert raised.value.reason == 'time'
     for told in ((b'', -11), (b'[' * 100_000, 0), (b'{"reason": ""}', 1), (b'\xff' * 70_000, -9)):
         monkeypatch.setattr(smoke, '_ran', lambda *_, told=told: told)
         with pytest.raises(PolicyRefused) as raised:
-            run_smoke(packed, manifest)
+            run_smoke(packed, manifest, LIMITS)
         assert raised.value.reason == 'smoke'
 
 
@@ -689,4 +689,4 @@ def test_the_smoke_run_takes_no_package_from_the_current_folder(tmp_path: Path, 
     (tmp_path / 'here' / 'onnxruntime.py').write_text("raise RuntimeError('from here')")
     monkeypatch.chdir(tmp_path / 'here')
     monkeypatch.setattr(sys, 'path', ['', *sys.path])
-    assert run_smoke(packed, manifest).p99_ms > 0.0
+    assert run_smoke(packed, manifest, LIMITS).p99_ms > 0.0
