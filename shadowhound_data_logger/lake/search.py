@@ -3,6 +3,10 @@
 The index is one SQLite file (FTS5), made of the store alone: of the ``summary.json`` of each mission, which is never changed, and
 of the labels. An update reads only missions that are new. It can be thrown away, and made again from nothing.
 
+In scripts without spaces between words (Chinese, Japanese, Thai, ...) each letter is a word of the index; a word of a query is
+the phrase of its letters: it is found wherever it occurs, from one letter on (docs/decisions/0023). In other scripts a part of a
+word is found as its beginning alone: ``küche*`` finds ``Küchentür``.
+
 A query is words that all must be there, in any order and any form of letters: ``door handle``, ``"door handle"`` for a phrase,
 ``door*`` for what begins so, ``-door`` for without, ``door OR gate`` for either. The best match comes first (BM25; what a mission
 was told and the name of an event or label count four times).
@@ -75,6 +79,14 @@ _SAID: Final = (
 )
 """The labels of a document's time."""
 _LABELS: Final = f'SELECT DISTINCT named.title FROM documents, {_SAID} AND documents.id = ? AND said.id != ?'  # noqa: S608 - our own
+_UNSPACED: Final = re.compile(
+    '[\u0e00-\u0eff\u0f00-\u0fff\u1000-\u109f\u1780-\u17ff'  # Thai, Lao, Tibetan, Burmese, Khmer
+    '\u2e80-\u2fdf\u3005-\u3007\u3021-\u3029\u3040-\u30ff\u3105-\u312f\u31a0-\u31bf\u31f0-\u31ff'  # radicals, kana, bopomofo
+    '\u3400-\u4dbf\u4e00-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]'  # Han
+)
+"""Letters of scripts that have no spaces between words; https://www.unicode.org/charts/"""
+_SEAM: Final = '\x1f'
+"""Between such letters in the index, and never shown; FTS5 takes it for a blank."""
 _TERM: Final = re.compile(r'\s*(?P<not>-)?(?:"(?P<phrase>[^"]*)"|(?P<word>[^\s"]+))(?P<prefix>\*)?')
 
 
@@ -135,7 +147,8 @@ def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, lim
         found = [dict(row) for row in db.execute(query, (match, *values, limit))]
         for row in found:
             number = row.pop('id')
-            row['labels'] = sorted(name for (name,) in db.execute(_LABELS, (number, number)))
+            row['labels'] = sorted(_unspaced(name) for (name,) in db.execute(_LABELS, (number, number)))
+            row['title'], row['excerpt'] = _unspaced(row['title']), _unspaced(row['excerpt'])
     return [{**row, 'success': None if row['success'] is None else bool(row['success'])} for row in found]
 
 
@@ -167,12 +180,22 @@ def match_of(text: str) -> str:
         word = word.rstrip('*') if term['phrase'] is None else word
         if not any(letter.isalnum() for letter in word):
             continue
-        quoted = '"{}"{}'.format(word.replace('"', '""'), '*' if is_prefix else '')
+        quoted = '"{}"{}'.format(_spaced(word).replace('"', '""'), '*' if is_prefix else '')
         (without if term['not'] else groups[-1]).append(quoted)
     if not all(groups) or sum(map(len, groups)) + len(without) > MOST_WORDS:
         raise SettingError('query', text, f'{allowed}: at least one word on each side of OR, at most {MOST_WORDS} in all')
     match = ' OR '.join(f'({" AND ".join(group)})' for group in groups)
     return f'({match}) NOT ({" OR ".join(without)})' if without else match
+
+
+def _spaced(text: str) -> str:
+    """The text with seams around the letters of scripts without spaces, in one of the forms that mean the same."""
+    seamed = _UNSPACED.sub(f'{_SEAM}\\g<0>{_SEAM}', unicodedata.normalize('NFKC', text.replace(_SEAM, ' ')))
+    return seamed.replace(2 * _SEAM, _SEAM)
+
+
+def _unspaced(text: str) -> str:
+    return text.replace(_SEAM, '')
 
 
 def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
@@ -195,7 +218,7 @@ def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
     for chosen in asked.chosen:
         must(_REACHES, json.dumps(chosen.spans))
     if asked.label is not None:
-        must(f'EXISTS (SELECT 1 FROM {_SAID} AND named.title = ?)', asked.label)  # noqa: S608 - our own
+        must(f'EXISTS (SELECT 1 FROM {_SAID} AND named.title = ?)', _spaced(asked.label))  # noqa: S608 - our own
     return conditions, values
 
 
@@ -230,7 +253,7 @@ def add(db: sqlite3.Connection, found: Iterable[Document]) -> None:
             (each.kind, each.robot, each.run_id, each.mission_id, each.mission_type, each.success, each.since_ns, each.until_ns,
              each.bucket, each.key, each.label_id),
         ).lastrowid  # fmt: skip
-        db.execute('INSERT INTO words (rowid, title, text) VALUES (?,?,?)', (number, each.title, each.text))
+        db.execute('INSERT INTO words (rowid, title, text) VALUES (?,?,?)', (number, _spaced(each.title), _spaced(each.text)))
 
 
 def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[Document]:

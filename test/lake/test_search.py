@@ -151,3 +151,66 @@ def test_a_file_that_is_no_index(tmp_path: Path, lake: Bucket) -> None:
         db.executescript("CREATE VIEW more AS SELECT load_extension('x');")
     with pytest.raises(LakeError, match='not an index'):
         search.search(path, 'door', wanted(0))
+
+
+COMMANDS = {
+    'zh0': '去厨房看看门有没有关', 'zh1': '晚上巡逻时给Go2机器狗拍照',
+    'ja0': 'キッチンのドアを確認して', 'ja1': '廊下を巡回して写真を撮る',
+    'th0': 'ไปดูประตูห้องครัว', 'th1': 'ลาดตระเวนรอบห้องนั่งเล่น',
+    'de0': 'Prüfe die Küchentür im Erdgeschoss', 'ko0': '부엌에서 문을 확인해',
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp('commands') / 'search.db'
+    with search._opened(path, is_new=True) as db, db:
+        for name, command in COMMANDS.items():
+            search.add(db, search.of_mission('thor', name, {'mission_command': command, 'mission_id': name}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ('query', 'expected'),
+    [('厨房', 'zh0'), ('门', 'zh0'), ('看看', 'zh0'), ('厨房 门', 'zh0'), ('厨房*', 'zh0'), ('"去厨房看看"', 'zh0'),
+     ('去厨房看看门有没有关', 'zh0'),
+     ('巡逻', 'zh1'), ('机器狗', 'zh1'), ('go2', 'zh1'), ('Go2机器狗', 'zh1'), ('房厨', ''), ('厨房 -门', ''),
+     ('ドア', 'ja0'), ('キッチン', 'ja0'), ('ｷｯﾁﾝ', 'ja0'), ('確認', 'ja0'), ('写真', 'ja1'), ('廊下', 'ja1'), ('ドン', ''),
+     ('ประตู', 'th0'), ('ห้องครัว', 'th0'), ('ห้อง', 'th0 th1'), ('ลาดตระเวน', 'th1'),
+     ('küche*', 'de0'), ('kuchentur', 'de0'), ('Küchentür', 'de0'), ('tür', ''), ('부엌*', 'ko0'), ('부엌', '')],
+)  # fmt: skip
+def test_words_of_scripts_without_spaces(commands: Path, query: str, expected: str) -> None:
+    """They are found wherever they are, one letter is enough; of compounds with letters the beginning is (decision 0023)."""
+    assert sorted(map(str, missions(commands, query))) == expected.split()
+
+
+def test_what_was_said_is_shown_as_it_was_said(commands: Path) -> None:
+    """Nothing of how the index is made can be seen in an answer."""
+    for query in ('厨房', 'ドア', 'ประตู', 'küche*'):
+        (found,) = search.search(commands, query, wanted(0))
+        assert found['title'] == COMMANDS[str(found['mission_id'])]
+        assert '\x1f' not in json.dumps(found)
+
+
+def test_labels_of_scripts_without_spaces(tmp_path: Path) -> None:
+    """The flag compares whole names, and names come back unchanged."""
+    settings = folder_store(tmp_path)
+    with closing(open_store(settings, UploadSettings())) as store:
+        told = {'mission_id': 'm', 'mission_command': '厨房', 'start_ns': NOON_NS, 'end_ns': NOON_NS + SECOND}
+        add(store, tmp_path / 'x', 'thor/missions/run/summary.json', json.dumps(told).encode())
+        labels.write(store, 'thor', [labels.Label(robot='thor', label='楼梯', since_ns=NOON_NS, until_ns=NOON_NS + 1)], by='ann')
+    path = tmp_path / 'search.db'
+    search.update(path, Bucket(settings, 'sensor-data'))
+    assert [each['labels'] for each in search.search(path, '厨房', wanted(0, label='楼梯'))] == [['楼梯']]
+    assert missions(path, '厨房', label='楼') == []
+
+
+def test_the_index_takes_little_more_than_the_words(tmp_path: Path) -> None:
+    """Of Chinese less than three times the text, with the text itself in it."""
+    path, text = tmp_path / 'search.db', 0
+    with search._opened(path, is_new=True) as db, db:
+        for number in range(3000):
+            command = f'{COMMANDS["zh0"]} {COMMANDS["zh1"]} {number}' * 3
+            text += len(command.encode())
+            search.add(db, [search.Document(kind='mission', robot='thor', title=command, text='')])
+    assert path.stat().st_size < 3 * text
