@@ -38,7 +38,7 @@ MOST_RATIO: Final = 1000
 """Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
 OWN_METADATA: Final = frozenset({'rosbag2', 'shadowhound_recording'})
 """Metadata records that every writer makes for its own file."""
-NOT_READ: Final = 'metadata.yaml is the only source of these figures: such files are not read in a store, but after bag fetch'
+NOT_READ: Final = 'these figures are from metadata.yaml alone: the files cannot be read in the store; fetch the bag to check them'
 WAL_HEADER_BYTES: Final = 32
 """Of SQLite's write-ahead log, without content."""
 ZSTD_MAGIC: Final = b'\x28\xb5\x2f\xfd'
@@ -51,7 +51,7 @@ class BagFile(Protocol):
 
     @property
     def profile(self) -> str:
-        """Of its messages, as the header of MCAP has it. Raises BagDamaged, as all others."""
+        """The profile of its messages, as in the header of MCAP. Raises BagDamaged, as do the others."""
 
     @property
     def info(self) -> SliceInfo: ...
@@ -61,7 +61,7 @@ class BagFile(Protocol):
         """Attachments and metadata records, which are not messages."""
 
     def check(self) -> SliceInfo:
-        """What it holds, after a check of what its storage can check without unpacking the messages."""
+        """The same as ``info``, after the checks that the storage itself offers."""
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
@@ -176,7 +176,7 @@ class SqliteFile:
 
 
 class PackedFile:
-    """A file that rosbag2 compressed as a whole; unpacked next to nothing else, each time it is needed."""
+    """A file that rosbag2 compressed as a whole. It is unpacked into a temporary folder each time it is needed."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -229,8 +229,8 @@ def opened(source: Ranged) -> BagFile:
 class BagReader:
     """Reads all files of a bag.
 
-    New; used by one thread. A file that cannot be opened is left out and is in ``describe().damaged``; damage within one raises
-    BagDamaged as it is reached.
+    Lifecycle: new; used by one thread. A file that cannot be opened is skipped and listed in ``damaged``; damage within a file
+    raises BagDamaged when it is reached.
     """
 
     def __init__(self, sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None = None) -> None:
@@ -340,7 +340,7 @@ class BagReader:
 def described(
     sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None, *, scans: bool = True
 ) -> Description | None:
-    """What a bag holds whose files are in a store, or some of them; None if there is nothing to read.
+    """The contents of a bag with files in a store; None if there is nothing to read.
 
     By the manifest if it knows all of them. Otherwise, SQLite and packed files in a store would have to be downloaded: of a bag
     with those, it is what the metadata claims. The same is true without ``scans`` of MCAP files whose summary is not enough.
@@ -358,7 +358,7 @@ def described(
 
 
 def _has_summary(source: Ranged) -> bool:
-    """Whether an MCAP file is described without reading all of it; also one that is damaged, which is found by its end."""
+    """Whether an MCAP file can be described, or recognized as damaged, without reading all of it."""
     try:
         return read_summary(source) is not None
     except BagDamaged:
@@ -403,7 +403,7 @@ def files_of(path: Path) -> dict[str, Path]:
 def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
     """The files with messages: all in the folder itself, and those in folders below it that the metadata names.
 
-    Of a file that is there twice, packed and not, it is the one that the metadata names.
+    If a file exists twice, packed and unpacked, it is the one that the metadata names.
     """
     named = {part.name for part in claimed.parts} if claimed is not None else set()
     found = [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
@@ -413,7 +413,7 @@ def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
 
 
 def reason(error: BagDamaged, name: str) -> str:
-    """What is wrong with a file, to be read after its name, which is not repeated."""
+    """What is wrong with a file, without its name: the text follows the name."""
     text = error.what.removeprefix(name)
     return text.strip() if text != error.what else f'is damaged: {error.what}'.replace(f' of {name}', '')
 

@@ -1,8 +1,8 @@
 """A piece of a bag as a new bag: a span of time and some of the topics, message by message as they were recorded.
 
 Nothing is decoded: messages, their encoding, both times, the sequence number, the schema and the metadata of the channel are
-copied, and the profile of the file. Converted are QoS in words (into numbers, which Humble reads) and rosbag2's compression
-outside the storage (into MCAP's). Attachments and metadata records are counted, but not copied.
+copied unchanged, and so is the profile of the file. QoS in words is converted into numbers, which Humble reads, and rosbag2's
+compression outside the storage into that of MCAP. Attachments and metadata records are counted, but not copied.
 
 If the clock of the bag was not set, the times are copied as well, and metadata.yaml has the clock of the bag.
 

@@ -62,7 +62,7 @@ class Description:
     topics: tuple[DescribedTopic, ...]
     parts: tuple[BagPart, ...]
     messages: int | None
-    """Those in the files that could be read; None if there are none of these."""
+    """Of the files that could be read; None if no file could."""
     t_start_ns: int | None
     t_end_ns: int | None
     """As in ``BagPart``."""
@@ -97,7 +97,7 @@ def of_metadata(content: bytes, name: str, there: Container[str] = ()) -> Descri
 def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed: Description | None) -> Description:
     """From what the files hold, by name, and what the metadata claims of the bag as a whole.
 
-    Nothing is counted of files that are absent or damaged.
+    Files that are absent or damaged are not counted.
     """
     topics: dict[tuple[str, str], DescribedTopic] = {}
     for channel, count in counted(each for one in infos.values() for each in one.channels.items()).items():
@@ -147,7 +147,7 @@ def _part_of(name: str, info: SliceInfo | SliceEntry) -> BagPart:
 
 
 def _contradictions(found: Description, claimed: Description) -> Iterator[str]:
-    """What the metadata of a bag with all its files claims, and what they hold instead."""
+    """The differences between what the metadata claims and what the files hold, for a bag with all its files."""
     names = {part.name for part in claimed.parts}
     unnamed = [part.name for part in found.parts if part.name not in names]
     if unnamed:
@@ -171,7 +171,7 @@ def _span(bag: Description) -> str:
 
 
 def _iso_ns(time_ns: int) -> str:
-    """To the nanosecond: bags with times near 0 last for some of these."""
+    """To the nanosecond: bags of tests last for less than a microsecond."""
     return f'{iso(time_ns)[:-1]}{time_ns % 1000:03d}Z'
 
 

@@ -73,7 +73,7 @@ class UploadPlan:
 
 @dataclass(frozen=True, slots=True)
 class FinishedBag:
-    """A bag that nobody writes any more."""
+    """A bag whose recording has ended."""
 
     folder: Path
     description: Description
@@ -129,7 +129,7 @@ def plan_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
 
 
 def _safe(name: str) -> str:
-    """The nearest name that can be part of a key; the end of a long one stays."""
+    """The nearest name that can be part of a key; of a long name, the middle is removed."""
     if is_segment(name):
         return name
     found = UNSAFE.sub('_', name)
@@ -138,7 +138,7 @@ def _safe(name: str) -> str:
 
 
 def _stored_names(names: Sequence[str]) -> dict[str, str]:
-    """Each file's own, or the nearest that can be part of a key and that no other file of the bag has."""
+    """Each file's own name, or the nearest one that can be part of a key and that no other file of the bag has."""
     stored = {name: '/'.join(map(_safe, name.split('/'))) for name in names}
     taken = {name for name in names if stored[name] == name} | {MANIFEST}
     for name in names:
@@ -204,7 +204,7 @@ def _marked(file: Outgoing, info: SliceInfo | None, robot: str, bag: str) -> Out
 
 
 def _kept(time_ns: int | None) -> int:
-    """For the index of the spool, which has 63 bits for a time: 0 for one that does not fit, as for one that is unknown."""
+    """For the index of the spool, which has 63 bits for a time: 0 for a time that does not fit or is unknown."""
     return time_ns if time_ns is not None and time_ns < 1 << 63 else 0
 
 

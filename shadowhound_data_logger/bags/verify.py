@@ -113,7 +113,7 @@ def verify_folder(path: Path, *, deep: bool = False, told: Telling = lambda _: N
 
 
 def _remarks(checks: Sequence[FileCheck], described: Description | None) -> tuple[str, ...]:
-    """Of a bag whose files were all opened, and are sound."""
+    """For a bag whose files were all opened and are sound."""
     infos = {check.name: check.info for check in checks if check.info is not None}
     if described is None or len(infos) < len(checks) or any(check.finding for check in checks):
         return ()
@@ -191,7 +191,7 @@ def _check_local(files: Mapping[str, Path], expected: _Expected, deep: bool, tol
 
 
 def _check_summary(source: Ranged, expected: _Expected, checked: str) -> FileCheck:
-    """What the file holds: in a store by its summary alone, on the disk by everything that has to be read for it."""
+    """In a store, only the summary is read; on the disk, everything that ``BagFile.check`` needs."""
     if not expected.name.endswith(MCAP) and not (expected.name.endswith(SLICES) and isinstance(source, LocalFile)):
         return FileCheck(expected.name, '', checked)
     try:
@@ -247,7 +247,7 @@ def _difference(counted: McapIndex, index: McapIndex, expected: _Expected) -> st
 
 
 class _Once:
-    """A file that is read from its beginning to its end, and hashed on the way, also what nobody else needs of it."""
+    """A file that is read once from beginning to end and hashed on the way, including the parts that the caller skips."""
 
     def __init__(self, source: Ranged, told: Telling) -> None:
         self.name = source.name
@@ -257,7 +257,7 @@ class _Once:
         self._digest = sha256_new()
         self._at = 0
         self.crc, self.crc_end = 0, 0
-        """Of the bytes before ``crc_end``, when it is read beyond."""
+        """Of the bytes before ``crc_end``, once those have been read."""
 
     def read(self, start: int, length: int) -> bytes:
         while self._at < start:

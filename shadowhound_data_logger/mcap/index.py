@@ -41,7 +41,7 @@ MOST_SUMMARY_BYTES: Final = 64 << 20
 """That of a hundred thousand chunks: a bag of 100 GB in one file."""
 MOST_HEADER_BYTES: Final = 4 << 10
 MOST_RECORD_BYTES: Final = MOST_CHUNK_BYTES + 1024
-"""A chunk, and what says of it how it is packed."""
+"""A chunk with the fields before its data."""
 BLOCK_BYTES: Final = 4 << 20
 """Of a file that is read from one end to the other, and of the messages outside chunks that are read together."""
 INDEX_HEAD: Final = 15
@@ -88,7 +88,7 @@ class McapIndex:
     metadata: tuple[str, ...]
     """The names of its metadata records; empty where the summary has their number alone, or nothing."""
     data_end: int
-    """Where the messages end: with the record for that, if it was read."""
+    """Where the messages end: at the DataEnd record if it was read, otherwise at the end of the data section."""
 
     def info(self, path: Path, size: int, sha256: str = '') -> SliceInfo:
         """The same without places."""

@@ -33,7 +33,7 @@ class Channel:
 
 
 def counted(channels: Iterable[tuple[Channel, int]]) -> dict[Channel, int]:
-    """The messages of each channel; two that differ in nothing but their number in the file are one."""
+    """The messages of each channel; channels that differ only in their number in the file are one."""
     found: dict[Channel, int] = {}
     for channel, count in channels:
         found[channel] = found.get(channel, 0) + count

@@ -51,7 +51,7 @@ class SliceWriter:
         self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = '',
         mode: int = 0o600, profile: str = ROS2,
     ) -> None:  # fmt: skip
-        """``mode``: who may read it, less what the umask takes away. ``profile``: that of the file which is copied."""
+        """``mode``: the permissions of the file, before the umask. ``profile``: for a copy, that of the original."""
         self.path = path
         self._ros_distro = ros_distro
         if compression not in _COMPRESSORS:
@@ -61,7 +61,7 @@ class SliceWriter:
         self._chunk_bytes = chunk_bytes
         self._contents = Contents()
         self._last: dict[str, tuple[Channel, ChannelTrack]] = {}
-        """By topic, the channel of its last message: a look-up by channel takes longer."""
+        """The channel of the last message, by topic: looking up a channel takes longer."""
         self._tracks: dict[Channel, ChannelTrack] = {}
         self._chunk = bytearray(chunk_bytes)
         self._view = memoryview(self._chunk)
@@ -95,7 +95,7 @@ class SliceWriter:
         self.copy(channel, log_ns, publish_ns if publish_ns > 0 else log_ns, sequence, cdr)
 
     def copy(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message of another file, with its times as they are there: 64 bits without a sign."""
+        """Add a message of another file with its times unchanged: unsigned, 64 bits."""
         last = self._last.get(channel.topic)
         track = last[1] if last is not None and last[0] is channel else self._track(channel)
         length, at = len(data), self._used

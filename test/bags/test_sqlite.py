@@ -169,7 +169,7 @@ def test_a_store_does_not_read_them(tmp_path: Path) -> None:
     folder = storage(tmp_path / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b' / 'b_0.db3', HUMBLE).parent
     metadata(folder, ['b_0.db3'], 5, message_count=7)
     found = info_of(DirectoryStore(tmp_path / 'store'), 'thor', 'b', tmp_path / 'home').description
-    assert (found.messages, found.remarks[0].startswith('metadata.yaml is the only source')) == (7, True)
+    assert (found.messages, found.remarks[0].startswith('these figures are from metadata.yaml alone')) == (7, True)
 
 
 def test_other_encodings_keep_their_name(tmp_path: Path) -> None:
