@@ -53,8 +53,8 @@ class Rejected(DataLoggerError):
 
     DEFAULT_REMEDY = 'shadowhound-data ledger counts rejected messages by reason'
 
-    def __init__(self, reason: str, detail: str = '') -> None:
-        super().__init__(f'{reason}: {detail}' if detail else reason, reason=reason)
+    def __init__(self, reason: str, detail: str = '', *, remedy: str = '') -> None:
+        super().__init__(f'{reason}: {detail}' if detail else reason, remedy=remedy, reason=reason)
         self.reason = reason
 
 

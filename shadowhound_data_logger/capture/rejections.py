@@ -22,7 +22,6 @@ MAX_KNOWN: Final = 1000
 ENCODER_FAILED: Final = 'encoder_failed'
 """Why samples are rejected whose encoder has a fault."""
 REMEDIES: Final = {
-    'malformed': 'compare the definition installed here with that of the publisher: ros2 topic info -v {topic}',
     'size_mismatch': 'the publisher contradicts itself, report it there; {sensor}.format: cdr stores such messages unchanged',
     'unknown_type': 'install and source the package of its type; {sensor}.format: cdr needs no definition',
     'wrong_type': '{sensor}.format: json or cdr stores every type',
@@ -103,5 +102,5 @@ class RejectionLog:
     @staticmethod
     def _report(key: tuple[str, str, str], sensor: str, rejection: Rejection, what: str) -> None:
         topic, reason, node = key
-        remedy = rejection.remedy or REMEDIES.get(reason, _OTHERWISE).format(topic=topic, sensor=sensor)
+        remedy = rejection.remedy or REMEDIES.get(reason, _OTHERWISE).format(sensor=sensor)
         log.warning('%s: %s%s cannot be stored: %s (%s)', topic, what, f' of {node}' if node else '', rejection.text, remedy)

@@ -33,6 +33,7 @@ _CODES: Final = {
     'bool': '?', 'byte': 'b', 'char': 'B', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I',
     'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
 }  # fmt: skip
+_COMPARE: Final = 'is its definition here that of the publisher? ros2 topic info -v shows the type hash of each'
 _WIDE_BYTES: Final = 4
 """Of each UTF-16 code unit of a wstring, as Fast CDR and rmw_cyclonedds write them."""
 
@@ -48,10 +49,11 @@ def read_message(store: Typestore, type_name: str, cdr: bytes | memoryview) -> A
     except KeyError as error:
         raise Rejected('unknown_type', f'{type_name} has a field of type {error}') from error
     except (struct.error, ValueError) as error:
-        raise Rejected('malformed', f'the {len(cdr)} bytes end within a {type_name}: {error}') from error
+        text = f'the {len(cdr)} bytes end within a {type_name}: {error}'
+        raise Rejected('malformed', text, remedy=_COMPARE) from error
     left = len(cdr) - ENCAPSULATION_BYTES - reader.at
     if left > MAX_PADDING + reader.slack:
-        raise Rejected('malformed', f'{left} bytes follow the {type_name}: is its definition here that of the publisher?')
+        raise Rejected('malformed', f'{left} bytes follow the {type_name}', remedy=_COMPARE)
     return message
 
 

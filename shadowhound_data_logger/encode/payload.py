@@ -67,8 +67,8 @@ class Rejections:
 
     def add(self, error: Rejected, *samples: Sample) -> None:
         for sample in samples:
-            publisher = sample.publisher or ''
-            known = self.found.setdefault((error.reason, publisher), Rejection(error.reason, publisher, str(error)))
+            key = error.reason, sample.publisher or ''
+            known = self.found.setdefault(key, Rejection(*key, error.what, remedy=error.remedy))
             known.count += 1
 
     def add_corrected(self, payload: Payload) -> None:

@@ -208,12 +208,12 @@ def stamped(type_name: str, seconds: int = 0, **fields: Any) -> bytes:
     return bytes(serialize_message(message))
 
 
-def cloud(points: list[tuple[float, float, float]]) -> bytes:
+def cloud(points: list[tuple[float, float, float]], **layout: int) -> bytes:
     from sensor_msgs.msg import PointField
 
     fields = [PointField(name=name, offset=4 * number, datatype=PointField.FLOAT32, count=1) for number, name in enumerate('xyz')]
     data = b''.join(struct.pack('<3f', *point) for point in points)
-    layout = {'width': len(points), 'height': 1, 'point_step': 12, 'row_step': len(data)}
+    layout = {'width': len(points), 'height': 1, 'point_step': 12, 'row_step': len(data)} | layout
     return stamped('sensor_msgs/msg/PointCloud2', fields=fields, data=data, **layout)
 
 
@@ -229,7 +229,8 @@ def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callab
             stamped(image, width=2, height=2, encoding='mono8', step=2, data=b'four'),
             stamped(image, width=2, height=2, encoding='bayer', step=2, data=b'four'),
         ]),
-        '/cloud': ('sensor_msgs/msg/PointCloud2', [cloud([]), cloud([(nan, nan, nan)] * 3), cloud([(1.0, 2.0, 3.0)])]),
+        '/cloud': ('sensor_msgs/msg/PointCloud2', [cloud([]), cloud([(nan, nan, nan)] * 3), cloud([(1.0, 2.0, 3.0)]),
+                                                 cloud([(1.0, 2.0, 3.0)] * 6, width=3, height=2, row_step=0)]),
     }  # fmt: skip
     parameters: dict[str, Any] = {'sensors': ['jpeg', 'raw', 'cloud']}
     for topic, (type_name, _) in messages.items():
@@ -245,10 +246,11 @@ def test_malformed_messages(processes: Processes, seaweed: Tower, stored: Callab
     topics = node.stop()['topics']
     assert topics['/jpeg']['rejected'] == {'empty': 1, 'malformed': 1}
     assert topics['/raw']['rejected'] == {'size_mismatch': 1}
-    assert topics['/cloud']['rejected'] == {}
-    assert [topics[topic]['stored_in']['delivered'] for topic in messages] == [2, 2, 3]
+    assert (topics['/cloud']['rejected'], topics['/cloud']['corrected']) == ({}, {'row_step': 1})
+    assert [topics[topic]['stored_in']['delivered'] for topic in messages] == [2, 2, 4]
+    assert '/raw: a message of /publisher cannot be stored: size_mismatch' in node.log
     objects = stored(processes.robot)
-    assert Counter(Path(key).suffix for key in objects.contents) == {'.jpg': 2, '.cdr': 2, '.pcd': 3}
+    assert Counter(Path(key).suffix for key in objects.contents) == {'.jpg': 2, '.cdr': 2, '.pcd': 4}
     assert not [key for key in objects.contents if '/1970' in key], 'a header stamp of 1970 is not believed'
 
 
