@@ -400,6 +400,7 @@ class _Copy:
     # -- damage ----------------------------------------------------------------------------------------------------
 
     def _damage(self, piece: Damaged) -> None:
+        self._flush()  # messages before it are dated before it
         if piece.op != Opcode.CHUNK:
             messages = 1 if piece.op == Opcode.MESSAGE else 0 if piece.op in _WITHOUT_MESSAGES else None
             self._losses.add(piece.at, piece.size, piece.what, messages, None)
@@ -409,7 +410,6 @@ class _Copy:
         if contents is not None and not found.is_verified:
             self._unverified += contents.messages
         if contents is not None and contents.messages and (found.is_verified or self._keeps_unverified):
-            self._flush()
             self._prepare(contents)
             kept = contents.messages
             self._write_chunk(contents.raw, contents.index)
@@ -436,6 +436,7 @@ class _Copy:
             self._rebuilt['message indexes'] = None
 
     def _after(self, end: int) -> None:
+        self._flush()
         if end < self._salvage.size:
             self._losses.add(end, self._salvage.size - end, 'bytes after the end of the file', 0, None)
 

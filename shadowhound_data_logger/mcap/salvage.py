@@ -389,7 +389,8 @@ class Salvage:
         is_torn = end == self.size and not fits and bool(op)
         if op == Opcode.CHUNK:
             return Damaged(at, end - at, op, 'a chunk', is_torn)
-        return Damaged(at, end - at, op if fits else 0, _name(op, is_torn=is_torn), is_torn)
+        is_framed = fits and end == at + RECORD.size + length
+        return Damaged(at, end - at, op if is_framed else 0, _name(op, is_torn=is_torn), is_torn)
 
     def salvaged(self, damaged: Damaged) -> Salvaged:
         """What can be read of a chunk that is torn, or contradicts itself."""
@@ -452,7 +453,8 @@ class Salvage:
         """
         while start < self.size and self._spend(BLOCK_BYTES // 16):
             block = self.read(start, BLOCK_BYTES + RECORD.size)
-            for match in _START.finditer(block, 0, min(BLOCK_BYTES, len(block)) + RECORD.size):
+            is_zeros = block.count(0) == len(block)
+            for match in () if is_zeros else _START.finditer(block, 0, min(BLOCK_BYTES, len(block)) + RECORD.size):
                 at = start + match.start()
                 is_outside = at >= chunk_end or block[match.start()] not in _IN_CHUNKS
                 if match.start() < BLOCK_BYTES and is_outside and self._is_strong(at):

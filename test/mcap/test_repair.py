@@ -61,7 +61,7 @@ KINDS: dict[str, dict[str, Any]] = {
     'no summary': {'summary': False}, 'no index': {'indexes': IndexType.NONE},
 }  # fmt: skip
 MORE = pytest.mark.long('thousands of repairs')
-SWEPT = [pytest.param(kind, marks=() if kind in {'lz4', 'no message index'} else MORE) for kind in KINDS]
+SWEPT = [pytest.param(kind, marks=() if kind == 'lz4' else MORE) for kind in KINDS]
 
 
 def written(folder: Path, kind: str) -> tuple[bytes, list[Found]]:
@@ -159,6 +159,18 @@ def test_bytes_that_were_added_or_removed(tmp_path: Path, data: st.DataObject) -
     for start, span in zip([0, *(each.end for each in complete)], complete, strict=False):
         if span.end <= at or at + gone <= start:
             assert {each.sequence for each in held} >= span.sequences
+
+
+def test_damage_between_messages_outside_of_chunks(tmp_path: Path) -> None:
+    """It is dated by the messages around it, and how many were there is unknown."""
+    content, ours = written(tmp_path, 'not chunked')
+    ends = [span.end for span in spans(content)]
+    noise = random.Random(4).randbytes(3000)
+    found, held = repaired(tmp_path, content[: ends[7] + 10] + noise + content[ends[9] :])
+    assert found is not None
+    assert held == ours[:8] + ours[10:]
+    (loss,) = found.losses
+    assert (loss.messages, loss.from_ns, loss.to_ns) == (None, ours[7].log_ns, ours[10].log_ns)
 
 
 @pytest.mark.parametrize('tail', [b'\0' * 5000, b'\xff' * 300, random.Random(3).randbytes(70_000), b'\x89MCAP0\r\n' * 3])
