@@ -32,7 +32,7 @@ from shadowhound_data_logger.datasets.features import (
     StatePart,
     camera_name,
 )
-from shadowhound_data_logger.datasets.series import RecordedSensor, Recordings, bags_of
+from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, bags_of, manifests_of
 from shadowhound_data_logger.datasets.ticks import whole_fps
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import labels, query
@@ -196,8 +196,10 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
         ours = [mission for mission in missions if mission.robot == robot]
         stated = newest(source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings)
         labelled = labels.read(source, robot, findings=findings) if options.labels or options.validation_label else []
+        recorded = manifests_of(store, robot)
         for mission in ours:
-            made = _planned(source, store, mission, options, action=action, stated=stated, work=work, findings=findings)
+            made = _planned(source, store, mission, options, action=action, stated=stated, recorded=recorded, work=work,
+                            findings=findings)  # fmt: skip
             first, last = made.span_ns
             yield replace(made, labels=tuple(each for each in labelled if each.since_ns <= last and each.until_ns >= first))
 
@@ -233,7 +235,8 @@ def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:
 
 
 def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, action: str,  # noqa: PLR0913
-             stated: pa.Table, work: Path, findings: Findings) -> EpisodePlan:  # fmt: skip
+             stated: pa.Table, recorded: Sequence[Manifest], work: Path, findings: Findings) -> EpisodePlan:  # fmt: skip
+    """``recorded`` are the robot's bags."""
     if not mission.end_ns:
         return EpisodePlan(mission, (), {}, {}, (), stated.slice(0, 0))
     arm = None
@@ -249,7 +252,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         found = rows.where(used & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
     seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
     tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS], mission)
-    bags = tuple(bags_of(store, mission.robot, (mission.mission_id, mission.run_id), mission.begin_ns, until))
+    bags = tuple(bags_of(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
     place = Place(source.settings)
     with Recordings(place, store, tracks, topics, (since, until), bags, work, early_ns=BEFORE_NS) as recordings:
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
@@ -271,7 +274,8 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         last = int(tracks[sensor].end_ns.max()) if recording.sink == OBJECTS else mission.end_ns
         streams.append(_stream(name, part, recording, mission, stated, last))
     if options.arm:
-        arm, more = _arm_streams(source, store, mission, options, bags=bags, stated=stated, work=work, findings=findings)
+        arm, more = _arm_streams(source, store, mission, options, bags=bags, stated=stated, recorded=recorded, work=work,
+                                 findings=findings)  # fmt: skip
         streams = (
             [each for each in more if each.name != ARM_ACTION] + streams + [each for each in more if each.name == ARM_ACTION]
         )
@@ -282,7 +286,8 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
 
 
 def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, bags: Sequence[Manifest],  # noqa: PLR0913
-                 stated: pa.Table, work: Path, findings: Findings) -> tuple[ArmPlan, list[StreamPlan]]:  # fmt: skip
+                 stated: pa.Table, recorded: Sequence[Manifest], work: Path,
+                 findings: Findings) -> tuple[ArmPlan, list[StreamPlan]]:  # fmt: skip
     """What an arm recorded in the mission's time by its own clock; no streams where that is not known."""
     since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
     topics = {sensor: f'/{options.arm}/{name}' for sensor, name in ARM_TOPICS.items()}
@@ -299,9 +304,10 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
 
     place, wide = Place(source.settings), (since - NEAR_NS, until + NEAR_NS)
     pairs = [np.array(options.clock_pairs, np.int64).reshape(-1, 2)]
-    with Recordings(place, store, tracks(*wide, ARM_CLOCK), topics, wide, bags, work) as recordings:
-        if (recorded := recordings.best(ARM_CLOCK)) is not None:
-            series = recordings.series(recorded, ('time_ref.sec', 'time_ref.nanosec'))
+    near = bags_of(recorded, mission.mission_id, mission.run_id, Interval(*wide))
+    with Recordings(place, store, tracks(*wide, ARM_CLOCK), topics, wide, near, work) as recordings:
+        if (events := recordings.best(ARM_CLOCK)) is not None:
+            series = recordings.series(events, ('time_ref.sec', 'time_ref.nanosec'))
             told = series.values.astype(np.int64)
             pairs.append(np.column_stack([series.stamps, told[:, 0] * SECOND + told[:, 1]]))
     try:

@@ -1,4 +1,4 @@
-"""What one mission recorded, sensor by sensor: all messages of a time, from objects or from a bag, whichever has more.
+"""What one mission recorded, sensor by sensor: all messages of a time, from objects or bags, whichever have more.
 
 A series is in memory but for its pictures: those of objects are read again when they are needed, those of a bag are kept in a
 file of the work folder meanwhile.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -54,7 +54,7 @@ AS_MUCH: Final = 0.5
 NEARLY_ALL: Final = 0.9
 """An event's bag is an excerpt, unless it has so much of a mission."""
 LEAST_ADDED_NS: Final = SECOND
-"""A second bag of a time is read for more than this: our recorder needs that long to notice that a mission has begun."""
+"""Another mission's bag, or one of none, is read for more than this: our recorder needs that long to notice a mission."""
 HOLE: Final = 10
 """So many periods without an object are not covered."""
 AHEAD: Final = 16
@@ -332,7 +332,8 @@ class Recordings:
     def _parts(self, topic: str) -> list[_SlicePart]:
         """The slices with messages of a topic, and of which time each is read: two bags of one time have each message twice.
 
-        Of a later bag, what the bags before it leave open is taken, if that is more than a second of the time that counts.
+        Of a later bag, what the bags before it leave open is taken: all of it if the bag is of the same mission as the first one,
+        else if it is more than a second of the time that counts.
         """
         found: list[_SlicePart] = []
         for bag in self._bags:
@@ -344,7 +345,9 @@ class Recordings:
                 if each.recorded.get(topic) and whole.first_ns <= self._span[1] and whole.last_ns >= self._span[0]:
                     mine.append(_SlicePart(bag, each, each.recorded[topic], whole, tuple(whole.without(covered))))
             added = sum(each.covered(self._counted) for each in mine)
-            if added > LEAST_ADDED_NS or (not found and any(each.share(self._counted) for each in mine)):
+            first = found[0].bag.mission if found else bag.mission
+            is_first = not found or (first is not None and _is_of_mission(bag, first.mission_id, first.run_id))
+            if added > LEAST_ADDED_NS or (is_first and any(each.share(self._counted) for each in mine)):
                 found += [each for each in mine if each.times]
         return found
 
@@ -401,15 +404,12 @@ class Recordings:
             yield message, known[message.channel]
 
 
-def bags_of(store: ObjectStore, robot: str, mission: tuple[str, str], begin_ns: int, end_ns: int) -> list[Manifest]:
-    """The bags of a robot that have messages of a mission's time, with the slices that the store has, the preferred ones first.
+def manifests_of(store: ObjectStore, robot: str) -> list[Manifest]:
+    """Of all bags of a robot whose times are known, with the slices that the store has.
 
-    ``mission`` is its id and its run's id. Its own bags are first, then those of no mission, then those of other missions, last
-    those of events, if they have nearly all of it; of each kind, the one with most of the mission first. The robot may keep
-    slices until they are requested. A bag without a manifest (of another recorder, or still growing) is not among them. Raises
-    StoreError.
+    The robot may keep other slices until they are requested. A bag without a manifest (of another recorder, or still growing) is
+    not among them. Raises StoreError.
     """
-    counted = Interval(begin_ns, end_ns)
     found = []
     for bag in find_bags(store, robot):
         if bag.is_archive:
@@ -421,14 +421,24 @@ def bags_of(store: ObjectStore, robot: str, mission: tuple[str, str], begin_ns: 
         if manifest is None or (manifest.clock is not None and manifest.clock.offset_ns is None):
             continue
         there = {file.name for file in bag.files}
-        manifest = replace(manifest, slices=tuple(each for each in manifest.slices if each.file in there))
+        found.append(replace(manifest, slices=tuple(each for each in manifest.slices if each.file in there)))
+    return found
+
+
+def bags_of(manifests: Iterable[Manifest], mission_id: str, run_id: str, counted: Interval) -> list[Manifest]:
+    """The bags that have messages of a mission's time, the preferred ones first.
+
+    The mission's own bags are first, then those of no mission, then those of other missions, last those of events, if they have
+    nearly all of it; of each kind, the one with most of the mission first.
+    """
+    found = []
+    for manifest in manifests:
         step = _offset_of(manifest)
         times = [Interval(each.t_start_ns + step, each.t_end_ns + step) for each in manifest.slices]
-        if any(first <= end_ns and last >= begin_ns for first, last in times):
-            covered = sum(each.within(counted).length for each in times)
-            if manifest.event is not None and covered < NEARLY_ALL * counted.length:
-                continue
-            found.append(((_rank(manifest, *mission), -covered, manifest.bag), manifest))
+        covered = sum(each.within(counted).length for each in times)
+        is_excerpt = manifest.event is not None and covered < NEARLY_ALL * counted.length
+        if not is_excerpt and any(first <= counted.last_ns and last >= counted.first_ns for first, last in times):
+            found.append(((_rank(manifest, mission_id, run_id), -covered, manifest.bag), manifest))
     return [manifest for _, manifest in sorted(found, key=lambda each: each[0])]
 
 
@@ -438,8 +448,15 @@ def _rank(bag: Manifest, mission_id: str, run_id: str) -> int:
         return 3
     if bag.mission is None:
         return 1
-    is_own = bag.mission.mission_id == mission_id or (bag.mission.mission_id is None and bag.mission.run_id == (run_id or ''))
-    return 0 if is_own else 2
+    return 0 if _is_of_mission(bag, mission_id, run_id) else 2
+
+
+def _is_of_mission(bag: Manifest, mission_id: str | None, run_id: str | None) -> bool:
+    """By the mission's id; by its run's while a bag has no other."""
+    if bag.mission is None:
+        return False
+    known = bag.mission.mission_id
+    return known == mission_id if known and mission_id else bool(run_id) and bag.mission.run_id == run_id
 
 
 def _file(wanted: Object) -> SourceFile:

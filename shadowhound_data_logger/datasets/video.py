@@ -147,7 +147,7 @@ def join(clips: Sequence[Clip], fps: int, target: IO[bytes]) -> None:
                         out.mux(packet)
                         count += 1
     except (av.error.FFmpegError, IndexError) as error:
-        raise LakeError(f'videos cannot be joined: {error}', remedy=', '.join(str(clip.path) for clip in clips)) from error
+        raise LakeError(f'videos cannot be joined: {error}', remedy='export verify names the file that is damaged') from error
     if count != (wanted := sum(clip.frames for clip in clips)):
         raise LakeError(f'the videos have {count} of {wanted} frames', remedy='export verify names the file')
 

@@ -181,6 +181,17 @@ def test_a_mission_that_was_recorded_in_two_bags(yard: Yard) -> None:
     assert told(found, 'one')['longest_gap_s'] == pytest.approx(0.9, abs=0.06)
 
 
+def test_the_last_moment_of_a_mission_is_in_another_bag(yard: Yard) -> None:
+    """The node was started again right before the end: what is of the mission is taken however little it is."""
+    yard.mission('one', 0, 6)
+    yard.bag('first', (0, 5.3), mission=MissionOf('patrol', None, 'runone'))
+    last = yard.bag('last', (5.5, 6), mission=of('one'))
+    yard.bag('always', (5, 6), hz=100)
+    found = yard.export(max_stale=0.5)
+    assert found.refused == {}
+    assert list(yard.sources('one')) == ['thor/rosbags/first/first_0.mcap', f'{last}last_0.mcap']
+
+
 def test_an_always_on_bag_has_the_beginning(yard: Yard) -> None:
     """The mission's own bag begins two seconds late: before it the other one's messages are taken, and none twice."""
     yard.mission('one', 10, 6)
