@@ -130,7 +130,8 @@ def open_sandbox(folder: Path, empty: str) -> tuple[list[str], str]:
 
 def _packages() -> Iterator[str]:
     """Where Python and its packages are; no folder that has the user's home, or that of the data logger, in it."""
-    secret = [Path.home(), Path(os.environ.get('SHADOWHOUND_HOME') or Path.home()).absolute()]
+    homes = ('~', os.environ.get('SHADOWHOUND_HOME') or '~')
+    secret = [Path(os.path.expanduser(home)).absolute() for home in homes]  # noqa: PTH111 - a user may have no home
     for path in dict.fromkeys(str(Path(path).absolute()) for path in (sys.base_prefix, sys.prefix, *sys.path) if path):
         if Path(path).exists() and not any(home.is_relative_to(path) for home in secret) and path != '/usr':
             yield path

@@ -186,7 +186,8 @@ def test_no_folder_with_the_home_in_it_is_shown(tmp_path: Path, monkeypatch: pyt
     """A path of Python's packages that has the home of the user, or of the data logger, in it stays out of the sandbox."""
     home, packages = tmp_path / 'go2' / '.shadowhound', tmp_path / 'go2' / 'packages'
     packages.mkdir(parents=True)
-    monkeypatch.setenv('SHADOWHOUND_HOME', str(home))
+    monkeypatch.setenv('HOME', str(home.parent))
+    monkeypatch.setenv('SHADOWHOUND_HOME', '~/.shadowhound')
     monkeypatch.setattr(sys, 'path', ['/', str(tmp_path), str(tmp_path / 'go2'), str(packages)])
     shown = list(smoke._packages())
     assert str(packages) in shown
