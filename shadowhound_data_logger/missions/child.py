@@ -82,7 +82,7 @@ class Replayer:
                     output.truncate(0)
                 self._process = subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=self._environ,
-                    cwd=self._folder if self._folder and self._folder.is_dir() else folder, start_new_session=True,
+                    cwd=self._folder if self._folder and os.access(self._folder, os.X_OK) else folder, start_new_session=True,
                 )  # fmt: skip
         except OSError as error:
             log.warning('missions are not sent: the sender cannot be started: %s', error)
@@ -142,12 +142,14 @@ def interpreter() -> str | None:
     second time: only a file that is called like an interpreter is taken. None where there is no such file.
     """
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
-    is_frozen = bool(getattr(sys, 'frozen', False))
-    own = () if is_frozen else (sys.executable, getattr(sys, '_base_executable', None))
+    own = () if getattr(sys, 'frozen', False) else (sys.executable, getattr(sys, '_base_executable', None))
+    for path in own:
+        if _is_python(path, version):
+            return path
     prefixes = (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)
     folders = dict.fromkeys([*(os.path.join(prefix, 'bin') for prefix in prefixes), sysconfig.get_config_var('BINDIR') or ''])  # noqa: PTH118
     installed = (os.path.join(folder, f'python{version}{sys.abiflags}') for folder in folders if folder)  # noqa: PTH118
-    return next((path for path in (*own, *installed) if _is_python(path, version)), None)
+    return next((path for path in installed if _is_python(path, version)), None)
 
 
 def _is_python(path: object, version: str) -> bool:
@@ -159,8 +161,10 @@ def _is_python(path: object, version: str) -> bool:
 
 def _import_path(environ: Mapping[str, str], python: str | None) -> list[str]:
     """The agent's PYTHONPATH and where this package is; the agent's packages as well if the interpreter is another one."""
-    given = [os.path.abspath(entry) for entry in environ.get('PYTHONPATH', '').split(os.pathsep) if entry]  # noqa: PTH100
-    packages = [entry for entry in sys.path if Path(entry).name in {'site-packages', 'dist-packages'}]
+    given = []
+    with suppress(OSError):  # the working directory was deleted
+        given = [os.path.abspath(entry) for entry in environ.get('PYTHONPATH', '').split(os.pathsep) if entry]  # noqa: PTH100
+    packages = [entry for entry in map(str, sys.path) if Path(entry).name in {'site-packages', 'dist-packages'}]
     return list(dict.fromkeys([*given, PACKAGE, *(packages if python != sys.executable else ())]))
 
 

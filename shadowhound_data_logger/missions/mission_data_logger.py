@@ -14,6 +14,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -255,6 +256,7 @@ class MissionDataLogger:
         self._mission, self._ended = None, []
         if self._runs:
             self._runs.forget()
+            self._runs, self._beginning = None, replace(self._beginning, runs=None)
         if self._replayer:
             self._replayer.forget()
             self._replayer = None

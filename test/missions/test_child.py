@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +23,12 @@ from shadowhound_data_logger.missions.child import interpreter
 from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json
 
 REAL: Final = sys.executable
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    yield tmp_path / 'home'
+    end_replayers(tmp_path / 'home')
 
 
 @pytest.fixture
@@ -133,6 +140,7 @@ def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.M
     gone = tmp_path / 'gone'
     gone.mkdir()
     monkeypatch.chdir(gone)
+    monkeypatch.setenv('PYTHONPATH', 'lib')
     shutil.rmtree(gone)
     try:
         logger = MissionDataLogger(home=tmp_path / 'home', start_timeout_s=0.0)
@@ -142,6 +150,21 @@ def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.M
     finally:
         os.chdir(tmp_path)
         end_replayers(tmp_path / 'home')
+
+
+def test_no_thread_can_be_started(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mission is logged all the same, and synced when the logger is closed."""
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, 'start', refuse)
+    monkeypatch.setattr(child.Replayer, 'start', lambda _: None)
+    logger = MissionDataLogger(home=home, start_timeout_s=0.1, tracking_uri='http://127.0.0.1:9')
+    assert logger.start_mission('patrol', '').startswith('patrol_')
+    logger.end_mission(True, 1, 1)
+    logger.close()
+    assert [record['k'] for record in journal(home)] == ['start', 'end']
 
 
 AGENT: Final = """
@@ -155,12 +178,6 @@ report = logger.close(60)
 assert report.complete, report
 print(run_id)
 """
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[Path]:
-    yield tmp_path / 'home'
-    end_replayers(tmp_path / 'home')
 
 
 @pytest.mark.long('a sender that loads MLflow')
