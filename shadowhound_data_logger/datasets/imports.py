@@ -148,6 +148,8 @@ def of_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> I
             parts.append({name: matrix(table[name]) for name in wanted})
         except (pa.ArrowException, OSError, ValueError) as error:
             raise LakeError(f'{path} is no data of a LeRobotDataset: {error}') from error
+        if any(parts[-1][name].dtype.kind not in 'iu' for name in ('episode_index', 'frame_index')):
+            raise LakeError(f'{path} has an episode_index or frame_index that is no whole number')
         if any(parts[-1][name].shape[1] != len(names) for name in ('observation.state', 'action')[: 1 + has_action]):
             raise LakeError(f'{path} has not the {len(names)} joints that {INFO} says')
     if not sum(len(part['episode_index']) for part in parts):
@@ -281,11 +283,11 @@ class _Stored:
             name = rf'(\d{{8}}/\d{{6}}_\d{{3}})_{named}_([0-9a-f]{{{DIGITS}}})_(\d+)\.json'
             pattern = re.compile(rf'{re.escape(arm)}/{named}/{name}', re.ASCII)
             for info in store.list(schema.BUCKET, f'{arm}/{named}/'):
-                if (told := pattern.fullmatch(info.key)) is None:
+                if (told := pattern.fullmatch(info.key)) is None or (begin_ms := _ms_of(told[1])) is None:
                     continue  # recorded by the arm's own machine
                 self._keys.add(info.key)
                 if sensor == ARM_JOINTS:
-                    self._add(_ms_of(told[1]), told[2], info.key, int(told[3]))
+                    self._add(begin_ms, told[2], info.key, int(told[3]))
 
     def has(self, each: Demonstration) -> bool:
         return each.begin_ns // MS in self._begins.get(each.identity[:DIGITS], ())
@@ -373,12 +375,17 @@ class _Stored:
         if place:
             begin, identity, key = self._pieces[place - 1]
             held = self._store.head(schema.BUCKET, key)
-            if held is not None and int(held.metadata.get(words.T_END_NS, 0)) >= each.begin_ns:
-                return begin, identity
+            if held is not None:
+                row = schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
+                if (row['t_end_ns'] or 0) >= each.begin_ns:
+                    return begin, identity
         return None
 
 
-def _ms_of(text: str) -> int:
-    """Of ``YYYYMMDD/HHMMSS_mmm`` in a key, ms since 1970."""
+def _ms_of(text: str) -> int | None:
+    """Of ``YYYYMMDD/HHMMSS_mmm`` in a key, ms since 1970; None for what is no time."""
     seconds, _, ms = text.rpartition('_')
-    return int(datetime.strptime(f'{seconds}+0000', '%Y%m%d/%H%M%S%z').timestamp()) * 1000 + int(ms)
+    try:
+        return int(datetime.strptime(f'{seconds}+0000', '%Y%m%d/%H%M%S%z').timestamp()) * 1000 + int(ms)
+    except ValueError:
+        return None

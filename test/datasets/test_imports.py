@@ -358,6 +358,30 @@ def test_a_frame_that_is_there_twice(shelf: Shelf) -> None:
         shelf.bring(folder)
 
 
+def test_what_others_left_in_the_store_is_not_taken_for_an_import(shelf: Shelf) -> None:
+    """Keys that look like ours with a date that is none, what the arm logged itself, and metadata that is no number."""
+    shelf.bring(shelf.set(numbers=(0,)))
+    root = shelf.settings.directory / 'sensor-data/arm/joint_states'
+    for name in ('20269999/999999_000_joint_states_0123456789abcdef_0.json', '20261028/120000_000_joint_states.json'):
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_bytes(b'{}')
+    (root / '20261028/115900_000_joint_states_0123456789abcdef_0.json').write_bytes(b'{}')  # begins before; its end is unknown
+    found = shelf.bring(shelf.set(numbers=(0, 1)))
+    assert counts(found) == (1, 1, 0, 1)
+
+
+@pytest.mark.parametrize('column', ['episode_index', 'frame_index'])
+def test_numbers_of_frames_that_are_none(shelf: Shelf, column: str) -> None:
+    folder = shelf.set()
+    path = folder / 'data/chunk-000/file-000.parquet'
+    table = pq.read_table(path)
+    values = table[column].to_numpy().astype(np.float64)
+    values[5] = np.nan
+    pq.write_table(table.set_column(table.column_names.index(column), column, pa.array(values)), path)
+    with pytest.raises(LakeError, match='that is no whole number'):
+        shelf.bring(folder)
+
+
 def test_the_command_reports_what_was_refused(shelf: Shelf, tmp_path: Path) -> None:
     """With exit code 1; what is there already, and what is not there any more, is no finding."""
     home = tmp_path / 'home'
