@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
-from shadowhound_data_logger.bags.naming import natural
+from shadowhound_data_logger.bags.naming import SQLITE, natural
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.errors import BagDamaged
 from shadowhound_data_logger.mcap.slice_info import SliceInfo, counted
@@ -113,7 +113,8 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
     parts = [_part_of(name, one) for name, one in infos.items()] + [BagPart(name, None, None, None) for name in damaged]
     absent = [part for part in claimed.parts if part.name not in {*infos, *damaged}] if claimed is not None else []
     found = Description(
-        storage='mcap', compression='', distro='', topics=tuple(topics.values()),
+        storage='sqlite3' if any(SQLITE in name for name in infos) else 'mcap', compression='', distro='',
+        topics=tuple(topics.values()),
         parts=tuple(sorted((*parts, *absent), key=lambda part: natural(part.name))),
         messages=sum(one.messages for one in infos.values()) if infos or not absent else None,
         t_start_ns=min((one.t_start_ns for one in filled), default=None),
@@ -121,7 +122,8 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
     )  # fmt: skip
     if claimed is None:
         return found
-    whole = replace(found, storage=claimed.storage, compression=claimed.compression, distro=claimed.distro, clock=claimed.clock)
+    storage = claimed.storage or found.storage
+    whole = replace(found, storage=storage, compression=claimed.compression, distro=claimed.distro, clock=claimed.clock)
     return whole if absent or damaged else replace(whole, remarks=tuple(_contradictions(whole, claimed)))
 
 
@@ -152,11 +154,15 @@ def _contradictions(found: Description, claimed: Description) -> Iterator[str]:
     unnamed = [part.name for part in found.parts if part.name not in names]
     if unnamed:
         yield f'metadata.yaml does not name {", ".join(unnamed)}'
-    if found.messages != claimed.messages:
+    if claimed.messages is None:
+        yield 'metadata.yaml has no number of messages'
+    elif found.messages is not None and found.messages != claimed.messages:
         yield f'metadata.yaml claims {claimed.messages:,} messages, the files have {found.messages:,}'
     elif _counts(found) != _counts(claimed):
         yield 'metadata.yaml claims other numbers of messages for the topics than the files have'
-    if (found.t_start_ns, found.t_end_ns) != (claimed.t_start_ns, claimed.t_end_ns) and claimed.messages and found.messages:
+    if claimed.messages and claimed.t_start_ns is None:
+        yield 'metadata.yaml has no starting time or no duration'
+    elif (found.t_start_ns, found.t_end_ns) != (claimed.t_start_ns, claimed.t_end_ns) and claimed.messages and found.messages:
         yield f'metadata.yaml claims the time {_span(claimed)}, the files have {_span(found)}'
 
 
@@ -198,19 +204,27 @@ def _is_infinite(lifespan: object) -> bool:
 
 
 def _described(found: Mapping[str, Any], there: Container[str]) -> Description:
-    """Every version of the format; what a version does not have is unknown."""
-    start, messages = _whole(found['starting_time'], 'nanoseconds_since_epoch'), _whole(found, 'message_count')
+    """Every version of the format; a field that is missing is unknown."""
+    messages = _whole(found, 'message_count')
     told = {_text(each['path']): each for each in found.get('files') or ()}
-    paths = [_text(path) for path in found['relative_file_paths'] or ()]
+    paths = [_text(path) for path in found.get('relative_file_paths') or ()]
     compression = ' '.join(_text(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
+    start, end = _times(found, messages)
     return Description(
-        storage=_text(found['storage_identifier']), compression='' if compression.lower() == 'none' else compression.lower(),
-        distro=_text(found.get('ros_distro') or ''), topics=tuple(_topics(found.get('topics_with_message_count') or ())),
-        messages=messages,
-        parts=tuple(_part(path if path in there else PurePosixPath(path).name, told.get(path)) for path in paths),
-        t_start_ns=start if messages else None, t_end_ns=start + _whole(found['duration'], 'nanoseconds') if messages else None,
-        clock=clock_said(found.get('custom_data')),
+        storage=_text(found.get('storage_identifier') or ''), distro=_text(found.get('ros_distro') or ''),
+        compression='' if compression.lower() == 'none' else compression.lower(),
+        topics=tuple(_topics(found.get('topics_with_message_count') or ())),
+        messages=messages, t_start_ns=start, t_end_ns=end, clock=clock_said(found.get('custom_data')),
+        parts=tuple(_part(path if path in there else PurePosixPath(path).name, told.get(path, {})) for path in paths),
     )  # fmt: skip
+
+
+def _times(told: Mapping[str, Any], messages: int | None) -> tuple[int | None, int | None]:
+    start = _whole(told.get('starting_time') or {}, 'nanoseconds_since_epoch')
+    length = _whole(told.get('duration') or {}, 'nanoseconds')
+    if not messages or start is None or length is None:
+        return None, None
+    return start, start + length
 
 
 def clock_said(custom: object) -> dict[str, str]:
@@ -237,19 +251,16 @@ def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:
         )  # fmt: skip
 
 
-def _part(path: str, told: Mapping[str, Any] | None) -> BagPart:
-    if told is None:
-        return BagPart(path, None, None, None)
-    start, messages = _whole(told['starting_time'], 'nanoseconds_since_epoch'), _whole(told, 'message_count')
-    end = start + _whole(told['duration'], 'nanoseconds')
-    return BagPart(path, messages, start if messages else None, end if messages else None)
+def _part(path: str, told: Mapping[str, Any]) -> BagPart:
+    messages = _whole(told, 'message_count')
+    return BagPart(path, messages, *_times(told, messages))
 
 
-def _whole(told: Mapping[str, Any], name: str) -> int:
-    found = told[name]
+def _whole(told: Mapping[str, Any], name: str) -> int | None:
+    found = told.get(name)
     if isinstance(found, str) and found.isdecimal() and len(found) <= 20:
         found = int(found)
-    if type(found) is not int or not 0 <= found < _LATEST_NS:
+    if found is not None and (type(found) is not int or not 0 <= found < _LATEST_NS):
         raise ValueError(f'{name} is not a whole number of 0 ... 2^64')
     return found
 

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Final, cast
 
 from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bags.contents import files_of, open_folder
+from shadowhound_data_logger.bags.contents import files_of, no_bag, open_folder
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, Manifest, Missing, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, UNSAFE, prefix_of
@@ -101,6 +101,8 @@ def finished(folder: Path) -> FinishedBag:
             raise BagError(f'{path} is a link out of the bag', remedy=remedy, path=str(path))
     reader = open_folder(folder).reader
     described = reader.describe()
+    if not described.parts:
+        raise no_bag(folder)
     if described.absent:
         text = f'{folder} is not complete: {", ".join(described.absent)}, which {METADATA} names, is missing'
         raise BagError(text, path=str(folder), remedy=f'put it there, or take its name out of {METADATA}')

@@ -19,6 +19,7 @@ from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
+from shadowhound_data_logger.bags.upload_plan import finished
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.errors import BagDamaged, BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -222,3 +223,27 @@ def test_a_file_that_is_there_twice(tmp_path: Path, named: str) -> None:
     if named:
         metadata(path.parent, [named], 5)
     check(path.parent, tmp_path / 'piece')
+
+
+@pytest.mark.parametrize('field', [
+    'version', 'storage_identifier', 'relative_file_paths', 'message_count', 'duration', 'starting_time',
+    'topics_with_message_count', 'files',
+])  # fmt: skip
+def test_a_field_that_metadata_lacks(tmp_path: Path, field: str) -> None:
+    """Is read from the files; a number that would be wrong without it is reported."""
+    folder = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE).parent
+    metadata(folder, ['b_0.db3'], 5)
+    told = json.loads((folder / 'metadata.yaml').read_text())
+    del told['rosbag2_bagfile_information'][field]
+    (folder / 'metadata.yaml').write_text(json.dumps(told))
+    found = info_folder(folder).description
+    assert (found.messages, found.t_start_ns, found.t_end_ns, found.storage) == (9, T0, T0 + 8 * 10**9, 'sqlite3')
+    assert bool(found.remarks) == (field not in {'version', 'storage_identifier', 'files'})
+    assert cut_folder(folder, tmp_path / 'piece', Choice()).messages == 9
+
+
+def test_metadata_of_nothing(tmp_path: Path) -> None:
+    """Is no bag that could be uploaded."""
+    (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
+    with pytest.raises(BagError, match='holds no bag'):
+        finished(tmp_path)
