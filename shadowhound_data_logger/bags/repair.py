@@ -129,6 +129,7 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     result = BagRepair(path, None, tuple(each.report for each in found), remarks, absent)
     if not result.is_damaged:
         return result
+    told.begin(sum(each.look[0] * (1 + each.report.is_damaged) for each in found))
     with _writing(out, in_place=in_place) as folder:
         for each in found:
             if each.report.is_damaged and not each.report.failed:
