@@ -61,8 +61,8 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
 @click.option('--scan', is_flag=True, help='Of a condition on values: open objects without statistics as well.')
-@click.option('--join', 'join_s', type=click.FloatRange(0.0), default=1.0, show_default=True, metavar='S',
-              help='Times at most so far apart are one.')  # fmt: skip
+@click.option('--join', 'join_s', type=click.FloatRange(0.0), metavar='S',
+              help='Times at most so far apart are one  [default: 1, or two periods of a slower sensor]')  # fmt: skip
 @click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
 @click.option('--like', 'like', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
               help='The pictures that are most like this one, by vectors that `lake embed` made.')  # fmt: skip
@@ -75,8 +75,8 @@ _OBJECTS: Final = {'bucket', 'key'}
     '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
 )
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str,  # noqa: PLR0913 - one an option
-          as_json: bool, with_labels: bool, scan: bool, join_s: float, pad_s: float, like: Path | None, like_text: str | None,
-          model: Path | None, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
+          as_json: bool, with_labels: bool, scan: bool, join_s: float | None, pad_s: float, like: Path | None,
+          like_text: str | None, model: Path | None, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
     An object must match all flags; times are UTC.

@@ -54,8 +54,12 @@ ALLOWED: Final = (
     "comparisons such as 'imu.accelerometer.2 > 15' or 'max(states.foot_force) > 200': sensor.field, or one of first last min "
     'max mean count nan_count of it, then < <= > >= = != and a number; joined by and, or and parentheses'
 )
-JOIN_S: Final = 1.0
-"""What is no further apart is one range."""
+MIN_JOIN_S: Final = 1.0
+"""What is no further apart is one range, unless the sensor is slower."""
+MAX_JOIN_S: Final = 60.0
+"""Of messages that are stored on a change, nobody knows a period."""
+JOIN_PERIODS: Final = 2
+"""A sampler keeps the first message of each period: two in a row are up to two periods apart."""
 OPENED_AT_A_TIME: Final = 64
 MOST_LEAVES: Final = 32
 MOST_TEXT: Final = 10_000
@@ -215,12 +219,12 @@ def _one(text: str, at: int, depth: int) -> tuple[Expression, int]:
 # -- the question --------------------------------------------------------------------------------------------------------------
 
 
-def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, join_s: float = JOIN_S, pad_s: float = 0.0,
+def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, join_s: float | None = None, pad_s: float = 0.0,
            findings: Findings | None = None, **flags: Any) -> ValueAnswer:  # fmt: skip
     """When a condition held; ``flags`` are those of ``lake.objects`` and choose objects of its sensor.
 
-    ``scan`` opens objects without statistics as well. Ranges at most ``join_s`` apart are one, and each gets ``pad_s`` before and
-    after it. Raises SettingError, LakeError for what is not a question, StoreError.
+    ``scan`` opens objects without statistics as well. Ranges at most ``join_s`` apart are one (None: 1 s, or two periods of a
+    slower sensor), and each gets ``pad_s`` before and after it. Raises SettingError, LakeError for a wrong question, StoreError.
     """
     expression = parse(condition)
     sensor = leaves(expression)[0].sensor
@@ -236,7 +240,7 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     objects = opened = unknown = 0
     for robot in [asked.robot] if asked.robot else robots(source):
         of = _Question(source, replace(asked, robot=robot), {**flags, 'robot': robot}, robot, expression, findings)
-        answer = of.answer(scan=scan, join_ns=round(join_s * SECOND), pad_ns=round(pad_s * SECOND))
+        answer = of.answer(scan=scan, join_ns=None if join_s is None else round(join_s * SECOND), pad_ns=round(pad_s * SECOND))
         found += answer.ranges
         fresh += answer.fresh
         fields.update(answer.fields)
@@ -257,7 +261,7 @@ class _Question:
         self._findings = findings
         self._parts = [entry for day in folders(source, asked, findings, STATISTICS) for entry in day.entries]
 
-    def answer(self, *, scan: bool, join_ns: int, pad_ns: int) -> ValueAnswer:
+    def answer(self, *, scan: bool, join_ns: int | None, pad_ns: int) -> ValueAnswer:
         rows, told, seen = self._candidates()
         may, must, is_known = told.judged(self._expression)
         to_open = np.flatnonzero(may & ~must & (is_known | scan))
@@ -268,6 +272,8 @@ class _Question:
                 unknown += 1
             else:
                 spans.append(np.array(some, np.int64).reshape(-1, 3))
+        if join_ns is None:
+            join_ns = round(min(max(MIN_JOIN_S, JOIN_PERIODS * seen.period_ns() / SECOND), MAX_JOIN_S) * SECOND)
         found = _joined_spans(np.concatenate(spans), join_ns)
         for chosen in self._asked.chosen:
             found = (
@@ -408,6 +414,7 @@ class _Sieve:
         self._chosen = chosen
         self._known = known
         self._seen: list[NDArray[np.int64]] = []
+        self._last: list[NDArray[np.int64]] = []
         self.objects = 0
         self.newest_ns = 0
         self.ends: dict[str, int | None] = {}
@@ -424,6 +431,7 @@ class _Sieve:
         self._count(_filtered(table, kept))
         inside = np.sort(stamps[kept])
         self._seen.append(inside)
+        self._last.append(np.sort(pc.coalesce(table['t_end_ns'], table['t_start_ns']).filter(pa.array(kept)).to_numpy()))
         low, high = np.searchsorted(self._known, inside[[0, -1]]) if len(inside) else (0, 0)
         if len(inside) and np.array_equal(self._known[low : high + 1], inside):
             return kept & _is_among(stamps, self._chosen)
@@ -433,6 +441,14 @@ class _Sieve:
         """Times that several rows have."""
         stamps = np.sort(np.concatenate([np.zeros(0, np.int64), *self._seen]), kind='stable')
         return np.unique(stamps[1:][np.diff(stamps) == 0])
+
+    def period_ns(self) -> int:
+        """The usual time between two messages, as far as rows tell it: no longer than a batch; 0 where it is unknown."""
+        first, last = (np.sort(np.concatenate([np.zeros(0, np.int64), *some])) for some in (self._seen, self._last))
+        if len(first) < 2:
+            return 0
+        lasting, apart = np.median(last - first), np.median(np.maximum(first[1:] - last[:-1], 0))
+        return int(min(apart, lasting) if lasting > 0 else apart)
 
     def _count(self, table: pa.Table) -> None:
         self.objects += len(table)

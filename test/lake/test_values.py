@@ -367,3 +367,38 @@ def test_only_questions_about_values_read_statistics(tmp_path: Path, monkeypatch
     assert (len(asked) > 0, [key for key in asked if '_stats' in key]) == (True, [])
     values.ranges('s.a > 11', source)
     assert [key for key in asked if '_stats' in key] != []
+
+
+def slow(root: Path, stamps_s: list[float], values_: list[float]) -> Bucket:
+    """A lake with an object of one message at each of these times."""
+    settings_ = folder_store(root)
+    with closing(open_store(settings_, UploadSettings())) as store:
+        rows = []
+        for second, value in zip(stamps_s, values_, strict=True):
+            stamp_ns = NOON_NS + round(second * SECOND)
+            content, key = body(stamp_ns, [{'a': value}]), f'thor/s/20261028/{round(second * 1000):09d}_s.json'
+            add(store, root, key, content)
+            metadata = {'robot': 'thor', 'sensor': 's', 'topic': '/s', 'type': 'x/msg/S', 'count': '1',
+                        'sha256': hashlib.sha256(content).hexdigest(), 't_start_ns': str(stamp_ns),
+                        't_end_ns': str(stamp_ns)}  # fmt: skip
+            rows.append(schema.row_of(schema.BUCKET, key, len(content), 'application/json', metadata))
+        add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
+    return Bucket(settings_, schema.BUCKET)
+
+
+@pytest.mark.parametrize('period_s', [1.0, 5.0])
+def test_jittered_samples_of_a_slow_sensor_are_one_range(tmp_path: Path, period_s: float) -> None:
+    """The sensor's own period says what belongs together; a real pause still parts two ranges, and --join is obeyed."""
+    stamps = [period_s * (place + 0.35 * math.sin(7 * place) + (60 if place >= 50 else 0)) for place in range(100)]
+    lake = slow(tmp_path, stamps, [20.0] * 100)
+    found = values.ranges('s.a > 15', lake, scan=True)
+    assert [each.messages for each in found.ranges] == [50, 50]
+    assert len(values.ranges('s.a > 15', lake, scan=True, join_s=period_s).ranges) > 20
+    assert len(values.ranges('s.a > 15', lake, scan=True, join_s=100 * period_s).ranges) == 1
+
+
+def test_a_fast_sensor_joins_what_is_a_second_apart(tmp_path: Path) -> None:
+    """Batches of many messages: the period is that of messages, not of objects."""
+    high, low = [{'a': 20.0}] * 5, [{'a': 1.0}] * 5
+    lake = filled(tmp_path, [high, low, high], [True] * 3)
+    assert [each.messages for each in values.ranges('s.a > 15', lake).ranges] == [5, 5]
