@@ -42,6 +42,12 @@ class SettingError(DataLoggerError):
         return f'{self.what}; {self.remedy}'
 
 
+class UnknownName(DataLoggerError):
+    """Nothing has the name that a question names; ``data['near']`` are the nearest names that something has."""
+
+    DEFAULT_REMEDY = 'shadowhound-data query "SELECT * FROM topics" lists what is stored'
+
+
 class NameRefused(DataLoggerError):
     """A name that would become part of an object key is not safe there."""
 
@@ -122,6 +128,12 @@ class BagError(DataLoggerError):
     """A bag, or a file that should be one, does not allow what is asked."""
 
     DEFAULT_REMEDY = 'shadowhound-data bag list shows the bags there are'
+
+
+class UnknownBag(BagError, UnknownName):
+    """The store has no bag of this name."""
+
+    DEFAULT_REMEDY = BagError.DEFAULT_REMEDY
 
 
 class BagDamaged(BagError):

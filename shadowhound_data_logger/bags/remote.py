@@ -15,7 +15,7 @@ from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import clock_said
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural, prefix_of
-from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.errors import UnknownBag
 from shadowhound_data_logger.mcap.ranges import StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -77,7 +77,7 @@ def find_bags(store: ObjectStore, robot: str) -> list[RemoteBag]:
 
 
 def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
-    """One of them. Raises BagError naming similar ones where there is none, StoreError."""
+    """One of them. Raises UnknownBag naming similar ones where there is none, StoreError."""
     prefix = prefix_of(robot, bag)
     if bag.endswith(ARCHIVE):
         held = store.head(BUCKET, prefix[:-1])
@@ -88,7 +88,7 @@ def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
         known = [each.name for each in find_bags(store, robot)]
         near = difflib.get_close_matches(bag, known, cutoff=0.4) or known[-3:]
         there = f'the store has {", ".join(near)}' if near else f'the store has no bag of {robot}; --robot names another robot'
-        raise BagError(f'there is no bag {bag} of {robot} in {store.describe()}', remedy=there, bag=bag, robot=robot)
+        raise UnknownBag(f'there is no bag {bag} of {robot} in {store.describe()}', remedy=there, bag=bag, robot=robot)
     return RemoteBag(robot, bag, _ordered(files))
 
 

@@ -121,10 +121,14 @@ def _fetch_dataset(url: str, to: Path, *, is_json: bool) -> ExitCode:
 def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[dict[str, Any]]:
     """The rows of the catalogue."""
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+    from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
 
+    source = default_source(the_store_settings())
     with lake.answering():
-        rows = lake.objects(default_source(the_store_settings()), findings=left_out, **flags).sort('t_start_ns')
+        rows = lake.objects(source, findings=left_out, **flags).sort('t_start_ns')
         found: list[dict[str, Any]] = (rows.limit(limit) if limit else rows).to_pylist()
+    if not found:
+        check_names(source, left_out, **flags)
     return found
 
 

@@ -10,6 +10,7 @@ import sqlite3
 import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
+from itertools import pairwise
 from typing import Final
 
 import click
@@ -26,7 +27,7 @@ from shadowhound_data_logger.cli.likeness import lake_embed
 from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
-from shadowhound_data_logger.cli.output import tell_error
+from shadowhound_data_logger.cli.output import print_error, tell_error
 from shadowhound_data_logger.cli.policy import policy
 from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
@@ -34,7 +35,7 @@ from shadowhound_data_logger.cli.search import lake_index, search
 from shadowhound_data_logger.cli.sink import lake_sink
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
-from shadowhound_data_logger.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.errors import DataLoggerError, SettingError, UnknownName
 
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),
@@ -114,8 +115,20 @@ def main() -> None:
         click.echo(error.format_message(), err=True)
         sys.exit(ExitCode.USAGE)
     except (click.ClickException, DataLoggerError, OSError, sqlite3.Error) as error:
-        tell_error(*described(error, sys.argv[1:]))
-        sys.exit(ExitCode.USAGE if isinstance(error, (click.ClickException, SettingError)) else ExitCode.FINDING)
+        is_usage = isinstance(error, (click.ClickException, SettingError, UnknownName))
+        code = ExitCode.USAGE if is_usage else ExitCode.FINDING
+        told = described(error, sys.argv[1:])
+        if wants_json(sys.argv[1:]):
+            print_error(*told, code)
+        else:
+            tell_error(*told)
+        sys.exit(code)
+
+
+def wants_json(arguments: Sequence[str]) -> bool:
+    """Whether the answer was to be JSON: also known of a command line that is wrong."""
+    given = list(arguments[: arguments.index('--')] if '--' in arguments else arguments)
+    return not {'--json', '--format=json'}.isdisjoint(given) or ('--format', 'json') in set(pairwise(given))
 
 
 def described(error: Exception, arguments: Sequence[str]) -> tuple[str, str, str]:

@@ -50,6 +50,11 @@ def tell_error(verb: str, what: str, remedy: str) -> None:
         click.echo(start + '\n'.join(map(visible, text.split('\n'))), err=True)
 
 
+def print_error(verb: str, what: str, remedy: str, code: int) -> None:
+    """The same for programs: one line of JSON on standard error, so that standard output has answers alone."""
+    click.echo(json.dumps({'error': what, 'remedy': remedy, 'verb': verb, 'exit_code': int(code)}), err=True)
+
+
 def print_page(*parts: RenderableType, console: Console | None = None) -> None:
     """Parts under one another, tables two columns apart where there is room; without a terminal no table is cut or broken."""
     console = console or Console(highlight=False)

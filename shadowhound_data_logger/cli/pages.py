@@ -65,6 +65,14 @@ An error names the verb, what is wrong and where, and on the next line what to d
     shadowhound-data bag info: there is no bag patrol of thor in the folder /home/hound/.shadowhound/store
       -> the store has no bag of thor; --robot names another robot
 
+With `--json` (and `--format json`) an error is JSON as well: one line on standard error, and nothing on standard output.
+
+    {"error": "there is no sensor 'camra'", "remedy": "is it 'camera'?", "verb": "shadowhound-data query", "exit_code": 2}
+
+Names that nothing in the store has (robot, sensor, topic, field, mission, mission type, policy, label, bag) are wrong usage. If
+all names exist and nothing matches, the answer is empty and the exit code 0, in every format: `--format keys` prints nothing.
+What a terminal's encoding does not have is printed as its escape (`\\u5de1`).
+
 ## Exit codes
 Of every verb; the node ends with 0, 1 or 2 in the same sense.
 

@@ -91,16 +91,20 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
-        from shadowhound_data_logger.lake import labels, values  # noqa: PLC0415
+        from shadowhound_data_logger.lake import labels, names, values  # noqa: PLC0415
 
         if values.is_about_values(flags.get('where', '')):
             if sql or sheet or ground or order or limit or with_labels or kind not in {'table', 'json'}:
                 raise BadUsage('a condition on values answers with times, as a table or JSON',
                                'write them to a file with --json, and ask again with --ranges FILE')  # fmt: skip
-            left_out = quietly()
+            source, left_out = default_source(the_store_settings()), quietly()
             others = {name: value for name, value in flags.items() if name != 'where'}
-            found = values.ranges(flags['where'], default_source(the_store_settings()), scan=scan, join_s=join_s,
+            found = values.ranges(flags['where'], source, scan=scan, join_s=join_s,
                                   pad_s=pad_s, findings=left_out, **others)  # fmt: skip
+            if not found.objects:
+                names.check_names(source, left_out, **{'sensor': values.sensor_of(flags['where']), **others})
+            if found.fields:
+                names.check_name_of('field', values.field_of(flags['where'], found.fields), found.fields)
             _print_times(flags['where'], found, is_json=as_json or kind == 'json')
             return tell_left_out(left_out)
         if sql and with_labels:
@@ -114,6 +118,8 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
             limit = limit or SHOWN
         else:
             found = _found(source, sql, flags, order, limit, left_out)
+            if flags and not len(found if not sql else _found(source, None, flags, None, 1, left_out)):
+                names.check_names(source, left_out, **flags)
         if with_labels:
             found = labels.with_column(found, labels.read(source, flags.get('robot'), findings=left_out))
     if (sheet or ground or kind == 'keys') and not _OBJECTS.issubset(found.column_names):

@@ -11,7 +11,7 @@ import click
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
-from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.errors import LakeError, SettingError, UnknownName
 from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, from_json
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def asking() -> Iterator[None]:
     """An invalid query is bad usage, and so is a machine without the library."""
     try:
         yield
-    except (LakeError, SettingError) as error:
+    except (LakeError, SettingError, UnknownName) as error:
         raise BadUsage(error.what, error.remedy or error.DEFAULT_REMEDY) from error
     except ModuleNotFoundError as error:
         if error.name not in EXTRA:

@@ -34,6 +34,7 @@ from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.names import check_name_of
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -145,11 +146,28 @@ def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, lim
     with _opened(path) as db:
         db.row_factory = sqlite3.Row
         found = [dict(row) for row in db.execute(query, (match, *values, limit))]
+        if not found:
+            _check_names(db, asked)
         for row in found:
             number = row.pop('id')
             row['labels'] = sorted(_unspaced(name) for (name,) in db.execute(_LABELS, (number, number)))
             row['title'], row['excerpt'] = _unspaced(row['title']), _unspaced(row['excerpt'])
     return [{**row, 'success': None if row['success'] is None else bool(row['success'])} for row in found]
+
+
+def _check_names(db: sqlite3.Connection, asked: Wanted) -> None:
+    """Raises UnknownName for one that no document has."""
+    for name in ('robot', 'mission_type'):
+        if (value := getattr(asked, name)) is not None:
+            known = (each for (each,) in db.execute(f'SELECT DISTINCT {name} FROM documents'))  # noqa: S608 - our own
+            check_name_of(name.replace('_', ' '), value, known)
+    if asked.mission is not None:
+        ids = [each for pair in db.execute('SELECT DISTINCT mission_id, run_id FROM documents') for each in pair if each]
+        if not any(each.startswith(asked.mission) for each in ids):
+            check_name_of('mission', asked.mission, ids)
+    if asked.label is not None:
+        titles = db.execute("SELECT DISTINCT words.title FROM documents JOIN words ON words.rowid = id WHERE kind = 'label'")
+        check_name_of('label', asked.label, (_unspaced(each) for (each,) in titles))
 
 
 def updated(path: Path) -> tuple[int, int] | None:

@@ -248,6 +248,17 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     return ValueAnswer(tuple(found), objects, opened, unknown, tuple(fresh), () if found or unknown else tuple(sorted(fields)))
 
 
+def sensor_of(condition: str) -> str:
+    """Which sensor a condition is about. Raises SettingError."""
+    return leaves(parse(condition))[0].sensor
+
+
+def field_of(condition: str, there: Sequence[str]) -> str:
+    """The first field of a condition that is not among those there are. Raises SettingError."""
+    asked = [leaf.field for leaf in leaves(parse(condition))]
+    return next((field for field in asked if not any(covers(field, name) for name in there)), asked[0])
+
+
 class _Question:
     """A condition on the objects of one robot."""
 

@@ -13,6 +13,7 @@ from lake.gap_parts import mark, tell
 from lake.making import NOON_NS, add, folder_store
 from lake.test_values import BATCHES, filled
 
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
@@ -103,7 +104,9 @@ def test_words_are_found_with_the_labels_of_their_time(home: Path) -> None:
     assert [(each['kind'], each['mission_id'], 'hall' in each['labels']) for each in found['found']] == [('mission', 'm', True)]
     assert (found['waiting'], found['fresh_ns'] > NOON_NS) == (1, True)
     assert told(home, 'search', 'door', '--label', 'hall')['found'] == found['found']
-    assert told(home, 'search', 'door', '--label', 'stairs')['found'] == []
+    assert told(home, 'search', 'door', '--label', 'high')['found'] == []
+    with pytest.raises(BadUsage, match="no label 'halll'"):
+        run(home, 'search', 'door', '--label', 'halll')
     text = run(home, 'search', 'door').output
     assert text.splitlines()[0].split()[-1] == 'labels'
     assert text.splitlines()[-1].startswith('Fresh up to 20')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import pkgutil
 import re
 import shlex
@@ -19,7 +20,7 @@ import shadowhound_data_logger
 from shadowhound_data_logger.cli import main as main_module
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.main import PROGRAM, SECTIONS, cli, described, main, verb_of
-from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError
+from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError, UnknownName
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -164,7 +165,7 @@ def test_every_class_of_errors_has_a_remedy(monkeypatch: pytest.MonkeyPatch, cap
         with monkeypatch.context() as patched:
             patched.setattr(main_module.cli.commands['bag'].commands['list'], 'callback', fail)  # type: ignore[attr-defined]
             code, (what, remedy) = ended(patched, capsys, 'bag', 'list')
-        assert code == (ExitCode.USAGE if issubclass(kind, SettingError) else ExitCode.FINDING), kind
+        assert code == (ExitCode.USAGE if issubclass(kind, (SettingError, UnknownName)) else ExitCode.FINDING), kind
         assert what.startswith(f'{PROGRAM} bag list: '), kind
         assert ('camera.rate_hz' if issubclass(kind, SettingError) else 'it went wrong in /here') in what, kind
         assert re.fullmatch(r'  -> \S.{10,}', remedy), kind
@@ -189,7 +190,7 @@ def test_a_remedy_of_its_own_comes_first() -> None:
     (['bag', 'list', '--since', 'soon'], ExitCode.USAGE, "--since = 'soon' is refused", 'allowed is now, today'),
     (['bag', 'list', '--robot', '../x'], ExitCode.USAGE, 'the robot name', 'letters'),
     (['bag', 'info', './none'], ExitCode.USAGE, 'there is no folder ./none', f'{PROGRAM} bag list'),
-    (['bag', 'info', 'none'], ExitCode.FINDING, 'none', '--robot'),
+    (['bag', 'info', 'none'], ExitCode.USAGE, 'none', '--robot'),
     (['missions', 'show', 'x'], ExitCode.USAGE, "no mission here has the id 'x'", f'{PROGRAM} missions list'),
     (['ledger', '--topic', '/imu'], ExitCode.USAGE, 'choose among gaps', '--gaps'),
     (['ledger', '--since', 'now', '--gaps', '--until', 'x'], ExitCode.USAGE, "--until = 'x' is refused", 'allowed is now'),
@@ -210,6 +211,27 @@ def test_an_error_says_what_and_what_to_do(home: Path, monkeypatch: pytest.Monke
     assert what in lines[0]
     assert lines[-1].startswith('  -> ')
     assert remedy in lines[-1]
+
+
+@pytest.mark.parametrize(('arguments', 'code'), [
+    (['query', '--since', 'soon', '--json'], ExitCode.USAGE), (['query', '--json', '--nope'], ExitCode.USAGE),
+    (['query', '--since', 'soon', '--format', 'json'], ExitCode.USAGE), (['status', '--json', '--interval', '0'], ExitCode.USAGE),
+    (['bag', 'info', 'none', '--json'], ExitCode.USAGE), (['spool', 'list', '--json'], ExitCode.FINDING),
+    (['missions', 'show', 'x', '--json'], ExitCode.USAGE),
+])  # fmt: skip
+def test_an_error_is_json_where_the_answer_would_be(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], code: ExitCode
+) -> None:
+    """One line on standard error, of one shape, with the exit code; nothing on standard output."""
+    assert home.is_dir()
+    found, lines = ended(monkeypatch, capsys, *arguments)
+    assert found == code
+    (line,) = lines
+    told = json.loads(line)
+    assert set(told) == {'error', 'remedy', 'verb', 'exit_code'}
+    assert all(told.values())
+    assert told['exit_code'] == code
+    assert told['verb'].startswith(f'{PROGRAM} {arguments[0]}')
 
 
 @pytest.mark.parametrize('arguments', [(), ('missions',), ('node', 'bag')])

@@ -120,3 +120,27 @@ def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
     ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=False, timeout=60)
     assert ran.returncode == 2
     assert 'shadowhound_data_logger[lake]' in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'what', 'remedy'),
+    [(['--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'?"),
+     (['--sensor', 'Camera'], "no sensor 'Camera'", "is it 'camera'?"),
+     (['--robot', 'thro'], "no robot 'thro'", "is it 'thor'?"),
+     (['--topic', '/odm'], "no topic '/odm'", "is it '/odom'"),
+     (['--mission-type', 'patrl'], "no mission type 'patrl'", "is it 'patrol'?"),
+     (['--mission', 'mfial'], "no mission 'mfial'", "is it 'mfailed'?"),
+     (['--policy', 'x'], '', ''),
+     (['--sensor', 'zzz'], "no sensor 'zzz'", 'there are battery'),
+     (['SELECT count(*) FROM objects', '--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'?"),
+     (['--where', 'camra.x > 1'], "no sensor 'camra'", "is it 'camera'?"),
+     (['--where', 'no_column > 1'], 'cannot be answered', 'examples')],
+)  # fmt: skip
+def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], what: str, remedy: str) -> None:
+    """Exit code 2 and the nearest names; where none is known of a kind, any may exist."""
+    found = run(home, *arguments, '--format', 'json')
+    if not what:
+        assert found.exit_code == 0
+        return
+    assert found.exit_code == 2
+    assert what in found.output

@@ -15,7 +15,7 @@ from lake.making import NOON_NS, add, folder_store
 
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.errors import LakeError, SettingError, UnknownName
 from shadowhound_data_logger.lake import labels, search
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -82,7 +82,10 @@ def test_the_flags_of_a_query(index: Path) -> None:
     assert missions(index, 'door handle', success=False) == ['m1']
     assert missions(index, 'door handle', until='2026-10-28T12:30') == ['m0']
     assert missions(index, 'door handle', mission='run1') == ['m1']
-    assert missions(index, 'door', robot='tachi') == []
+    for wrong, named in (({'robot': 'thro'}, 'thor'), ({'mission_type': 'patrl'}, 'patrol'), ({'mission': 'run9'}, 'run'),
+                         ({'label': 'stair'}, 'stairs')):  # fmt: skip
+        with pytest.raises(UnknownName, match=named):
+            missions(index, 'door', **wrong)
     assert missions(index, 'up', label='stairs') == ['m2']
     assert missions(index, 'door', label='stairs') == []
     assert [each['labels'] for each in search.search(index, 'explore', wanted(0))] == [['stairs']]
@@ -202,7 +205,8 @@ def test_labels_of_scripts_without_spaces(tmp_path: Path) -> None:
     path = tmp_path / 'search.db'
     search.update(path, Bucket(settings, 'sensor-data'))
     assert [each['labels'] for each in search.search(path, '厨房', wanted(0, label='楼梯'))] == [['楼梯']]
-    assert missions(path, '厨房', label='楼') == []
+    with pytest.raises(UnknownName, match='楼梯'):
+        missions(path, '厨房', label='楼')
 
 
 def test_the_index_takes_little_more_than_the_words(tmp_path: Path) -> None:
