@@ -109,15 +109,15 @@ def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
     """Of the types that the settings expect."""
     from shadowhound_data_logger.ros.reader import unavailable  # noqa: PLC0415 - rclpy
 
-    missing: dict[str, list[str]] = {}
+    missing: dict[str, dict[str, str]] = {}
     for name in sorted({name for sensor in sensors for name in sensor.types}):
-        if unavailable(name):
-            missing.setdefault(name.partition('/')[0], []).append(name)
-    for package, names in missing.items():
+        if reason := unavailable(name):
+            missing.setdefault(name.partition('/')[0], {})[name] = reason
+    for package, reasons in missing.items():
         yield error(
             'ros.types',
-            f'{package} cannot be imported, so {", ".join(names)} cannot be received',
-            'the workspace with this package is not sourced in this shell, or was not built for this Python',
+            f'{", ".join(reasons)} cannot be received: {next(iter(reasons.values()))}',
+            'the workspace with this package is not sourced in this shell, was not built for this Python, or has no such type',
             TYPES_REMEDY.format(package=package),
         )
     if not missing:
