@@ -283,7 +283,7 @@ def _png_of_depth(pixels: NDArray[np.uint16]) -> bytes:
     from PIL import Image  # noqa: PLC0415 - see _pillow
 
     height, width = pixels.shape
-    image = Image.frombuffer('I;16', (width, height), pixels.astype('<u2'), 'raw', 'I;16', 0, 1)
+    image = Image.frombuffer('I;16', (width, height), pixels.astype('<u2', copy=False), 'raw', 'I;16', 0, 1)
     return _saved(image, 'PNG', compress_level=_PNG_LEVEL)
 
 

@@ -20,9 +20,10 @@ _SIZE: Final = struct.Struct('<II')
 _MAX_NIBBLES: Final = 10
 """Of a number: 30 bits."""
 _SHIFTS: Final = np.arange(28, -4, -4, dtype=np.uint32)
-_MOST_SMALL: Final = 1 << 20
-_MOST_TIMES: Final = 50
-"""Maximum pixels of an image, whatever its size or, if more, for each byte of it. A black image of 720p has 16 bytes."""
+_MAX_SMALL: Final = 640 * 480
+_MAX_TIMES: Final = 16
+"""Maximum pixels of an image, whatever its size or, if more, for each byte of it: decoding takes six bytes for each pixel. A
+black image has 16 bytes; most have a byte for one or two pixels."""
 
 
 def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
@@ -30,7 +31,7 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
     if len(data) < _SIZE.size:
         raise ValueError(f'RVL of {len(data)} bytes')
     width, height = _SIZE.unpack_from(data)
-    if not 0 < width * height <= max(_MOST_SMALL, _MOST_TIMES * len(data)):
+    if not 0 < width * height <= max(_MAX_SMALL, _MAX_TIMES * len(data)):
         raise ValueError(f'RVL of {len(data)} bytes with {width} x {height} pixels')
     values = _numbers(data[_SIZE.size :])
     runs = _runs(values, width * height)

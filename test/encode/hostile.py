@@ -86,9 +86,9 @@ class Fuzzer:
         self._valid = {name: content(ros, name) for name in TYPES if name in ros.store.fielddefs}
         self.outcomes: Counter[str] = Counter()
         for name, format_name in product(self._valid, FORMATS):  # what is loaded when it is first asked for is loaded now
-            sample = Sample(0, self._valid[name][0])
             sensor = replace(self._sensors[0], format=format_name)
-            encode(Batch(sensor.name, '/valid', name, (sample,), len(sample.cdr)), sensor, 'thor', self._types)
+            for cdr in self._valid[name]:
+                encode(Batch(sensor.name, '/valid', name, (Sample(0, cdr),), len(cdr)), sensor, 'thor', self._types)
 
     def round(self, seed: int) -> None:
         """One batch; AssertionError, or whatever an encoder lets through, where it is not treated as it must be."""
@@ -131,8 +131,8 @@ def measured(work: Callable[[], Encoding]) -> tuple[Encoding, int, float]:
 
 def content(ros: Any, type_name: str) -> list[bytes]:
     """Valid messages of a type, in both byte orders, with something in the fields that encoders look into."""
-    variants: list[dict[str, Any]] = [{}]
-    values = variants[0]
+    values: dict[str, Any] = {}
+    variants = [values]
     if type_name.endswith('/Image'):
         of_encoding = {
             'bgr8': (12, 48),
@@ -166,10 +166,9 @@ def content(ros: Any, type_name: str) -> list[bytes]:
     elif type_name.endswith('/PointCloud2'):
         fields = [ros.make('sensor_msgs/msg/PointField', name=name, offset=4 * number, datatype=7, count=1)
                   for number, name in enumerate('xyz')]  # fmt: skip
-        values = {'width': 2, 'height': 2, 'point_step': 12, 'row_step': 24, 'fields': fields, 'data': np.zeros(48, np.uint8)}
+        values |= {'width': 2, 'height': 2, 'point_step': 12, 'row_step': 24, 'fields': fields, 'data': np.zeros(48, np.uint8)}
     elif type_name.endswith('/JointState'):
-        values = {'name': ['a', 'bb'], 'position': np.ones(2), 'velocity': np.ones(2), 'effort': np.ones(2)}
-    variants = [values] if values else variants
+        values |= {'name': ['a', 'bb'], 'position': np.ones(2), 'velocity': np.ones(2), 'effort': np.ones(2)}
     return [ros.cdr(type_name, little_endian=little, **each) for each in variants for little in (True, False)]
 
 
