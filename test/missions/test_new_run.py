@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from e2e.wire import HANG, PASS, REFUSE
+from e2e.wire import HANG, PASS, REFUSE, Wire
 from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 from missions.server import Server, complete, until
 from stores.certificates import Authority
@@ -52,6 +53,25 @@ def test_a_mission_has_its_run_before_mlflow_is_loaded(server: Server, home: Pat
     assert logger.close(120.0).complete
     assert server.run('before MLflow').info.run_id == given
     assert server.artifacts(given) >= {'test_new_run.py', 'summary.json'}
+
+
+@pytest.mark.seaweedfs
+def test_the_call_costs_one_request(server: Server, warm_home: Path) -> None:
+    """The experiment is looked for by the constructor, and both take little CPU; bench/mission_calls.py measures the time."""
+    heard = bytearray()
+    with Wire(server.tower.tracking_uri, heard.extend) as wire:
+        logger = MissionDataLogger(home=warm_home, start_timeout_s=PATIENCE_S, tracking_uri=wire.url)
+        began_s = time.process_time()
+        first = logger.start_mission('patrol', 'a request 1')
+        second = logger.start_mission('patrol', 'a request 2')
+        took_s = time.process_time() - began_s
+        ended(logger)
+    assert re.findall(rb'(?:GET|POST) /api/2.0/mlflow/([a-z-]+/[a-z-]+)', bytes(heard)) == [
+        b'experiments/get-by-name', b'runs/create', b'runs/create',
+    ]  # fmt: skip
+    assert took_s < 0.2
+    until(lambda: complete(warm_home, 2), 'both are sent')
+    assert [server.run(f'a request {number}').info.run_id for number in (1, 2)] == [first, second]
 
 
 @pytest.mark.seaweedfs
