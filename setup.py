@@ -46,6 +46,7 @@ setup(
         'policies': ['cryptography>=48', 'onnxruntime>=1.17', 'securesystemslib>=1.6', 'tuf>=7'],
         'likeness': ['onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
+        'tower': ['grpcio>=1.60'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
         'webrtc': ['aiortc>=1.15,<1.17', 'av>=15'],
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
