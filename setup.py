@@ -43,8 +43,15 @@ setup(
     extras_require={
         'datasets': ['av>=15', 'daft>=0.7.26,<0.8', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],
         'lake': ['daft>=0.7.26,<0.8', 'matplotlib>=3.6', 'obstore>=0.11', 'pyarrow>=16'],
-        'policies': ['cryptography>=48', 'onnxruntime>=1.17', 'securesystemslib>=1.6', 'tuf>=7'],
-        'likeness': ['onnxruntime>=1.17', 'tokenizers>=0.15'],
+        'policies': [
+            'cryptography>=48',
+            'onnx>=1.16',
+            'onnxruntime>=1.17',
+            'safetensors>=0.4.3',
+            'securesystemslib>=1.6',
+            'tuf>=7',
+        ],
+        'likeness': ['onnx>=1.16', 'onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
         'tower': ['grpcio>=1.60'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more

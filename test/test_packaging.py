@@ -23,8 +23,8 @@ REQUIREMENTS = ROOT / 'requirements'
 PROFILE = ROOT / 'launch_configs' / 'fastdds_shm.xml'
 INTERFACES = ROOT / 'interfaces' / 'go2_interfaces'
 MEBI = 1 << 20
-PACKAGES = {'PIL': 'pillow', 'backports': 'backports-zstd', 'gi': 'python3-gi', 'grpc': 'grpcio', 'mlflow': 'mlflow-skinny',
-            'ruamel': 'ruamel-yaml', 'yaml': 'pyyaml'}  # fmt: skip
+PACKAGES = {'PIL': 'pillow', 'backports': 'backports-zstd', 'gi': 'python3-gi', 'google': 'protobuf', 'grpc': 'grpcio',
+            'mlflow': 'mlflow-skinny', 'ruamel': 'ruamel-yaml', 'yaml': 'pyyaml'}  # fmt: skip
 """Names in imports -> those of the packages, where they differ."""
 IMPORT = re.compile(r'^ *(?:import (?=[\w.]+(?: as \w+)?(?:  #.*)?$)|from (?=[\w.]+ import ))(\w+)', re.MULTILINE)
 
