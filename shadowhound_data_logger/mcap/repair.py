@@ -395,7 +395,11 @@ class _Copy:
         found = next((each for each in sources if number in getattr(each, kind)), None)
         if found is salvage.unverified:
             self._rebuilt['schemas and channels, from a chunk whose checksum does not match'] = None
-        return b'' if found is None else bytes(getattr(found, kind)[number])
+        if found is None:
+            return b''
+        content = bytes(getattr(found, kind)[number])
+        salvage.known.add(Opcode.SCHEMA if kind == 'schemas' else Opcode.CHANNEL, content)  # later ones must not contradict it
+        return content
 
     # -- damage ----------------------------------------------------------------------------------------------------
 

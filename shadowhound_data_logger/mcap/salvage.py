@@ -148,6 +148,11 @@ class Declarations:
             known[number] = content
             self.size += len(content)
 
+    def contradicts(self, op: int, content: bytes) -> bool:
+        """Whether the same id is used for something else."""
+        known = self.schemas if op == Opcode.SCHEMA else self.channels
+        return known.get(int.from_bytes(content[:2], 'little'), content) != content
+
     def has_schema_of(self, channel: bytes) -> bool:
         number = int.from_bytes(channel[2:4], 'little')
         return not number or number in self.schemas
@@ -174,6 +179,8 @@ class Salvage:
         self.unverified = Declarations()
         """Found in damaged chunks: without them, intact chunks could not be read."""
         self._told = told
+        self._is_chunked = self._is_astray = False
+        """Whether there are chunks, and whether the pieces since the last one were found by the search."""
         self._follows_chunk = False
         """Whether the piece before was a chunk or the index of one."""
         self._left = SEARCHES * self.size + (16 << 20)
@@ -182,6 +189,7 @@ class Salvage:
     def pieces(self) -> Iterator[Piece]:
         """Raises only OSError. Ends after the record that ends the data, or at the end of the file."""
         self._read_hints()
+        self._is_chunked = self.statistics is not None and self.statistics.chunk_count > 0
         at = 0
         while at < self.size:
             piece: Piece | None = self._first() if not at else self._piece(at)
@@ -190,14 +198,16 @@ class Salvage:
                 if piece.op == Opcode.CHUNK and (contents := self.salvaged(piece).contents) is not None:
                     for op, content in contents.declarations:
                         self.unverified.add(op, content)
-            elif isinstance(piece, IntactRecord) and piece.op in _DECLARED and piece.content is not None:
-                piece = replace(piece, content=self._corrected(piece.op, piece.content))
-                self.known.add(piece.op, piece.content or b'')
+            elif isinstance(piece, IntactRecord) and piece.op in _IN_CHUNKS:
+                piece = self._outside(piece)
             elif isinstance(piece, IntactChunk):
                 for op, content in piece.contents.declarations:
                     self.known.add(op, content)
             if self.known.size > MOST_SUMMARY_BYTES:
                 piece = Damaged(at, self.size - at, 0, f'its schemas and channels have more than {MOST_SUMMARY_BYTES:,} bytes')
+            if isinstance(piece, IntactChunk) or piece.op == Opcode.CHUNK:
+                self._is_chunked = True
+            self._is_astray = self._is_astray and not isinstance(piece, IntactChunk)
             self._follows_chunk = isinstance(piece, IntactChunk) or piece.op in {Opcode.CHUNK, Opcode.MESSAGE_INDEX}
             yield piece
             self._told(piece.size)
@@ -206,7 +216,20 @@ class Salvage:
                 return
 
     def read(self, at: int, length: int) -> bytes:
-        return os.pread(self._file, length, at)
+        """At most these bytes, wherever a damaged field says that they are."""
+        return os.pread(self._file, min(length, self.size - at), at) if 0 <= at < self.size and length > 0 else b''
+
+    def _outside(self, piece: IntactRecord) -> Piece:
+        """A message, schema or channel outside of chunks: where the search found it, it is one of a damaged chunk."""
+        is_declared = piece.op in _DECLARED and piece.content is not None
+        if self._is_chunked and self._is_astray:
+            if is_declared:
+                self.unverified.add(piece.op, piece.content or b'')
+            return Damaged(piece.at, piece.size, piece.op, 'a record of a damaged chunk')
+        if is_declared:
+            piece = replace(piece, content=self._corrected(piece.op, piece.content or b''))
+            self.known.add(piece.op, piece.content or b'')
+        return piece
 
     # -- one piece -------------------------------------------------------------------------------------------------
 
@@ -348,7 +371,10 @@ class Salvage:
                 content = bytes(raw[at + RECORD.size : after])
                 if _length(_DECLARED[op], content) != length:
                     break  # also where more follows its fields: the reference reader loses its way there
-                if op == Opcode.CHANNEL and not any(each.has_schema_of(content) for each in (declared, *self._sources())):
+                is_unusable = op == Opcode.CHANNEL and not any(
+                    each.has_schema_of(content) for each in (declared, *self._sources())
+                )
+                if is_unusable or self.known.contradicts(op, content):
                     parts.append(raw[start:at])
                     removed, start = removed + after - at, after
                 else:
@@ -385,6 +411,7 @@ class Salvage:
             return Damaged(0, end, 0, 'the beginning of the file is missing')
         end = at + RECORD.size + length
         if not fits or (end < self.size and not self._is_strong(end)):
+            self._is_astray = True
             end = self._search(at + 1, at + RECORD.size + self._chunk_length(at) if op == Opcode.CHUNK else 0)
         is_torn = end == self.size and not fits and bool(op)
         if op == Opcode.CHUNK:
@@ -545,7 +572,9 @@ class Salvage:
 
 
 def _length(kind: type[Schema | Channel | Metadata | Header], content: bytes) -> int | None:
-    """Of a record's fields; None where they are not complete."""
+    """Of a record's fields; None where they are not complete, or make no sense: no schema has the number 0."""
+    if kind is Schema and content[:2] == bytes(2):
+        return None
     try:
         return length_of(kind, content)
     except UNREADABLE:

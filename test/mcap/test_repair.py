@@ -173,6 +173,35 @@ def test_damage_between_messages_outside_of_chunks(tmp_path: Path) -> None:
     assert (loss.messages, loss.from_ns, loss.to_ns) == (None, ours[7].log_ns, ours[10].log_ns)
 
 
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """With one to five kinds of damage at one to five places."""
+    found = bytearray(content)
+    for _ in range(rng.randrange(1, 6)):
+        at, kind, other = rng.randrange(len(found)), rng.randrange(6), rng.randrange(len(content))
+        if kind == 0:
+            found[at] = rng.randrange(256)
+        elif kind == 1:
+            del found[at : at + rng.randrange(1, 200)]
+        elif kind == 2:
+            found[at:at] = rng.randbytes(rng.randrange(1, 200))
+        elif kind == 3:
+            found[at : at + rng.randrange(1, 100)] = bytes(rng.randrange(1, 100))
+        elif kind == 4:
+            found[at:at] = content[other : other + rng.randrange(1, 800)]
+        else:
+            found[at : at + 8] = rng.choice([b'\xff' * 8, (1 << 63).to_bytes(8, 'little'), bytes(8)])
+    return bytes(found)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_damage_of_any_kind(tmp_path: Path, kind: str) -> None:
+    """The copy is valid, or the file is refused; it never fails in another way."""
+    content, _ = written(tmp_path, kind)
+    rng = random.Random(kind)
+    for _ in range(examples(50)):
+        repaired(tmp_path, mutated(content, rng), unverified=rng.random() < 0.2)
+
+
 @pytest.mark.parametrize('tail', [b'\0' * 5000, b'\xff' * 300, random.Random(3).randbytes(70_000), b'\x89MCAP0\r\n' * 3])
 def test_bytes_after_the_end(tmp_path: Path, tail: bytes) -> None:
     """They are no part of the copy, and no message is lost."""
