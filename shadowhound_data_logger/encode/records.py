@@ -1,8 +1,8 @@
 """Messages of any type to JSON: a record of one message, or a batch of many. Every finite number reads back bit for bit.
 
-Numbers are written as the shortest decimal that gives the same float32 or float64 again, 64-bit integers exactly, NaN and
-Infinity as null with their number in ``non_finite``, byte sequences as base64. A message field whose name the document uses
-itself gets an underscore behind it.
+Numbers are written as the shortest decimal that gives the same float32 or float64 again, 64-bit integers exactly, NaN as null,
+infinities as the text ``"Infinity"`` or ``"-Infinity"`` (as the JSON of protobuf has them), the number of all these in
+``non_finite``, byte sequences as base64. A message field whose name the document uses itself gets an underscore behind it.
 
 Decoded messages become plain values that ``orjson`` can write: one compiled expression a type, made from its definition.
 ``float32`` scalars become ``numpy.float32``, because then the shortest decimal that reads back as that float32 is written, as
@@ -25,7 +25,7 @@ from rosbags.typesys.base import normalize_fieldname
 from shadowhound_data_logger.clock import iso
 from shadowhound_data_logger.encode.columns import BatchStatistics
 from shadowhound_data_logger.encode.payload import Job, Payload, Rejections
-from shadowhound_data_logger.encode.statistics import NONE, UNCOUNTED, FieldStatistics, covers, packed
+from shadowhound_data_logger.encode.statistics import INFINITE, NONE, UNCOUNTED, FieldStatistics, covers, packed
 from shadowhound_data_logger.encode.types import PLACEHOLDER, MessageTypes, nested_type
 from shadowhound_data_logger.errors import Rejected
 from shadowhound_data_logger.model import Sample
@@ -170,12 +170,30 @@ def _columns(types: MessageTypes, type_name: str, chosen: tuple[str, ...], batch
 
 
 def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int, bool]:
-    """The records as a JSON list, how many numbers are not finite and so became null, and whether the others are ``widened``."""
+    """The records as a JSON list, how many numbers are not finite, and whether the others are ``widened``."""
     body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
     if is_awkward := _AWKWARD in body:
-        body = orjson.dumps(widened(records), option=orjson.OPT_SERIALIZE_NUMPY)
+        records = widened(records)
+        body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
     # A message has no nulls of its own, but text may contain the word.
-    return body, _nulls(orjson.loads(body)) if b'null' in body else 0, is_awkward
+    non_finite = _nulls(orjson.loads(body)) if b'null' in body else 0
+    if non_finite:
+        body = orjson.dumps(_with_infinities(records), option=orjson.OPT_SERIALIZE_NUMPY)
+    return body, non_finite, is_awkward
+
+
+def _with_infinities(value: Any) -> Any:
+    """The same with the texts of infinities in their places: REP 117 gives them a meaning that NaN does not have."""
+    if isinstance(value, dict):
+        return {key: _with_infinities(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_with_infinities(item) for item in value]
+    if isinstance(value, np.ndarray) and value.dtype.kind == 'f' and len(places := np.flatnonzero(np.isinf(value))):
+        parts = orjson.dumps(value, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b',')
+        for place in places:
+            parts[place] = b'"%b"' % INFINITE[int(value[place] < 0)].encode()
+        return orjson.Fragment(b'[%b]' % b','.join(parts))
+    return INFINITE[int(value < 0)] if isinstance(value, (float, np.floating)) and np.isinf(value) else value
 
 
 def _nulls(value: Any) -> int:

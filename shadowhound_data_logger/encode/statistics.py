@@ -27,6 +27,8 @@ MOST_SAID: Final = 1 << 16
 MEAN_ERROR: Final = 2.0**-22
 """A float32 and its shortest decimal are within 2^-24 of each other, and the mean is kept as a float32."""
 ALL: Final = ''
+INFINITE: Final = ('Infinity', '-Infinity')
+"""What infinities are in JSON."""
 NONE: Final = 'none'
 """Instead of names of fields: no statistics."""
 UNCOUNTED: Final = frozenset({'stamp_ns', 'timestamp', 'header', 'non_finite'})
@@ -48,7 +50,7 @@ class Statistic:
     mean: float | None
     count: int
     nan_count: int
-    """Numbers that are not finite: NaN and infinities, which JSON has as null. Of ``ALL``, the fields that are left out."""
+    """Numbers that are not finite: NaN, which JSON has as null, and infinities. Of ``ALL``, the fields that are left out."""
 
 
 NUMBERS: Final = ('first', 'last', 'min', 'max', 'mean', 'count', 'nan_count')
@@ -138,6 +140,9 @@ def _sum(values: Sequence[float]) -> float:
 def _fields(name: str, values: Sequence[Any], depth: int) -> Iterator[tuple[str, Sequence[Any]]]:
     """(field, its numbers in their order, None for those that are not finite) below the values of one name."""
     kinds = set(map(type, values))
+    if str in kinds and not {value for value in values if type(value) is str}.isdisjoint(INFINITE):
+        values = [None if value in INFINITE else value for value in values]
+        kinds = set(map(type, values))
     if kinds <= _NUMBERS:
         if values:
             yield name, values

@@ -18,6 +18,7 @@ import numpy as np
 import orjson
 import simplejpeg
 
+from shadowhound_data_logger.encode.statistics import INFINITE
 from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
 
@@ -234,7 +235,7 @@ class Table:
     stamps: NDArray[np.int64]
     """ns since 1970."""
     values: NDArray[np.float64]
-    """(messages, columns); null is NaN."""
+    """(messages, columns); null is NaN, ``"Infinity"`` an infinity."""
 
     @property
     def nbytes(self) -> int:
@@ -278,10 +279,15 @@ def _numbers(path: str, value: Any) -> Iterator[str]:
     elif isinstance(value, list):
         if value and isinstance(value[0], Mapping):
             yield from _numbers(path, value[0])
-        elif value and all(item is None or isinstance(item, (int, float)) for item in value):
+        elif value and all(map(_is_number, value)):
             yield path
-    elif value is None or isinstance(value, (int, float)):
+    elif _is_number(value):
         yield path
+
+
+def _is_number(value: Any) -> bool:
+    """Of JSON: null is NaN, and infinities are texts."""
+    return value is None or isinstance(value, (int, float)) or (isinstance(value, str) and value in INFINITE)
 
 
 def _column(samples: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:

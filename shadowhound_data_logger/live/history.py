@@ -31,6 +31,7 @@ from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.catalogue.schema import BUCKET
 from shadowhound_data_logger.clock import SECOND, utc
 from shadowhound_data_logger.config import home, store_settings
+from shadowhound_data_logger.encode.statistics import INFINITE
 from shadowhound_data_logger.encode.types import MessageTypes
 from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected, SettingError
 from shadowhound_data_logger.keys import is_name
@@ -512,7 +513,9 @@ def _message(type_name: str, sample: Mapping[str, Any]) -> Any:
 def _space(value: Any) -> Any:
     if isinstance(value, dict):
         return SimpleNamespace(**{name: _space(inner) for name, inner in value.items()})
-    return [_space(inner) for inner in value] if isinstance(value, list) else value
+    if isinstance(value, list):
+        return [_space(inner) for inner in value]
+    return float(value) if isinstance(value, str) and value in INFINITE else value
 
 
 def _checked(values: Mapping[Any, Any]) -> Mapping[str, float]:

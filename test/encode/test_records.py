@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.config import SensorSettings
 from shadowhound_data_logger.encode.registry import encode
+from shadowhound_data_logger.encode.statistics import ALL, FieldStatistics
 from shadowhound_data_logger.encode.types import MessageTypes
+from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.model import Batch, Sample
 
 IMU = 'go2_interfaces/msg/IMU'
@@ -92,7 +95,7 @@ def test_a_large_batch(ros: Any) -> None:
     cdrs = [ros.cdr(JOINTS, name=[str(index)], position=np.array([value])) for index, value in values.items()]
     batch = document(ros.encode(JOINTS, *cdrs[:100], b'', *cdrs[100:]))
     assert [sample['name'] for sample in batch['samples']] == [[str(index)] for index in range(251)]
-    assert [batch['samples'][index]['position'][0] for index in (0, 1, 150, 249, 250)] == [None, 1.0, None, 249.0, None]
+    assert [batch['samples'][index]['position'][0] for index in (0, 1, 150, 249, 250)] == [None, 1.0, '-Infinity', 249.0, None]
     assert (batch['count'], batch['non_finite']) == (251, 3)
 
 
@@ -219,16 +222,17 @@ def test_lowstate(ros: Any) -> None:
     assert b'"power_v":28.7,' in body
 
 
-def test_what_is_not_finite_becomes_null_and_is_counted(ros: Any) -> None:
-    """NaN and both infinities are null, in arrays and scalars, and the document says how many there were."""
+def test_what_is_not_finite_has_a_form_in_json_and_is_counted(ros: Any) -> None:
+    """NaN is null, infinities are texts, in arrays and scalars, and the document says how many there were."""
     bad = np.array([np.nan, 1, np.inf, -np.inf], np.float32)
     batch = document(ros.encode(IMU, ros.cdr(IMU, quaternion=bad), ros.cdr(IMU)))
-    assert batch['samples'][0]['quaternion'] == [None, 1.0, None, None]
+    assert batch['samples'][0]['quaternion'] == [None, 1.0, 'Infinity', '-Infinity']
     assert batch['non_finite'] == 3
     odometry = document(ros.encode(ODOMETRY, ros.cdr(ODOMETRY, pose={'pose': {'position': {'x': float('nan')}}})))
     assert odometry['position'] == {'x': None, 'y': 0.0, 'z': 0.0}
     assert odometry['non_finite'] == 1
-    assert document(ros.encode(LOWSTATE, ros.cdr(LOWSTATE, power_a=float('-inf'))))['non_finite'] == 1
+    lowstate = document(ros.encode(LOWSTATE, ros.cdr(LOWSTATE, power_a=float('-inf'))))
+    assert (lowstate['samples'][0]['power_a'], lowstate['non_finite']) == ('-Infinity', 1)
 
 
 def test_the_word_null_is_no_number(ros: Any) -> None:
@@ -249,6 +253,35 @@ def test_the_one_float_that_short_decimals_lose(ros: Any) -> None:
     assert np.float32(power) == np.float32(awkward)
 
 
+def unlike(value: Any) -> str | None:
+    """What JSON has of a number that is not finite."""
+    return None if np.isnan(value) else 'Infinity' if value > 0 else '-Infinity'
+
+
+def test_infinities_of_a_scan_come_back(ros: Any) -> None:
+    """REP 117: nothing within range, too close, and an invalid reading are three things, to a strict parser and ``decode``."""
+    scan, ranges = 'sensor_msgs/msg/LaserScan', [1.5, math.inf, -math.inf, math.nan, 0.1]
+    cdrs = [ros.cdr(scan, ranges=np.array(ranges, np.float32), range_max=math.inf)] * 2
+    batch = Batch('scan', '/scan', scan, tuple(Sample(STAMP_NS, cdr) for cdr in cdrs), 1000)
+    body = encode(batch, SensorSettings(name='scan', topics=('scan',), batch_s=1.0), 'thor', ros.types).object.body
+    assert isinstance(body, bytes)
+    told = json.loads(body, parse_constant=pytest.fail)
+    assert told['samples'][0]['ranges'] == [1.5, 'Infinity', '-Infinity', None, 0.1]
+    assert told['non_finite'] == 8
+    values = decode.table(decode.records(body), scan, ('ranges', 'range_max'), 0).values
+    assert np.array_equal(values.astype(np.float32), np.array([[*ranges, math.inf]] * 2, np.float32), equal_nan=True)
+    assert decode.table(decode.records(body), scan, (), 0).values.shape == (2, len(ranges) + 7)
+
+
+def test_statistics_count_infinities(ros: Any) -> None:
+    """Among what is not finite, also where they are read from the JSON again."""
+    found = FieldStatistics()
+    found.add([{'a': ['Infinity', 1.0, None], 'b': '-Infinity', 'c': 'text'}, {'a': [2.0, 1.0, 3.0], 'b': 4.0, 'c': 'Infinite'}])
+    assert {name: (each.count, each.nan_count, each.max) for name, each in found.told().items() if name != ALL} == {
+        'a.0': (1, 1, 2.0), 'a.1': (2, 0, 1.0), 'a.2': (1, 1, 3.0), 'b': (1, 1, 4.0),
+    }  # fmt: skip
+
+
 @settings(derandomize=True, deadline=None, max_examples=examples(150))
 @given(
     words=st.lists(st.integers(0, 2**32 - 1), min_size=4, max_size=4),
@@ -261,12 +294,12 @@ def test_numbers_and_text_read_back_bit_for_bit(ros: Any, words: list[int], long
     batch = document(ros.encode(IMU, ros.cdr(IMU, quaternion=singles)))
     power = document(ros.encode(LOWSTATE, ros.cdr(LOWSTATE, power_v=float(singles[0]))))['samples'][0]['power_v']
     for value, back in zip([*singles, singles[0]], [*batch['samples'][0]['quaternion'], power], strict=True):
-        assert back is None if not np.isfinite(value) else np.float32(back).tobytes() == value.tobytes()
+        assert back == unlike(value) if not np.isfinite(value) else np.float32(back).tobytes() == value.tobytes()
     assert batch.get('non_finite', 0) == 4 - np.isfinite(singles).sum()
     sample = document(ros.encode(JOINTS, ros.cdr(JOINTS, name=names, position=doubles)))['samples'][0]
     assert sample['name'] == names
     for value, back in zip(doubles, sample['position'], strict=True):
-        assert back is None if not np.isfinite(value) else np.float64(back).tobytes() == value.tobytes()
+        assert back == unlike(value) if not np.isfinite(value) else np.float64(back).tobytes() == value.tobytes()
 
 
 @pytest.mark.parametrize('batch_s', [0.0, 1.0])
