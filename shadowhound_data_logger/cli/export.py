@@ -135,6 +135,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, catch_up, upload  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
         from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
 
         check_name(name, 'the name of the data set')
@@ -161,6 +162,9 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
             folder, source, flags, options, workers=workers, cluster=cluster, wait=wait, is_dry=dry_run,
             findings=left_out, say=bar.say,
         )  # fmt: skip
+        if not (result.added or result.present or result.refused or result.waiting):
+            with asking():
+                check_names(source, left_out, **flags)
         if result.digest and not dry_run:
             library.remember(the_home(), folder)
             if place is not None:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from datasets.recorded import House, Mission
 
-from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.datasets import transfer
@@ -175,3 +175,13 @@ def test_data_sets_are_named_without_mlflow(machines: tuple[Machine, Machine], m
     monkeypatch.setattr('shadowhound_data_logger.lake.training.runs_trained_on', away)
     (found,) = a.ask('where', key, code=ExitCode.FINDING)
     assert (found['where'], found['missions'], found['runs']) == (URL, ['one'], None)
+
+
+@pytest.mark.parametrize('flags', [('--mission', 'onne'), ('--mission-type', 'patrl'), ('--label', 'x'), ('--robot', 'thro')])
+def test_an_export_of_what_does_not_exist_is_wrong_usage(machines: tuple[Machine, Machine], flags: tuple[str, str]) -> None:
+    """As of a query; where no label exists at all, nothing is known of any."""
+    if flags[0] == '--label':
+        assert machines[0].ask('lerobot', 'patrols', *flags, '--dry-run')['added'] == []
+        return
+    with pytest.raises(BadUsage, match=f'there is no .*{flags[1]}'):
+        machines[0].ask('lerobot', 'patrols', *flags, '--dry-run')

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
 
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
@@ -102,3 +103,12 @@ def test_by_the_times_of_an_answer(home: Path) -> None:
     told = json.loads(run(home, '--sensor', 'odom', '--ranges', str(file), '--json').output)
     assert told['moved'] == 2
     assert files(home) == sorted(row('odom', stamp_ns)['key'] for stamp_ns in TIMES[1:3])
+
+
+def test_a_sensor_that_does_not_exist_is_wrong_usage(home: Path, tmp_path: Path) -> None:
+    """As of a query; nothing is fetched."""
+    found = run(home, '--sensor', 'camra', '--to', str(tmp_path / 'data'))
+    assert isinstance(found.exception, BadUsage)
+    assert found.exception.message == "there is no sensor 'camra'"
+    assert found.exception.remedy == "is it 'camera'?"
+    assert not (tmp_path / 'data').exists()
