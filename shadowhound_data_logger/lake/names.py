@@ -52,9 +52,8 @@ def check_names(source: Bucket, findings: Findings, **flags: Any) -> None:
             found = query.objects(source, findings=findings, robot=robot).select(*columns).distinct().to_pydict()
         known: dict[str, list[str | None]] = {name: found[name] for name in columns}
         for name in _COLUMNS:
-            if name in known:
-                others = DEFAULT_SENSORS if name == 'sensor' and any(known[name]) else ()
-                check_name_of(name.replace('_', ' '), flags[name], [*known[name], *others])
+            if name in known and not (name == 'sensor' and flags[name] in DEFAULT_SENSORS):  # one of these may have nothing yet
+                check_name_of(name.replace('_', ' '), flags[name], known[name])
         if flags.get('mission'):
             ids = [*known['mission_id'], *known['run_id']]
             if not any(each and each.startswith(flags['mission']) for each in ids):

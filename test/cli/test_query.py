@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from lake.making import FAILED, NOON_NS, add, fill, folder_store, row
 from PIL import Image
 
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.clock import SECOND
 from shadowhound_data_logger.config import UploadSettings
@@ -124,23 +125,26 @@ def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ('arguments', 'what', 'remedy'),
-    [(['--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'?"),
-     (['--sensor', 'Camera'], "no sensor 'Camera'", "is it 'camera'?"),
+    [(['--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'"),
+     (['--sensor', 'Camera'], "no sensor 'Camera'", "is it 'camera'"),
      (['--robot', 'thro'], "no robot 'thro'", "is it 'thor'?"),
      (['--topic', '/odm'], "no topic '/odm'", "is it '/odom'"),
      (['--mission-type', 'patrl'], "no mission type 'patrl'", "is it 'patrol'?"),
      (['--mission', 'mfial'], "no mission 'mfial'", "is it 'mfailed'?"),
      (['--policy', 'x'], '', ''),
-     (['--sensor', 'zzz'], "no sensor 'zzz'", 'there are battery'),
-     (['SELECT count(*) FROM objects', '--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'?"),
-     (['--where', 'camra.x > 1'], "no sensor 'camra'", "is it 'camera'?"),
+     (['--sensor', 'lidar'], '', ''),
+     (['--sensor', 'zzz'], "no sensor 'zzz'", 'there are camera, odom'),
+     (['SELECT count(*) FROM objects', '--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'"),
+     (['--where', 'camra.x > 1'], "no sensor 'camra'", "is it 'camera'"),
      (['--where', 'no_column > 1'], 'cannot be answered', 'examples')],
 )  # fmt: skip
 def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], what: str, remedy: str) -> None:
     """Exit code 2 and the nearest names; where none is known of a kind, any may exist."""
-    found = run(home, *arguments, '--format', 'json')
+    env = {'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
+    found = CliRunner().invoke(query, [*arguments, '--format', 'json'], env=env, standalone_mode=False)
     if not what:
-        assert found.exit_code == 0
+        assert (found.exception, found.return_value) == (None, 0)
         return
-    assert found.exit_code == 2
-    assert what in found.output
+    assert isinstance(found.exception, BadUsage)
+    assert what in found.exception.message
+    assert remedy in found.exception.remedy
