@@ -97,14 +97,18 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
 @missions.command(epilog=examples('missions resume --deadline 300'))
 @click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=60.0, show_default=True, help='Seconds to wait.')
 @click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
-def resume(*, deadline: float, experiment: str | None) -> ExitCode:
+@as_json
+def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCode:
     """Send what is not sent yet, and wait for it.
 
     Exit code 1 when something is left after the deadline; sending continues for ten more minutes in the background.
     """
     where = the_home()
     if not _late(overviews(where)):
-        click.echo('Nothing is left to send.')
+        if as_json:
+            print_json({'left': []})
+        else:
+            click.echo('Nothing is left to send.')
         return ExitCode.FINE
     robot = os.environ.get('SHADOWHOUND_ROBOT') or 'thor'
     replayer = Replayer(where, experiment or f'{robot}_missions', os.environ)
@@ -113,6 +117,9 @@ def resume(*, deadline: float, experiment: str | None) -> ExitCode:
         left = _wait(where, time.monotonic() + deadline)
     finally:
         replayer.let_go()
+    if as_json:
+        print_json({'left': left})
+        return exit_code(finding=left)
     for each in left:
         print_page(*_reason(each), console=Console(highlight=False, stderr=True))
     click.echo(f'{number(len(left))} not sent within {deadline:g} s.' if left else 'All is sent.')

@@ -171,6 +171,8 @@ def test_what_cannot_be_sent_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert found.return_value == 1
     assert f'{mission_id}: not sent yet' in found.output
     assert '1 not sent within 0.3 s' in found.output
+    found = run(tmp_path, 'resume', '--deadline', '0.3', '--json')
+    assert (found.return_value, [each['mission_id'] for each in json.loads(found.stdout)['left']]) == (1, [mission_id])
 
 
 def test_what_is_left_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,3 +187,4 @@ def test_what_is_left_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(Replayer, 'start', start)
     assert (run(tmp_path, 'resume').output, len(started)) == ('All is sent.\n', 1)
     assert (run(tmp_path, 'resume').output, len(started)) == ('Nothing is left to send.\n', 1)
+    assert json.loads(run(tmp_path, 'resume', '--json').output) == {'left': []}
