@@ -228,6 +228,8 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
                                ('export MLFLOW_TRACKING_URI=http://tower:5001',)),
     'pasted as it was': (wrong('MLFLOW_TRACKING_URI', 'http://TOWER_IP:5001'), 'environment', 'environment.placeholder',
                          ('export MLFLOW_TRACKING_URI=',)),
+    'a blank after the store for artifacts': (wrong('MLFLOW_S3_ENDPOINT_URL', 'http://127.0.0.1:1 '), 'environment',
+                                              'environment.artifacts', ('without blanks',)),
     'another store for artifacts': (wrong('MLFLOW_S3_ENDPOINT_URL', 'http://old:9000'), 'environment', 'environment.artifacts',
                                     ('export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',)),
     'a proxy': (wrong('HTTP_PROXY', 'http://proxy:3128'), 'environment', 'environment.proxy', ('NO_PROXY',)),
