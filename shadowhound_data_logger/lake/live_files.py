@@ -116,7 +116,8 @@ def days(source: Bucket, named: Sequence[str], dates: Sequence[str] | None, pool
 def _day(source: Bucket, robot: str, date: str, findings: Findings, of: TableSchema) -> Day:
     """A part whose list of sources is invalid or contradicts another is left out: neither live nor superseded."""
     try:
-        entries = [entry for entry in source.list(folder_of(robot, date, of)) if entry.key.endswith('.parquet')]
+        listed = source.list(folder_of(robot, date, of), lambda _, key: findings.add(key, 'its key is not a path'))
+        entries = [entry for entry in listed if entry.key.endswith('.parquet')]
     except ObjectRefused as error:
         findings.add(folder_of(robot, date, of), f'{UNLISTED}: {error}')
         entries = []
