@@ -57,7 +57,7 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.cli.question import ranges_option
 from shadowhound_data_logger.clock import SystemClock, iso
 from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import BagDamaged, NameRefused, StoreUnavailable
+from shadowhound_data_logger.errors import BagDamaged, BagError, NameRefused, StoreUnavailable
 from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.times import moment
@@ -98,6 +98,17 @@ def _in_folder() -> Iterator[None]:
         yield
     except BagDamaged as error:
         error.remedy = error.remedy or LOCAL_REMEDY
+        raise
+
+
+@contextmanager
+def _in_store(name: str) -> Iterator[None]:
+    """The name of a bag means one in the store; a folder of that name needs a slash."""
+    try:
+        yield
+    except BagError as error:
+        if Path(name).is_dir():
+            error.remedy = f'the folder {name} is ./{name}: a name without a slash is that of a bag in the store'
         raise
 
 
@@ -175,7 +186,7 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
         with _in_folder():
             found = info_folder(bag)
     else:
-        with the_store(STORE_THREADS) as store:
+        with _in_store(bag), the_store(STORE_THREADS) as store:
             found = info_of(store, robot, bag, the_home())
     if as_json:
         print_json(_info_json(found))
@@ -202,7 +213,7 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
             with _in_folder():
                 found = verify_folder(bag, deep=deep, told=bar.have)
         else:
-            with the_store(STORE_THREADS) as store:
+            with _in_store(bag), the_store(STORE_THREADS) as store:
                 found = verify_remote(store, find_bag(store, robot, bag), deep=deep, told=bar.have)
     if as_json:
         checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
@@ -311,7 +322,7 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
         with _in_folder():
             found = cut_folder(bag, output, choice)
     else:
-        with the_store(STORE_THREADS) as store:
+        with _in_store(bag), the_store(STORE_THREADS) as store:
             found = cut_remote(store, find_bag(store, robot, bag), output, choice)
     if as_json:
         print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))

@@ -214,6 +214,16 @@ def test_pages_of_a_bag_whose_times_are_a_counter(tmp_path: Path) -> None:
         assert 'fetch' not in str(ran.exception)
 
 
+@pytest.mark.parametrize('verb', ['info', 'verify', 'cut'])
+def test_a_folder_without_a_slash_is_hinted_at(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
+    """A name is that of a bag in the store; where only a folder has it, the error says how a folder is written."""
+    monkeypatch.chdir(tmp_path)
+    write_ours(tmp_path / 'mine')
+    error = run(home, verb, 'mine', *(('-o', tmp_path / 'other') if verb == 'cut' else ())).exception
+    assert isinstance(error, BagError)
+    assert './mine' in error.remedy
+
+
 def test_repair(tmp_path: Path) -> None:
     """It says what was damaged, lost and rebuilt, in words and as JSON; exit code 1 if something was, 0 if nothing is."""
     folder = tmp_path / NAME
