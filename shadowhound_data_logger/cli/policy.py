@@ -141,12 +141,17 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
     files, repository = _signers()
     new_root = [files.load_public(path) for path in publics]
     with _signing(folder) as signing:
+        before = signing.listed()
         found = signing.rotate(roles or ('targets', 'online'), secrets, new_root, threshold, passphrase)
-        listed = [] if found.missing else signing.listed()
+        listed = before if found.missing else signing.listed()
     if found.missing:
         click.echo(f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh')
         return ExitCode.FINE
     click.echo(f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}')
+    if gone := sorted({*before} - {*listed}):
+        click.echo(
+            f'not signed in this folder, and no longer listed: {", ".join(gone)}; policy publish lists what is yours again'
+        )
     if 'online' in roles or 'targets' in roles or not roles:
         click.echo(f'copy {place / repository.ONLINE_KEY} to where policy refresh runs')
     if (place / repository.ROOT_KEY).is_file():

@@ -159,13 +159,7 @@ class Repository:
 
     def _timestamp(self, root: Metadata[Root]) -> tuple[Metadata[Timestamp] | None, str]:
         """The newer one of those of the store and of this folder, and the version of the object."""
-        try:
-            answer = steadily(lambda: self._store.changed(BUCKET, f'{METADATA}/timestamp.json', '', MAX_METADATA_BYTES))
-        except ObjectRefused as error:
-            if error.data.get('reason') != 'missing':
-                raise
-            answer = None
-        body, etag = answer or (b'', '')
+        body, etag = self._there('timestamp.json')
         found = [each for each in (_verified(body, root, 'timestamp'), self._kept('timestamp', root)) if each]
         if etag and not found and root.signed.version == 1 and not (self._folder / 'metadata').exists():
             raise PolicyError(f'{BUCKET}/{METADATA} was signed with other keys than those of {self._folder}',
@@ -191,11 +185,22 @@ class Repository:
             found = _verified(self._get(f'{known.version}.{role}.json') or b'', delegator, role, known.version)
         for _ in range(MAX_STEPS):
             version = found.signed.version + 1 if found else 1
-            following = _verified(self._get(f'{version}.{role}.json') or b'', delegator, role, version)
-            if following is None:
+            following: Metadata[Targets] | None = _verified(self._get(f'{version}.{role}.json') or b'', delegator, role, version)
+            if following is None or (role != TARGETS and not _is_harmless(following.signed)):
                 break
             found = following
         return found
+
+    def _there(self, name: str) -> tuple[bytes, str]:
+        """What has a name in the store, and its version: empty for nothing. What is larger than any metadata is removed."""
+        try:
+            return steadily(lambda: self._store.changed(BUCKET, f'{METADATA}/{name}', '', MAX_METADATA_BYTES)) or (b'', '')
+        except ObjectRefused as error:
+            if error.data.get('reason') == 'size':
+                self._store.delete(BUCKET, f'{METADATA}/{name}')
+            elif error.data.get('reason') != 'missing':
+                raise
+            return b'', ''
 
     def _get(self, name: str) -> bytes | None:
         try:
@@ -227,7 +232,9 @@ class Repository:
         with self._changing(key) as (role, listed, _):
             gone = [path for path in paths if listed.targets.pop(path, None)]
             if not gone:
-                raise PolicyError(f'{role} does not list {", ".join(sorted(paths))}')
+                raise PolicyError(
+                    f'{role} does not list {", ".join(sorted(paths))}', remedy='who does? policy delegate NAME --end'
+                )
         return self._refresh_if_here()
 
     def delegate(self, public: PublicKey, paths: Sequence[str], key: Path | None = None) -> str:
@@ -279,7 +286,9 @@ class Repository:
         found = self._folder / TARGETS_KEY
         if found.is_file():
             return found
-        others = [path for path in self._folder.glob(f'*{PRIVATE}') if path.name not in {ROOT_KEY, ONLINE_KEY}]
+        others = [
+            path for path in self._folder.glob(f'*{PRIVATE}') if path.name not in {ROOT_KEY, ONLINE_KEY} and NEXT not in path.name
+        ]
         if len(others) != 1:
             raise PolicyError(f'there is no {TARGETS_KEY} in {self._folder}', remedy='name the key to sign with by --key')
         return others[0]
@@ -314,22 +323,17 @@ class Repository:
         """A root with new keys for these roles (``root``, ``targets``, ``online``), signed with these keys of the root so far.
 
         New keys of ``targets`` take those of ``online`` with them: robots then forget how far the old ones had counted. What
-        ``targets`` lists then is what was signed in this folder. Where the root has all signatures, it is in force when this
-        returns; otherwise others sign it, and ``refresh`` puts it in force.
+        ``targets`` lists then is what was signed in this folder, if anything was. A root with all signatures is in force when
+        this returns; otherwise others sign it, and ``refresh`` puts it in force.
         """
-        root = self.load().root
+        state = self.load()
+        root = state.root
         following = deepcopy(root)
         signed = following.signed
         signed.version += 1
         signed.expires = in_days(ROOT_DAYS)
         following.signatures.clear()
-        if not root_keys and not (self._folder / ROOT_KEY).is_file():
-            raise PolicyError(f'a new root is signed with the keys of the one before, and {ROOT_KEY} is not in {self._folder}',
-                              remedy='name them, wherever they are: --root-secret /media/usb/root.key')  # fmt: skip
-        signers = [keys.load_key(path, self._passphrase) for path in root_keys or [self._folder / ROOT_KEY]]
-        for path, signer in zip(root_keys, signers, strict=False):
-            if signer.public_key.keyid not in root.signed.roles[ROOT_ROLE].keyids:
-                raise PolicyError(f'{path} is not a key of the root of version {root.signed.version}')
+        signers = self._root_signers(root_keys, root.signed)
         for path in self._folder.glob(f'*{NEXT}*'):
             path.unlink()
         if ROOT_ROLE in roles:
@@ -339,6 +343,8 @@ class Repository:
                 publics = [signers[-1].public_key]
             _set_keys(signed, ROOT_ROLE, publics, threshold or signed.roles[ROOT_ROLE].threshold)
         if TARGETS in roles:
+            if TARGETS in state.lists and not (self._folder / 'metadata' / f'{TARGETS}.json').exists():
+                self._keep(TARGETS, state.lists[TARGETS])  # nothing was signed here: what is in force goes on
             made = keys.make_key(self._folder / f'targets{NEXT}{PRIVATE}', passphrase)
             _set_keys(signed, TARGETS, [made.public_key])
         if {TARGETS, 'online'} & {*roles}:
@@ -353,6 +359,17 @@ class Repository:
             self.load()  # which puts it in force, also where somebody else has online.key
             self._refresh_if_here()
         return found
+
+    def _root_signers(self, paths: Sequence[Path], root: Root) -> list[CryptoSigner]:
+        """The keys of the root that sign the next one: these, or the one in this folder. Raises PolicyError."""
+        if not paths and not (self._folder / ROOT_KEY).is_file():
+            raise PolicyError(f'a new root is signed with the keys of the one before, and {ROOT_KEY} is not in {self._folder}',
+                              remedy='name them, wherever they are: --root-secret /media/usb/root.key')  # fmt: skip
+        signers = [keys.load_key(path, self._passphrase) for path in paths or [self._folder / ROOT_KEY]]
+        for path, signer in zip(paths, signers, strict=False):
+            if signer.public_key.keyid not in root.roles[ROOT_ROLE].keyids:
+                raise PolicyError(f'{path} is not a key of the root of version {root.version}')
+        return signers
 
     # -- what expires ----------------------------------------------------------------------------------------------
 
@@ -369,7 +386,8 @@ class Repository:
             if before is not None and before.version > listed.signed.version:
                 raise PolicyError(f'a snapshot names version {before.version} of {role}, and the newest that can be verified is '
                                   f'{listed.signed.version}', remedy=_STOLEN)  # fmt: skip
-            snapshot.signed.meta[f'{role}.json'] = MetaFile.from_data(listed.signed.version, listed.to_bytes(), ['sha256'])
+            body = self._uploaded(role, listed, state.root if role == TARGETS else state.lists[TARGETS])
+            snapshot.signed.meta[f'{role}.json'] = MetaFile.from_data(listed.signed.version, body, ['sha256'])
         self._sign('snapshot', snapshot, signer, state.root)
         timestamp = state.timestamp or _unsigned(Timestamp())
         timestamp.signed.snapshot_meta = MetaFile.from_data(snapshot.signed.version, snapshot.to_bytes(), ['sha256'])
@@ -377,6 +395,15 @@ class Repository:
         self._sign('timestamp', timestamp, signer, state.root, etag=state.timestamp_etag)
         state.snapshot, state.timestamp = snapshot, timestamp
         return state
+
+    def _uploaded(self, role: str, listed: Metadata[Targets], delegator: Metadata[Any]) -> bytes:
+        """A list as it is in the store, where it is put again if junk is in its place."""
+        version = listed.signed.version
+        body = self._get(f'{version}.{role}.json') or b''
+        if _verified(body, delegator, role, version) is not None:
+            return body
+        self._place(listed, role, lambda _: False)
+        return listed.to_bytes()
 
     def _refresh_if_here(self) -> bool:
         if not (self._folder / ONLINE_KEY).is_file():
@@ -391,10 +418,14 @@ class Repository:
         metadata.sign(signer)
         delegator.signed.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
         if role == 'timestamp':
-            self._replace_timestamp(metadata.to_bytes(), etag)
+            if not self._put('timestamp.json', metadata.to_bytes(), etag):
+                raise PolicyError('the timestamp was signed by somebody else meanwhile', remedy='do it once more')
         else:
             version = metadata.signed.version
             self._place(metadata, role, lambda body: _verified(body, delegator, role, version) is not None)
+        self._keep(role, metadata)
+
+    def _keep(self, role: str, metadata: Metadata[Any]) -> None:
         kept = self._folder / 'metadata'
         kept.mkdir(mode=0o700, exist_ok=True)
         with durable_files.replacing(kept / f'{role}.json', is_synced=True, mode=0o600) as file:
@@ -403,21 +434,14 @@ class Repository:
     def _place(self, metadata: Metadata[Any], role: str, is_valid: Callable[[bytes], bool]) -> None:
         """Upload it under its number. What is there already gives way, unless it is valid: then somebody else was faster."""
         name, body = f'{metadata.signed.version}.{role}.json', metadata.to_bytes()
-        if self._put(name, body):
-            return
-        there, etag = steadily(lambda: self._store.changed(BUCKET, f'{METADATA}/{name}', '', MAX_METADATA_BYTES)) or (b'', '')
-        if there != body and (is_valid(there) or not self._store.replace(BUCKET, f'{METADATA}/{name}', body, etag)):
+        there, etag = self._there(name)
+        if there != body and (is_valid(there) or not self._put(name, body, etag)):
             raise PolicyError(f'{name} was signed by somebody else meanwhile', remedy='do it once more')
 
-    def _replace_timestamp(self, body: bytes, etag: str) -> None:
-        is_placed = (
-            self._store.replace(BUCKET, f'{METADATA}/timestamp.json', body, etag) if etag else self._put('timestamp.json', body)
-        )
-        if not is_placed:
-            raise PolicyError('the timestamp was signed by somebody else meanwhile', remedy='do it once more')
-
-    def _put(self, name: str, body: bytes) -> bool:
-        """Whether it is there now."""
+    def _put(self, name: str, body: bytes, etag: str) -> bool:
+        """Whether it is there now, in the place of what had this version; False where that is another one by now."""
+        if etag:
+            return self._store.replace(BUCKET, f'{METADATA}/{name}', body, etag)
         path = self._folder / f'.{name}.part'
         path.write_bytes(body)
         item = SpooledObject(id=0, bucket=BUCKET, key=f'{METADATA}/{name}', path=path, size=len(body),
@@ -430,6 +454,11 @@ class Repository:
         finally:
             path.unlink()
         return True
+
+
+def _is_harmless(listed: Targets) -> bool:
+    """Whether a delegated list hinders none of another key at the same paths: as one that expires soon, or delegates, would."""
+    return listed.delegations is None and listed.expires > in_days(RENEW_DAYS)
 
 
 def delegated(targets: Targets) -> Sequence[str]:

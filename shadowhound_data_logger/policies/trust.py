@@ -96,6 +96,8 @@ def refresh(folder: Path, store: ObjectStore, received: Callable[[int], None], p
         updater.refresh()
         return updater
 
+    for path in metadata.glob('tmp*'):  # of python-tuf, when it was killed
+        path.unlink()
     before = _stamps(metadata)
     try:
         return Trust(_checked(refreshed))

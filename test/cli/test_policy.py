@@ -124,9 +124,9 @@ def test_a_rotation_that_was_cut_off(team: Team, monkeypatch: pytest.MonkeyPatch
     team.run('keys')
     robot = team.robot('thor')
     team.publish('go2/go2_patrol/1')
-    for version, step in enumerate(('_place', '_newest', '_sign', '_replace_timestamp'), 2):
+    for version, step in enumerate(('_place', '_newest', '_sign', '_put'), 2):
         with monkeypatch.context() as patch:
-            patch.setattr(Repository, step, _dying(getattr(Repository, step), after=1 if step == '_newest' else 0))
+            patch.setattr(Repository, step, _dying(getattr(Repository, step), after={'_newest': 1, '_put': 2}.get(step, 0)))
             with pytest.raises(ZeroDivisionError):
                 Repository(team.keys, team.store, lambda _: '').rotate(('targets', 'online'))
         assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1'], step
@@ -144,6 +144,30 @@ def _dying(act: Any, after: int) -> Any:
         return act(*given, **named) if len(calls) <= after else 1 // 0
 
     return dies
+
+
+def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
+    """What is in force goes on; where something was signed, what others signed with a copy of its key ends, and is said."""
+    team.run('keys')
+    robot = team.robot('thor')
+    shutil.copytree(team.keys, team.home / 'copy')
+    team.publish('go2/go2_patrol/1')
+    vault = team.home / 'vault'
+    vault.mkdir()
+    (team.keys / 'root.key').rename(vault / 'root.key')
+    shutil.copy(team.keys / 'root.json', vault)
+    assert 'not in' in team.run('rotate', code=1)
+    said = team.run('rotate', '--keys', vault)
+    assert 'listed are: go2/go2_patrol/1' in said
+    assert 'copy' in said
+    assert team.listed(robot, 'go2/go2_patrol/1')
+    Repository(team.home / 'copy', team.store, lambda _: '').load()  # it follows the root
+    with pytest.raises(DataLoggerError, match='nothing is delegated'):
+        Repository(team.home / 'copy', team.store, lambda _: '').publish({'go2/go2_patrol/2': b'{}'})
+    shutil.copytree(vault, team.home / 'third')
+    Repository(team.home / 'third', team.store, lambda _: '').publish({'go2/go2_patrol/3': b'{}'})
+    said = team.run('rotate', '--keys', vault)
+    assert 'no longer listed: go2/go2_patrol/3' in said
 
 
 def test_two_rotations_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
