@@ -112,7 +112,7 @@ def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt
 @click.argument('root', type=_file)
 @click.option('--key', type=_file, required=True, help='Private key of a person who keeps a part of the root.')
 def sign_root(*, root: Path, key: Path) -> ExitCode:
-    """Sign a root that policy keys or policy rotate made."""
+    """Sign a new root with another key."""
     repository = _signers()[1]
     for line in repository.described(root):
         click.echo(line)
@@ -121,7 +121,7 @@ def sign_root(*, root: Path, key: Path) -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples('policy rotate', 'policy rotate root --root-secret /media/usb/root.key', 'policy rotate online'))
+@policy.command(epilog=examples('policy rotate', 'policy rotate root --root-secret usb/root.key', 'policy rotate online'))
 @click.argument('roles', nargs=-1, type=click.Choice(['root', 'targets', 'online']))
 @click.option('--root-secret', 'secrets', type=_file, multiple=True, metavar='KEY',
               help='Private key of the root; may be repeated  [default: root.key in the folder of keys]')  # fmt: skip
@@ -131,8 +131,9 @@ def sign_root(*, root: Path, key: Path) -> ExitCode:
 @_signs
 def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[Path, ...], threshold: int | None, encrypt: bool,
            folder: Path | None) -> ExitCode:  # fmt: skip
-    """Replace keys that may have been stolen, or have grown old; by default targets.key and online.key.
+    """Replace keys that may have been stolen.
 
+    By default those are targets.key and online.key.
     Robots learn of it from the store. What somebody else signed with the old keys is no longer listed.
     """
     if (publics or threshold) and 'root' not in roles:
@@ -183,8 +184,9 @@ def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, f
 @_signs
 @as_json
 def refresh(*, days: float, folder: Path | None, as_json: bool) -> ExitCode:
-    """Date what is signed anew, with online.key: once a day, from cron.
+    """Renew the signed timestamp, once a day.
 
+    It needs online.key and runs from cron.
     It takes in what other signers have published, and puts a root in force that has all its signatures by now.
     """
     with _signing(folder, days) as signing:
@@ -263,7 +265,10 @@ def publish(
 @_key
 @_signs
 def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folder: Path | None) -> ExitCode:
-    """Sign that a version may no longer run: robots go back to the last good one."""
+    """Sign that a version may no longer run.
+
+    Robots roll back to their last good version.
+    """
     policy_name, _, version = name.partition('@')
     if not version.isdecimal():
         raise BadUsage(f'{name!r} is not a version', 'such as go2_patrol@7')
