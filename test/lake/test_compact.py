@@ -147,8 +147,8 @@ def test_two_at_a_time_write_one_file(settings: StoreSettings) -> None:
     source = watched(settings)
     hidden = source.inner.list
 
-    def earlier(prefix: str) -> Any:
-        return (entry for entry in hidden(prefix) if not is_compacted(entry.key))
+    def earlier(*given: Any) -> Any:
+        return (entry for entry in hidden(*given) if not is_compacted(entry.key))
 
     source.list = earlier  # type: ignore[assignment, method-assign]
     with closing(open_store(settings, UploadSettings())) as store:
