@@ -35,7 +35,7 @@ format: setup ## let ruff repair and format what it can
 	scripts/with-env ruff format .
 
 demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, a minute and a half; DEMO_ARGS=--keep keeps its live page
-	scripts/with-env python -m shadowhound_data_logger.sim.demo $(DEMO_ARGS)
+	scripts/with-env python -m shadowhound_sim.demo $(DEMO_ARGS)
 
 bench: setup ## benchmarks against the baseline, as ratios, into docs/performance.md; BENCH_ARGS=--quick is shorter
 	scripts/with-env python bench/run.py $(BENCH_ARGS)

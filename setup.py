@@ -60,8 +60,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'sensor_logger_node = shadowhound_data_logger.capture.sensor_logger_node:main',
-            'sim_go2_node = shadowhound_data_logger.sim.sim_go2_node:main',
+            'sensor_logger_node = shadowhound_data_logger.node.sensor_logger_node:main',
             'shadowhound-data = shadowhound_data_logger.cli.main:main',
         ],
     },

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import _proc
 import boto3
+from shadowhound_sim.demo_processes import PR_SET_PDEATHSIG, environment, free_domain
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.sim.demo_processes import PR_SET_PDEATHSIG, environment, free_domain
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import ledger
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 HERE: Final = Path(__file__).resolve().parent
 ROBOT: Final = 'thor'
 BUCKET: Final = 'sensor-data'
-NODE: Final = ('-m', 'shadowhound_data_logger.capture.sensor_logger_node')
-SIM: Final = ('-m', 'shadowhound_data_logger.sim.sim_go2_node')
+NODE: Final = ('-m', 'shadowhound_data_logger.node.sensor_logger_node')
+SIM: Final = ('-m', 'shadowhound_sim.sim_go2_node')
 START_S: Final = 60.0
 STOP_S: Final = 40.0
 TAIL_LINES: Final = 15

@@ -28,17 +28,17 @@ import orjson
 import pyarrow as pa
 from _report import Bar, Report, main, progress
 
-from shadowhound_data_logger.catalogue.schema import BUCKET, FORMAT_VERSION, OBJECTS, TableSchema
-from shadowhound_data_logger.catalogue.statistics import STATISTICS
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.encode.statistics import FieldStatistics, numbers_of
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORMAT_VERSION, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS
+from shadowhound_data_logger.formats.statistics import FieldStatistics, numbers_of
 from shadowhound_data_logger.lake import compact, search, values
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.lake.live_files import compacted_key
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.lake.select import wanted
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -112,7 +112,7 @@ def _rows(numbers: np.ndarray[Any, Any]) -> pa.Table:
 
 def _statistics(store: ObjectStore, folder: Path, numbers: np.ndarray[Any, Any]) -> pa.Table:
     """As the encoder tells them for the bumps, which lie in the store; of the others made of the same numbers at once."""
-    from shadowhound_data_logger.model import SpooledObject  # noqa: PLC0415
+    from shadowhound_data_logger.core.model import SpooledObject  # noqa: PLC0415
 
     rng = np.random.default_rng(int(numbers[0]))
     count, begin = len(numbers), FIRST_NS + numbers * SECOND

@@ -23,12 +23,12 @@ from statistics import median, quantiles
 from time import thread_time
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import DEFAULT_SENSORS, SensorSettings, SpoolSettings
-from shadowhound_data_logger.errors import BucketMissing
-from shadowhound_data_logger.model import DataObject, Outcome, SpooledObject, State
-from shadowhound_data_logger.ship.ahead import IMPORTANT, OLDEST
-from shadowhound_data_logger.ship.schedule import Look, Schedule, Ship
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS, SensorSettings, SpoolSettings
+from shadowhound_data_logger.core.errors import BucketMissing
+from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.shipping.ahead import IMPORTANT, OLDEST
+from shadowhound_data_logger.shipping.schedule import Look, Schedule, Ship
 from shadowhound_data_logger.spool.spool import Spool
 
 NOON_NS: Final = 1_760_788_800 * SECOND

@@ -23,9 +23,9 @@ from mcap.reader import SeekingReader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 
 ROUNDS = 5
 EVER = 1 << 64

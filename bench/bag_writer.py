@@ -29,8 +29,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 STRING = 'string data\n'
 CHANNELS = tuple(Channel(f'/topic{number}', 'std_msgs/msg/String', 'ros2msg', STRING, '', '') for number in range(12))

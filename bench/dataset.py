@@ -27,14 +27,14 @@ from _report import Bar, Report, main, progress
 from _world import make_bucket
 from obstore.store import S3Store
 from PIL import Image
+from shadowhound_tower.embedded import Tower
 from torch.utils.data import DataLoader
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import MissionDataset, query
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.sim.tower import Tower
 
 FIRST_NS: Final = 1_793_188_800 * SECOND
 BAR: Final = 2.0

@@ -19,8 +19,8 @@ from typing import Final
 
 from _report import Bar, Report, main, progress
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.formats.rows import parts, schema
 
 FIRST_NS: Final = 1_793_188_800 * SECOND
 HOUR: Final = 3600

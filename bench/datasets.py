@@ -28,11 +28,11 @@ SIZE: Final = (480, 640)
 OURS: Final = """
 import json, sys, time
 from pathlib import Path
-from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.core.options import StoreSettings
 
 begun = time.perf_counter()
 source = Bucket(StoreSettings(directory=Path(sys.argv[1])), BUCKET)

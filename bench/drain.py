@@ -26,12 +26,12 @@ from typing import Any
 
 import boto3
 from botocore.config import Config
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.ship.uploader import Uploader
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, StoreSettings, UploadSettings
+from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store

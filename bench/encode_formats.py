@@ -20,10 +20,10 @@ import numpy as np
 import simplejpeg
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from shadowhound_data_logger.config import SensorSettings, Settings
-from shadowhound_data_logger.encode.registry import encode
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.model import Batch, Sample
+from shadowhound_data_logger.core.config import SensorSettings, Settings
+from shadowhound_data_logger.core.model import Batch, Sample
+from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.types import MessageTypes
 
 INTERFACES = Path(__file__).parents[1] / 'interfaces' / 'go2_interfaces' / 'msg'
 STAMP_NS = 1_760_788_800_250_000_000

@@ -11,8 +11,8 @@ import sys
 import time
 
 from shadowhound_data_logger.bags.events import Events
-from shadowhound_data_logger.capture.intake import Intake
-from shadowhound_data_logger.capture.sensor_logger_node import main
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.sensor_logger_node import main
 
 rounds: list[tuple[float, float]] = []
 writing: list[tuple[float, float]] = []

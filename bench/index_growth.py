@@ -18,10 +18,10 @@ from pathlib import Path
 from time import thread_time
 from typing import Any
 
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import CatalogueSettings, SpoolSettings
-from shadowhound_data_logger.model import DataObject, Outcome, State
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import CatalogueSettings, SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, Outcome, State
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
 from shadowhound_data_logger.spool.spool import Spool
 
 START_NS = 1_760_774_400 * SECOND

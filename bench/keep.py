@@ -18,14 +18,14 @@ from _link import ShapedLinks, in_own_network
 from _report import Bar, Report, main, percentile, progress, ratio
 from _world import BUCKET, ROBOT, Program, World, until
 
-from shadowhound_data_logger.catalogue.schema import KEPT
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.formats.rows.schema import KEPT
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.mailbox import KeptFilter
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 

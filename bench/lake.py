@@ -30,16 +30,16 @@ import obstore
 from _report import Bar, Report, main, progress
 from _world import make_bucket
 from obstore.store import S3Store
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import fetch as fetching
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_reader, open_store
 
 FIRST_NS: Final = 1_790_812_800 * SECOND

@@ -20,7 +20,7 @@ from typing import Any
 from _report import Bar, Report, main, percentile, progress
 from _world import World, until
 
-from shadowhound_data_logger.options import DEFAULT_SENSORS
+from shadowhound_data_logger.core.options import DEFAULT_SENSORS
 
 RATE_HZ = 20
 ROUNDS = 4

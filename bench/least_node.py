@@ -22,17 +22,17 @@ from typing import TYPE_CHECKING
 import rclpy
 from rclpy.node import Node
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.capture.intake import until_poll
-from shadowhound_data_logger.capture.sampling import Batcher, KeepRule, rule_for
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SensorSettings, Settings
-from shadowhound_data_logger.encode.registry import encode
-from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
-from shadowhound_data_logger.model import Batch, DataObject, Sample, SpooledObject
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SensorSettings, Settings
+from shadowhound_data_logger.core.model import Batch, DataObject, Sample, SpooledObject
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
+from shadowhound_data_logger.node.intake.intake import until_poll
+from shadowhound_data_logger.node.intake.sampling import Batcher, KeepRule, rule_for
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, endpoints
-from shadowhound_data_logger.stamps import StampRule
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

@@ -18,14 +18,14 @@ from typing import Any, Final
 import numpy as np
 from _report import Bar, Report, main, progress
 
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import BUCKET, OBJECTS, row_of
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.schema import BUCKET, OBJECTS, row_of
 from shadowhound_data_logger.lake import likeness
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.lake.image_models import Vectors
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 FIRST_NS: Final = 1_790_812_800 * SECOND

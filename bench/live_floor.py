@@ -17,7 +17,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from shadowhound_data_logger import heap
+from shadowhound_data_logger.core import heap
 from shadowhound_data_logger.live.kinds import KINDS
 from shadowhound_data_logger.live.topics import POLL_S, _Watched
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile

@@ -34,7 +34,7 @@ from domains import free_domain
 from e2e.processes import Process, Processes, until
 from live import KINDS, TOPICS, Watcher, shape  # live.py beside this file
 
-from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.live.foxglove import PROTOCOLS
 from shadowhound_data_logger.live.kinds import KINDS as KIND_OF_TYPE
 

@@ -13,8 +13,8 @@ import threading
 import time
 from pathlib import Path
 
-from shadowhound_data_logger.capture.pipeline import Pipeline
-from shadowhound_data_logger.capture.sensor_logger_node import main
+from shadowhound_data_logger.node.pipeline import Pipeline
+from shadowhound_data_logger.node.sensor_logger_node import main
 
 MALLINFO = ('arena', 'ordblks', 'smblks', 'hblks', 'hblkhd', 'usmblks', 'fsmblks', 'uordblks', 'fordblks', 'keepcost')
 HEAPS = {'arena': 'heaps', 'hblkhd': 'mapped', 'uordblks': 'heaps_used', 'fordblks': 'heaps_free'}

@@ -19,10 +19,10 @@ from _report import Bar, Report, main, percentile, progress
 
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 from e2e.wire import HANG, PASS, REFUSE, Wire
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT
-from shadowhound_data_logger.sim.tower import Tower
 
 RATE_HZ: Final = 100.0
 FRAME_EVERY: Final = 10

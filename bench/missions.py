@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final
 
 from _report import Bar, Report, main, progress
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import missions
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT, MlflowTracking
-from shadowhound_data_logger.sim.tower import Tower
 
 POINTS: Final = 100_000
 SHARE: Final = 0.5

@@ -24,10 +24,10 @@ from typing import Any
 
 import boto3
 from botocore.config import Config
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores import open_store
 
 BUCKET = 'sensor-data'

@@ -21,8 +21,8 @@ import _proc
 from _report import Bar, Report, main, progress, ratio
 from _world import ROBOT, Program, World, until
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import status
 from shadowhound_data_logger.stores import open_store
 

@@ -22,11 +22,11 @@ from time import process_time
 from typing import Any
 
 from _report import Bar, Report, main, progress
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import SpooledObject
+from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 ROUNDS, THREADS, SIZE = 7, 4, 2000

@@ -23,11 +23,11 @@ from _proc import memory as process_memory
 from _report import Bar, Report, main, progress
 from lake import rows
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import put_part
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 HOURS: Final = 24

@@ -12,9 +12,9 @@ import tempfile
 from pathlib import Path
 from time import perf_counter, process_time
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, State
 from shadowhound_data_logger.spool.spool import Spool
 
 NOON_NS = 1_760_788_800 * SECOND

@@ -15,12 +15,12 @@ import rclpy
 from _report import Bar, Report, main, progress, ratio
 from rclpy.context import Context
 from rclpy.serialization import serialize_message
+from shadowhound_sim.demo_processes import THIS_MACHINE, free_domain
 from std_msgs.msg import String
 
 from shadowhound_data_logger.ros import reader
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE, free_domain
 
 SIZES = {'small': (324, 2.0), 'large': (20_000, 2.0)}
 """Bytes, and how many times as much as rclpy's a take may cost: a robot's LowState and a JPEG."""

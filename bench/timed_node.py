@@ -13,8 +13,8 @@ import sys
 import time
 from collections.abc import Sequence
 
-from shadowhound_data_logger.capture.sensor_logger_node import main
-from shadowhound_data_logger.model import DataObject, Outcome, Put, RecordingRows, SpooledObject
+from shadowhound_data_logger.core.model import DataObject, Outcome, Put, RecordingRows, SpooledObject
+from shadowhound_data_logger.node.sensor_logger_node import main
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
 

@@ -19,9 +19,9 @@ from typing import Any, Final
 import _proc
 from _report import Bar, Report, main, progress, ratio
 from _world import lost
+from shadowhound_sim.demo_processes import free_domain
 
-from shadowhound_data_logger.capture.middleware import choose
-from shadowhound_data_logger.sim.demo_processes import free_domain
+from shadowhound_data_logger.node.intake.middleware import choose
 
 sys.path.append(str(Path(__file__).parents[1] / 'test'))
 from e2e.numbered import message

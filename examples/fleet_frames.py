@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.lake import decode, query
 from shadowhound_data_logger.lake.prefetch import Place, Prefetch
 from shadowhound_data_logger.lake.track import Object

@@ -23,10 +23,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
+from shadowhound_sim.camera import Camera
+from shadowhound_sim.world import World
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.sim.camera import Camera
-from shadowhound_data_logger.sim.world import World
 
 PERIOD_S: Final = 0.2
 FRAME_EVERY: Final = 5

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
+from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.datasets.features import COMMAND, STATE_PARTS
-from shadowhound_data_logger.errors import PolicyError
 from shadowhound_data_logger.policies import active
 from shadowhound_data_logger.policies.running import ActivePolicy
 

@@ -31,7 +31,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.lake import MissionDataset, log_dataset
 
 EXPERIMENT = 'navigation_policy_training'

@@ -18,13 +18,11 @@ import profiles
 import pytest
 from botocore.loaders import create_loader
 from domains import free_domain
-
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
+from shadowhound_sim.demo_processes import THIS_MACHINE
 
 if TYPE_CHECKING:
+    from shadowhound_tower.embedded import Tower
     from stores.certificates import Authority
-
-    from shadowhound_data_logger.sim.tower import Tower
 
 
 ENDING_S = 60.0

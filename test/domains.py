@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from shadowhound_sim.demo_processes import DOMAINS
 
 from shadowhound_data_logger.doctor.machine import domains
 from shadowhound_data_logger.ros.shared_memory import orphans
-from shadowhound_data_logger.sim.demo_processes import DOMAINS
 
 
 @contextmanager

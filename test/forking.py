@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 MODULES: Final = (
-    'shadowhound_data_logger.capture.node', 'shadowhound_data_logger.sim.sim_go2_node', 'rclpy.serialization',
+    'shadowhound_data_logger.node.node', 'shadowhound_sim.sim_go2_node', 'rclpy.serialization',
     'diagnostic_msgs.msg', 'geometry_msgs.msg', 'go2_interfaces.msg', 'nav_msgs.msg', 'rcl_interfaces.msg', 'sensor_msgs.msg',
     'std_msgs.msg', 'std_srvs.srv',
 )  # fmt: skip

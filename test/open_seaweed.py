@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.sim.servers import GRPC, Server, find_program, seaweed_sockets
+from shadowhound_tower.servers import GRPC, Server, find_program, seaweed_sockets
 
 HOST: Final = '127.0.0.1'
 PORTS: Final = {'s3': 9000, 'master': 9333, 'volume': 8080, 'filer': 8888, 'admin': 7646}

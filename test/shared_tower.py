@@ -15,8 +15,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.sim.tower import OWNER, Tower
+from shadowhound_tower.embedded import OWNER, Tower
+
+from shadowhound_data_logger.core.config import StoreSettings
 
 ROBOTS: Final = ('thor', 'tachi')
 """The latter's password is changed by a test."""

@@ -13,18 +13,18 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger import metadata_words
+from shadowhound_data_logger.core import metadata_words
 
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
-ORDER = ('contracts', 'stores', 'policies', 'mcap', 'encode', 'ros', 'spool', 'ship', 'catalogue', 'missions', 'face', 'bags',
-         'capture', 'lake', 'datasets', 'doctor', 'live', 'cli', 'sim')  # fmt: skip
-"""Each folder may import those before it. The contracts are the modules beside the folders, the face is the package itself."""
+ORDER = ('core', 'stores', 'formats', 'policies', 'ros', 'spool', 'shipping', 'missions', 'face', 'bags', 'node', 'lake',
+         'datasets', 'live', 'doctor', 'cli')  # fmt: skip
+"""Each folder may import those before it. The face is the package itself."""
 ROS = {'ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'go2_interfaces', 'nav_msgs', 'rcl_interfaces', 'rclpy',
        'rosidl_generator_py', 'sensor_msgs', 'std_msgs', 'std_srvs', 'diagnostic_msgs'}  # fmt: skip
 ALLOWED = {
-    **{name: {'capture', 'ros', 'sim'} for name in ROS},
-    'rclpy': {'capture', 'doctor', 'live', 'ros', 'sim'},
+    **{name: {'node', 'ros'} for name in ROS},
+    'rclpy': {'node', 'doctor', 'live', 'ros'},
     'aiohttp': {'live'},
     **{name: {'stores'} for name in ('boto3', 'botocore')},
     **{name: {'policies'} for name in ('cryptography', 'securesystemslib', 'tuf')},
@@ -35,7 +35,7 @@ ALLOWED = {
     'aiortc': {'live'},
     'daft': {'datasets', 'lake'},
     'obstore': {'stores'},
-    'pyarrow': {'datasets', 'lake', 'live', 'sim'},
+    'pyarrow': {'datasets', 'lake', 'live'},
 }
 HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av',
          'cryptography', 'onnxruntime', 'securesystemslib', 'tokenizers', 'tuf')  # fmt: skip
@@ -77,7 +77,7 @@ def folder(path: Path) -> str:
     inside = path.relative_to(ROOT).parts
     if len(inside) > 1:
         return inside[0]
-    return 'face' if path.stem == '__init__' else 'contracts'
+    return 'face'
 
 
 PLACES = {path.relative_to(ROOT).with_suffix('').parts[0]: folder(path) for path in MODULES}
@@ -144,9 +144,9 @@ def test_the_live_page_knows_nothing_of_the_nodes_insides() -> None:
     ours = [path for path in MODULES if folder(path) == 'live']
     reads_the_past = {'past.py', 'history.py', 'kept.py'}  # in a process of their own
     assert {name for path in ours if path.name not in reads_the_past for name in folders(path)} <= {
-        'contracts', 'encode', 'live', 'ros', 'spool',
+        'core', 'formats', 'live', 'ros', 'spool',
     }  # fmt: skip
-    assert {name for path in ours for name in folders(path)}.isdisjoint({'capture', 'ship', 'missions', 'doctor', 'cli', 'sim'})
+    assert {name for path in ours for name in folders(path)}.isdisjoint({'node', 'shipping', 'missions', 'doctor', 'cli'})
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['topics.py']
 
 
@@ -160,7 +160,7 @@ def test_a_robot_writes_the_catalogue_without_reading_it() -> None:
     """What the node runs imports none of the packages that only the extra ``lake`` brings."""
     program = f"""
 import sys
-from {PACKAGE}.catalogue import writer
+from {PACKAGE}.shipping import catalog_writer
 print([name for name in ('daft', 'obstore', 'pyarrow') if name in sys.modules])
 """
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import yaml
 
-from shadowhound_data_logger.capture.sampling import EveryMessage, rule_for
-from shadowhound_data_logger.config import Settings, default_parameters
+from shadowhound_data_logger.core.config import Settings, default_parameters
+from shadowhound_data_logger.node.intake.sampling import EveryMessage, rule_for
 
 FOLDER = Path(__file__).parents[1] / 'launch_configs'
 

@@ -26,6 +26,7 @@ MEBI = 1 << 20
 PACKAGES = {'PIL': 'pillow', 'backports': 'backports-zstd', 'gi': 'python3-gi', 'google': 'protobuf', 'grpc': 'grpcio',
             'mlflow': 'mlflow-skinny', 'ruamel': 'ruamel-yaml', 'yaml': 'pyyaml'}  # fmt: skip
 """Names in imports -> those of the packages, where they differ."""
+OURS = ('shadowhound_data_logger', 'sim/shadowhound_sim', 'tower/shadowhound_tower')
 IMPORT = re.compile(r'^ *(?:import (?=[\w.]+(?: as \w+)?(?:  #.*)?$)|from (?=[\w.]+ import ))(\w+)', re.MULTILINE)
 
 
@@ -80,7 +81,7 @@ def test_the_package_is_registered_under_its_name() -> None:
 def test_an_entry_point_leads_to_a_function(point: str) -> None:
     """A command that is installed can be started: its module imports and has the function."""
     module, _, function = point.partition(' = ')[2].partition(':')
-    if module.split('.')[1] in {'capture', 'sim'} and importlib.util.find_spec('rclpy') is None:
+    if module.split('.')[1] == 'node' and importlib.util.find_spec('rclpy') is None:
         pytest.skip('this command needs ROS')
     assert callable(getattr(importlib.import_module(module), function))
 
@@ -102,11 +103,11 @@ def test_every_dependency_has_its_reason(name: str) -> None:
 def imported() -> set[str]:
     """The packages that the library's modules import, by the names that pip (for gi apt) knows; ROS and types aside."""
     found: set[str] = set()
-    for path in (ROOT / 'shadowhound_data_logger').rglob('*.py'):
+    for path in (path for folder in OURS for path in (ROOT / folder).rglob('*.py')):
         text = re.sub(r'^if TYPE_CHECKING:\n(?: .*\n|\n)*', '', path.read_text(), flags=re.MULTILINE)
         found.update(IMPORT.findall(text))
     stdlib = {*sys.stdlib_module_names, 'compression'}  # the latter from 3.14 on
-    return {PACKAGES.get(name, name) for name in found - stdlib - ROS - {'shadowhound_data_logger'}}
+    return {PACKAGES.get(name, name) for name in found - stdlib - ROS - {Path(folder).name for folder in OURS}}
 
 
 def test_what_is_imported_is_asked_for_or_comes_with_what_is() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.capture.keeping import PREVIEW_BYTES
+from shadowhound_data_logger.node.keeping.keeping import PREVIEW_BYTES
 
 PROGRAM = Path(__file__).parents[1] / 'bench' / 'scale.py'
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.options import ShutdownSettings
+from shadowhound_data_logger.core.options import ShutdownSettings
 
 ROOT = Path(__file__).resolve().parents[1]
 UNITS = sorted((ROOT / 'launch_configs').glob('*.service'))
 UNIT, LIVE = (ROOT / 'launch_configs' / f'shadowhound-{name}.service' for name in ('data-logger', 'live'))
 CLOSE_S = 5.0
-"""What capture/pipeline.py allows for making durable what is in memory."""
+"""What node/pipeline.py allows for making durable what is in memory."""
 
 
 def section(unit: Path) -> dict[str, str]:

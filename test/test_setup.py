@@ -32,7 +32,7 @@ class Machine:
         checkout = folder / 'checkout'
         (checkout / 'scripts').mkdir(parents=True)
         shutil.copy(ROOT / 'scripts' / 'setup', checkout / 'scripts')
-        for name in ('interfaces', 'launch_configs', 'package.xml', 'requirements', 'setup.cfg', 'setup.py'):
+        for name in ('interfaces', 'launch_configs', 'package.xml', 'requirements', 'setup.cfg', 'setup.py', 'sim', 'tower'):
             (checkout / name).symlink_to(ROOT / name)
 
     def python(self, where: str, version: str, *, makes_venvs: bool = True) -> Path:

@@ -10,8 +10,8 @@ from typing import Final
 import click
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.options import GROUPS
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.options import GROUPS
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 COMMAND: Final = re.compile(r'shadowhound-data (?P<verb>[a-z]+)(?P<rest>[^`#|;)\n\']*)')

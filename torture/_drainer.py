@@ -15,14 +15,14 @@ import time
 from pathlib import Path
 from typing import IO
 
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SpoolSettings, UploadSettings, store_settings
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings, store_settings
+from shadowhound_data_logger.core.model import Put, SpooledObject
+from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.base import ObjectStore
 from torture._profile import LIVE, arrivals, make, receive
 

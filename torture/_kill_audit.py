@@ -26,7 +26,7 @@ from e2e.reading import TYPES, assert_same, decode
 from e2e.witness import recorded
 from pypcd4.pypcd4 import PointCloud
 
-from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.stores.base import ObjectStore
 from torture._command import Bar, some

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from heapq import merge
 from typing import Final
 
-from shadowhound_data_logger.config import DEFAULT_SENSORS
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.spool.spool import Spool
 
 LIVE: Final = 'live-'

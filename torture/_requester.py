@@ -11,13 +11,13 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.mailbox import BAG_SENSOR, KeptFilter
+from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.mailbox import BAG_SENSOR, KeptFilter
-from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 SHORT_S = 3

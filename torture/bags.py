@@ -21,9 +21,9 @@ from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, published
 from e2e.reading import TYPES
 from e2e.witness import recorded
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop

@@ -13,8 +13,8 @@ from typing import Final
 from faults.campaign import live, simulated
 from faults.kinds import given_seed
 from faults.report import Summary
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.sim.tower import Tower
 from torture._command import Bar, parser, progress, verdict, workshop
 
 LONG: Final = 1000, 50

@@ -22,13 +22,13 @@ from typing import Any, Final
 from e2e.bag_reading import Bag, bags
 from e2e.processes import Node, Processes, is_accounted, published, until
 from e2e.wire import PASS, REFUSE, Wire
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.bags.objects import EVICTED
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SpoolSettings, UploadSettings
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.retention import NO_ROOM

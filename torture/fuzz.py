@@ -23,8 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from encode.conftest import GO2_MESSAGES, Ros
-from encode.hostile import Fuzzer
+from formats.conftest import GO2_MESSAGES, Ros
+from formats.hostile import Fuzzer
 from spool import editing, rotting
 
 from torture import _readers

@@ -32,8 +32,8 @@ from domains import free_domain
 from e2e.numbered import told
 from e2e.processes import Node, Processes, Publisher, until
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import WRONG_TYPE
 from shadowhound_data_logger.spool.control import connect

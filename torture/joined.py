@@ -23,14 +23,14 @@ from e2e.processes import Node, Processes, published, until
 from e2e.wire import HANG, PASS, REFUSE, Wire
 from missions.agent import FRAME_EVERY, NO_CSV
 from missions.server import Server, complete
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running

@@ -29,22 +29,22 @@ from typing import Any, Final
 from domains import free_domain
 from e2e.processes import Node, Processes, until
 from e2e.wire import HANG, PASS, REFUSE, Wire
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import verify_remote
-from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SpoolSettings, UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
+from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.core.model import LOST
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
+from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.mailbox import KeptFilter
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged, StoredFile
-from shadowhound_data_logger.model import LOST
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store

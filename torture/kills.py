@@ -21,9 +21,9 @@ from domains import free_domain
 from e2e.processes import Node, Process, Processes, published, until
 from e2e.reading import TYPES
 from e2e.wire import HANG, PASS, REFUSE, Wire
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop

@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
+from shadowhound_tower.embedded import Tower
+
 from bench.drain import bare
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SpoolSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores import open_store

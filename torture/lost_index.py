@@ -31,19 +31,19 @@ from e2e.numbered import told
 from e2e.processes import Node, Process, Processes, Publisher, until
 from e2e.wire import Wire
 from missions.server import Server, complete
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.bags.local import RECORDS
 from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.record import PROGRAM
-from shadowhound_data_logger.catalogue.gaps import GAP
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.formats.rows.gaps import GAP
 from shadowhound_data_logger.lake import gaps as lake_gaps
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store

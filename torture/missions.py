@@ -23,12 +23,12 @@ from e2e.processes import until
 from e2e.wire import HANG, PASS, REFUSE, Wire
 from missions.agent import FRAME_EVERY, jpeg
 from missions.server import Server
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import read
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 

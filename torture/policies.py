@@ -22,16 +22,16 @@ from typing import Any, Final
 
 import boto3
 from policies.models import Spark, linear
+from shadowhound_tower.embedded import Tower
 from shared_tower import USERS
 
-from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.mlflow_rest import MlflowRest
-from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.mlflow_rest import MlflowRest
+from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.policies import packing, running, sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 from shadowhound_data_logger.policies.registry import CHAMPION, MlflowRegistry
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture._disks import MEBI, Disk, NotAllowed, small_disk

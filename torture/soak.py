@@ -26,11 +26,11 @@ import matplotlib as mpl
 from e2e.processes import HERE, Node, Process, Processes, is_accounted, published, until
 from e2e.wire import HANG, PASS, REFUSE, Wire
 from matplotlib.figure import Figure
+from shadowhound_tower.embedded import Tower
 
 from bench._proc import memory
 from shadowhound_data_logger.missions.plots import AMBER, BLUE, DPI, INK, STYLE, TEAL
 from shadowhound_data_logger.ros.shared_memory import FOLDER
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.control import NAME, Connection
 from torture._command import Bar, parser, progress, verdict, workshop

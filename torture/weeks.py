@@ -26,27 +26,36 @@ from unittest import mock
 import orjson
 from spool.making import FakeClock, assert_whole, make, receive
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
-from shadowhound_data_logger.capture.halving import Halving
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.clock import SECOND, iso
-from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
-from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, KeptFilter, PullRequest, encode_inbox, inbox_key
+from shadowhound_data_logger.core.model import (
+    EVENTS_WHEN,
+    UPLOAD_WHEN,
+    DataObject,
+    FileBody,
+    Outcome,
+    SpooledObject,
+    State,
+    waits_for,
+)
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
+from shadowhound_data_logger.core.rules import read_rule
+from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps, prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten
-from shadowhound_data_logger.mailbox import MAILBOX_BUCKET, KeptFilter, PullRequest, encode_inbox, inbox_key
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import EVENTS_WHEN, UPLOAD_WHEN, DataObject, FileBody, Outcome, SpooledObject, State, waits_for
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
-from shadowhound_data_logger.rules import read_rule
-from shadowhound_data_logger.ship.requests import RequestServer
-from shadowhound_data_logger.ship.thinning import Thinner
+from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.requests import RequestServer
+from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore

@@ -128,7 +128,7 @@ def seaweed(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
 
 
 def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
-    """Who may log in to MLflow, as its server checks it (shadowhound_data_logger/sim/mlflow_access.py)."""
+    """Who may log in to MLflow, as its server checks it (tower/shadowhound_tower/mlflow_access.py)."""
     digests = {
         user: [hashlib.sha256(key['password'].encode()).hexdigest() for key in keys]
         for user, keys in users.items() if user not in NO_LOGIN

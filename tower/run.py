@@ -29,11 +29,11 @@ from typing import Final
 
 import make_secrets
 from make_secrets import MLFLOW_PORT, S3_PORT
+from shadowhound_tower import mlflow_access
+from shadowhound_tower.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
 
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.doctor import seaweedfs
-from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.sim import mlflow_access
-from shadowhound_data_logger.sim.servers import GRPC, Server, ServerFailed, find_program, seaweed_sockets
 
 HERE: Final = Path(__file__).resolve().parent
 POSTGRES_PORT, MASTER_PORT = 5432, 9333

@@ -20,16 +20,16 @@ from typing import IO, Any, Final, Protocol
 from shadowhound_data_logger.bags.description import Description, of_files, of_manifest, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.format import CDR, ROS2
-from shadowhound_data_logger.mcap.index import McapIndex, read_index, read_profile, read_summary
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, read_whole
-from shadowhound_data_logger.mcap.rosbag2_metadata import in_numbers
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES, unpacked
-from shadowhound_data_logger.zstd import ZstdError, ZstdFile
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.untrusted import MOST_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.zstd import ZstdError, ZstdFile
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.format import CDR, ROS2
+from shadowhound_data_logger.formats.mcap.index import McapIndex, read_index, read_profile, read_summary
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, read_whole
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import in_numbers
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 
 THREADS: Final = 8
 """Files that are opened at a time."""

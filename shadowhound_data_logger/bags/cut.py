@@ -31,17 +31,17 @@ from shadowhound_data_logger.bags.latched import MAX_LATCHED_BYTES, MAX_PER_TOPI
 from shadowhound_data_logger.bags.naming import BUCKET, MCAP, METADATA
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, read_manifest
-from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.errors import BagError, SettingError
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
-from shadowhound_data_logger.mcap.ranges import Meter, StoredFile
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.errors import BagError, SettingError
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.times import moment_in_bag
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage
+from shadowhound_data_logger.formats.mcap.ranges import Meter, StoredFile
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.times import moment_in_bag
 
 UNFINISHED: Final = '.part'
 COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.naming import SQLITE, natural
-from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.slice_info import SliceInfo, counted
-from shadowhound_data_logger.untrusted import check_size, from_yaml
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.untrusted import check_size, from_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo, counted
 
 MOST_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""

@@ -24,10 +24,10 @@ from shadowhound_data_logger.bags.recording import UNWRITABLE, Recording
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Ring
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.clock import SECOND, iso
+from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.options import BagSettings, EventSettings
+from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.folder import safe_type
-from shadowhound_data_logger.options import BagSettings, EventSettings
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

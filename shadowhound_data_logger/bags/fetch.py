@@ -17,14 +17,14 @@ from shadowhound_data_logger.bags.contents import BagReader
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, clock_of, missing_of
-from shadowhound_data_logger.durable_files import fingerprint, lock, replacing
-from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, check_document, read_whole
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.core.durable_files import fingerprint, lock, replacing
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.untrusted import path_below
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, check_document, read_whole
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
-from shadowhound_data_logger.untrusted import path_below
 
 FETCH_THREADS: Final = 4
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import described, open_folder
 from shadowhound_data_logger.bags.description import Description, clock_said, of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
@@ -21,8 +20,9 @@ from shadowhound_data_logger.bags.remote import (
     missing_of,
     state_of,
 )
-from shadowhound_data_logger.errors import BagError
-from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import BagError
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.core.errors import BagDamaged
 
 MOST: Final = 1 << 64
 """Times in MCAP have 64 bits without a sign."""

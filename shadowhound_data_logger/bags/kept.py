@@ -12,19 +12,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, MissionOf, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, natural, slice_file
 from shadowhound_data_logger.bags.objects import SENSOR, ros_distro
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.keys import MAX_BAG_BYTES
-from shadowhound_data_logger.mcap.index import read_summary
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import DataObject, FileBody
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES
+from shadowhound_data_logger.core.model import DataObject, FileBody
+from shadowhound_data_logger.formats.mcap.index import read_summary
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.spool.request_table import KeptSlice
 
 CUTTING: Final = 'cutting'

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.model import Taken
 
 log = logging.getLogger(__name__)
 

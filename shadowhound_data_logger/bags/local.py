@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.naming import BAGS, BUCKET, prefix_of
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.mcap.writer import OPEN
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.formats.mcap.writer import OPEN
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 

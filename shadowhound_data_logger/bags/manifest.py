@@ -33,9 +33,9 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from shadowhound_data_logger.bags.json_object import JsonObject
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.untrusted import from_json, is_path
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.untrusted import from_json, is_path
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 
 VERSION: Final = 1
 COMPLETE: Final = 'complete'

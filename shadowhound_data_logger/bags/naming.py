@@ -7,8 +7,8 @@ from collections.abc import Callable
 from itertools import count
 from typing import Final
 
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, is_name
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, is_name
 from shadowhound_data_logger.missions.folder import safe_type
 
 BUCKET: Final = 'sensor-data'

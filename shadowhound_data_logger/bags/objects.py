@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, prefix_of, slice_number
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.spool.writer import SpoolWriter
 

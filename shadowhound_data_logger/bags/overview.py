@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import NOT_READ, described
 from shadowhound_data_logger.bags.description import of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, given_up, local_files
@@ -26,9 +25,10 @@ from shadowhound_data_logger.bags.remote import (
     read_manifest,
     state_of,
 )
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.ranges import StoredFile
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.formats.mcap.ranges import StoredFile
 from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 8

@@ -13,13 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import ClockOf
 from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_of, slice_file, unsynced_name
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
-from shadowhound_data_logger.dating import Dating
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock
+from shadowhound_data_logger.core.dating import Dating
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 _LATEST: Final = 1 << 63

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate, takewhile
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.model import Taken
 
 QUEUE_FULL: Final = 'queue_full'
 """Why messages are dropped that do not fit."""

@@ -4,7 +4,7 @@
     record_and_upload_rosbag('patrol', 60)
 
 It leaves the robot slice by slice while it records, and what Tower cannot take now waits in the spool. A process of its own
-does it (``capture/bag_process.py``), so neither rclpy nor its signals get into the caller's.
+does it (``node/recording/bag_process.py``), so neither rclpy nor its signals get into the caller's.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.core.errors import BagError
 
-PROGRAM: Final = 'shadowhound_data_logger.capture.bag_process'
+PROGRAM: Final = 'shadowhound_data_logger.node.recording.bag_process'
 DEADLINE_S: Final = 60.0
 """For the rest of it after the recording; most of a bag is delivered by then."""
 

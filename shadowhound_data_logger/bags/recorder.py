@@ -19,9 +19,9 @@ from shadowhound_data_logger.bags.queue import BagQueue, Lot
 from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.core.options import BagSettings
+from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.spool.accounts import BAG
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

@@ -23,12 +23,12 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.state import ENDED, RECORD, BagState
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.mcap.recovery import recover
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.mcap.writer import OPEN, SliceWriter
-from shadowhound_data_logger.model import RecordingRows
-from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.core.model import RecordingRows
+from shadowhound_data_logger.core.options import BagSettings
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.recovery import recover
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import OPEN, SliceWriter
 from shadowhound_data_logger.spool.retention import NO_ROOM
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ whatever reached the disk is spooled, the manifest says what is missing, and the
 no slice is lost by the restart. Every step can be cut short and done again. What is no slice, whoever put it there, is set aside
 unopened.
 
-This decides about a bag; ``mcap/recovery.py`` repairs the bytes of a slice, ``spool/recovery.py`` repairs a spool.
+This decides about a bag; ``formats/mcap/recovery.py`` repairs the bytes of a slice, ``spool/recovery.py`` repairs a spool.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from shadowhound_data_logger.bags.naming import BUCKET, prefix_of, slice_number
 from shadowhound_data_logger.bags.objects import finish, ros_distro, slice_object
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.state import RECORD, BagState
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, is_name
-from shadowhound_data_logger.mcap.index import read_index, read_metadata
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
-from shadowhound_data_logger.mcap.recovery import read_info, recover
-from shadowhound_data_logger.mcap.writer import OPEN
-from shadowhound_data_logger.model import RecordingRows
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, is_name
+from shadowhound_data_logger.core.model import RecordingRows
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.mcap.index import read_index, read_metadata
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.recovery import read_info, recover
+from shadowhound_data_logger.formats.mcap.writer import OPEN
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.span import MAX_RANGES, NumberRun
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

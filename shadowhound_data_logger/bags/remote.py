@@ -11,12 +11,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.description import clock_said
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural, prefix_of
-from shadowhound_data_logger.errors import UnknownBag
-from shadowhound_data_logger.mcap.ranges import StoredFile, read_whole
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import UnknownBag
+from shadowhound_data_logger.formats.mcap.ranges import StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
 
 ARCHIVE: Final = '.tar.gz'

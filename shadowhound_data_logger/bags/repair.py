@@ -1,8 +1,8 @@
 """Repairs a bag, ours or another recorder's: a folder or one file. Intact files are copied, damaged ones rewritten.
 
-MCAP is repaired by ``mcap/repair.py``; of SQLite every row that can be read is kept; ``metadata.yaml`` is rebuilt from the files
-if it is missing, invalid or contradicts them; a manifest is updated and lists what is missing. Files that rosbag2 compressed as a
-whole are copied if they are intact, and otherwise reported.
+MCAP is repaired by ``formats/mcap/repair.py``; of SQLite every row that can be read is kept; ``metadata.yaml`` is rebuilt from
+the files if it is missing, invalid or contradicts them; a manifest is updated and lists what is missing. Files that rosbag2
+compressed as a whole are copied if they are intact, and otherwise reported.
 
 The result gets its name when it is complete and on the disk. In place, each file is replaced by a rename once all are repaired:
 an interruption leaves every file either old or new.
@@ -24,14 +24,14 @@ from shadowhound_data_logger.bags.fetch import Told, on_disk
 from shadowhound_data_logger.bags.manifest import RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural
 from shadowhound_data_logger.bags.sqlite_repair import LEFT, salvage_tables
-from shadowhound_data_logger.durable_files import fingerprint, replacing, sync
-from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.mcap.ranges import LocalFile, read_whole
-from shadowhound_data_logger.mcap.repair import Loss, McapRepair, examine, repair
-from shadowhound_data_logger.mcap.rosbag2_metadata import bagfile_information, to_yaml
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.mcap.writer import OPEN
-from shadowhound_data_logger.untrusted import from_yaml
+from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.untrusted import from_yaml
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, read_whole
+from shadowhound_data_logger.formats.mcap.repair import Loss, McapRepair, examine, repair
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import bagfile_information, to_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import OPEN
 
 REPAIRED: Final = '_repaired'
 """Appended to the name of the bag or file, unless another output is requested."""

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from shadowhound_data_logger.bags.latched import MESSAGE_BYTES, Latched
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.spool.accounts import EVENT, Accounts, Losses
 
 PIECE_BYTES: Final = 1 << 20

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.contents import check_schema
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.untrusted import MOST_CHUNK_BYTES
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.untrusted import MOST_CHUNK_BYTES
 
 TABLES: Final = ('schema', 'metadata', 'topics', 'message_definitions', 'messages')
 _TYPES: Final = frozenset({'INTEGER', 'TEXT', 'BLOB'})

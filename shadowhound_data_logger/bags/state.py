@@ -34,14 +34,14 @@ from shadowhound_data_logger.bags.manifest import (
     read_mission,
 )
 from shadowhound_data_logger.bags.naming import slice_file, slice_number
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.errors import BagDamaged, NameRefused
-from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo, counted
-from shadowhound_data_logger.mcap.writer import OPEN
-from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.errors import BagDamaged, NameRefused
+from shadowhound_data_logger.core.keys import check_key
+from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceRow
+from shadowhound_data_logger.core.untrusted import from_json
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo, counted
+from shadowhound_data_logger.formats.mcap.writer import OPEN
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
-from shadowhound_data_logger.untrusted import from_json
 
 log = logging.getLogger(__name__)
 

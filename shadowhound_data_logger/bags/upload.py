@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.fetch import Told, on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, archive_of, finished, plan_of
-from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import BagError, ForeignObject
-from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
-from shadowhound_data_logger.retry import steadily
-from shadowhound_data_logger.ship.uploader import Uploader, delivering
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import Clock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import BagError, ForeignObject
+from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.shipping.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits

@@ -14,18 +14,18 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, cast
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import files_of, no_bag, open_folder
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, Manifest, Missing, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, UNSAFE, prefix_of
 from shadowhound_data_logger.bags.remote import ARCHIVE
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import BagDamaged, BagError
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, MAX_SEGMENT_BYTES, check_key, check_name, is_segment, unique
-from shadowhound_data_logger.mcap.rosbag2_metadata import to_yaml
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.untrusted import from_yaml
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, MAX_SEGMENT_BYTES, check_key, check_name, is_segment, unique
+from shadowhound_data_logger.core.untrusted import from_yaml
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import to_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 
 CONTENT_TYPES: Final = {'.yaml': 'application/yaml', '.json': 'application/json', '.gz': 'application/gzip'}
 _NUMBER: Final = re.compile(r'_(\d+)\.', re.ASCII)

@@ -14,18 +14,18 @@ from hashlib import sha256 as sha256_new
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.contents import files_of, no_bag, opened, reason, slices_of
 from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
 from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import DATA_END_BYTES, McapIndex, check_crcs, read_end, read_summary, scan
-from shadowhound_data_logger.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
-from shadowhound_data_logger.mcap.slice_info import SliceInfo
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.core.untrusted import is_path
+from shadowhound_data_logger.formats.mcap.index import DATA_END_BYTES, McapIndex, check_crcs, read_end, read_summary, scan
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 4
 PIECE_BYTES: Final = 8 << 20

@@ -22,10 +22,10 @@ from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.naming import METADATA, SLICES, safe_bag
 from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_spool, planned, spool_upload
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, finished
-from shadowhound_data_logger.clock import SECOND, Clock, iso
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.durable_files import flock, replacing
-from shadowhound_data_logger.errors import BagError, DataLoggerError
+from shadowhound_data_logger.core.clock import SECOND, Clock, iso
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.durable_files import flock, replacing
+from shadowhound_data_logger.core.errors import BagError, DataLoggerError
 from shadowhound_data_logger.stores import open_store
 
 MARKS: Final = '.shadowhound-bags.json'

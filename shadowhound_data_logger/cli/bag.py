@@ -15,7 +15,6 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import BagInfo, info_folder, info_of
@@ -55,12 +54,13 @@ from shadowhound_data_logger.cli.output import (
     with_dates,
 )
 from shadowhound_data_logger.cli.question import ranges_option
-from shadowhound_data_logger.clock import SystemClock, iso
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import BagDamaged, BagError, NameRefused, StoreUnavailable
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SystemClock, iso
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import BagDamaged, BagError, NameRefused, StoreUnavailable
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.stores.memory import MemoryStore
-from shadowhound_data_logger.times import moment
 
 STORE_THREADS: Final = 8
 LOCAL_REMEDY: Final = 'shadowhound-data bag verify DIR --deep shows what is damaged'

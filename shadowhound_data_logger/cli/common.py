@@ -11,10 +11,10 @@ from typing import Final
 
 import click
 
-from shadowhound_data_logger.config import UploadSettings, home, store_settings
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_name
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.core.config import UploadSettings, home, store_settings
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

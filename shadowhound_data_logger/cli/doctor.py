@@ -16,12 +16,12 @@ from rich.text import Text
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code
 from shadowhound_data_logger.cli.output import plain, print_json, progress
+from shadowhound_data_logger.core.ros_arguments import ParametersUnreadable
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Role, Severity
 from shadowhound_data_logger.doctor.run import TIMEOUT_S, Examination
 from shadowhound_data_logger.doctor.run import fix as fix_results
-from shadowhound_data_logger.ros_arguments import ParametersUnreadable
 
 STYLES: Final = {
     Severity.ERROR: 'red',

@@ -26,8 +26,8 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress, volume
 from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, tell_left_out
-from shadowhound_data_logger.errors import TrackingError
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.core.errors import TrackingError
+from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.stores import open_reader
 
 if TYPE_CHECKING:

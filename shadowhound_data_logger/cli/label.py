@@ -32,9 +32,9 @@ from shadowhound_data_logger.cli.output import (
     shown_time,
 )
 from shadowhound_data_logger.cli.question import asking, quietly, ranges_option, tell_left_out
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, visible
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, visible
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.labels import Label
@@ -223,7 +223,7 @@ def _only_robot() -> str:
 
 def _place(key: str, robot: str) -> tuple[str, str]:
     """Bucket and key of an object, which may be told as BUCKET/KEY."""
-    from shadowhound_data_logger.catalogue.schema import BUCKET  # noqa: PLC0415
+    from shadowhound_data_logger.formats.rows.schema import BUCKET  # noqa: PLC0415
 
     bucket, _, rest = key.partition('/')
     return (BUCKET, key) if bucket == robot else (bucket, rest)

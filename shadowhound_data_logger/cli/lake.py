@@ -32,10 +32,10 @@ from shadowhound_data_logger.cli.common import (
 from shadowhound_data_logger.cli.export import all_datasets
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
-from shadowhound_data_logger.clock import SECOND, SystemClock, utc
-from shadowhound_data_logger.ship.audit import KINDS, Audit, audit
+from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.shipping.audit import KINDS, Audit, audit
 from shadowhound_data_logger.stores import open_reader
-from shadowhound_data_logger.times import moment
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Coverage

@@ -25,13 +25,13 @@ from shadowhound_data_logger.cli.output import (
     unsure,
     volume,
 )
-from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
 from shadowhound_data_logger.spool.ledger import imbalances, journal
 from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.status import robots
-from shadowhound_data_logger.times import moment
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})

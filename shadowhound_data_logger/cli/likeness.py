@@ -73,9 +73,9 @@ def _told(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
 def likest(source: Any, like: Path | None, text: str | None, folder: Path | None, limit: int, left_out: Findings,
            flags: Mapping[str, Any]) -> Any:  # fmt: skip
     """The rows of the likest pictures, with how like they are; what has no vector is said on standard error."""
+    from shadowhound_data_logger.core.untrusted import open_image  # noqa: PLC0415
     from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - Daft takes half a second
     from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
-    from shadowhound_data_logger.untrusted import open_image  # noqa: PLC0415
 
     model = open_model(folder)
     try:

@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 
 import click
 
-from shadowhound_data_logger import heap
 from shadowhound_data_logger.cli.common import (
     BadUsage,
     ExitCode,
@@ -24,6 +23,7 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.output import print_json
+from shadowhound_data_logger.core import heap
 from shadowhound_data_logger.spool.status import robots
 
 PORT = 8765

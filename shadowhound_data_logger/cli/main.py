@@ -35,7 +35,7 @@ from shadowhound_data_logger.cli.search import lake_index, search
 from shadowhound_data_logger.cli.sink import lake_sink
 from shadowhound_data_logger.cli.spool import spool
 from shadowhound_data_logger.cli.status import status
-from shadowhound_data_logger.errors import DataLoggerError, SettingError, UnknownName
+from shadowhound_data_logger.core.errors import DataLoggerError, SettingError, UnknownName
 
 SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
     'On every machine': (doctor,),

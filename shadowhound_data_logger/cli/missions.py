@@ -26,11 +26,11 @@ from shadowhound_data_logger.cli.output import (
     shown_iso,
     value_table,
 )
-from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.untrusted import csv_cell
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
 from shadowhound_data_logger.missions.overview import ACTIVE, export, find, is_sending, overview, overviews
-from shadowhound_data_logger.untrusted import csv_cell
 
 POLL_S: Final = 0.5
 STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}

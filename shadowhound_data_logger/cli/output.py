@@ -27,11 +27,11 @@ from rich.table import Table
 from rich.text import Text
 
 from shadowhound_data_logger.bags.fetch import Told
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED
-from shadowhound_data_logger.untrusted import visible
 
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000

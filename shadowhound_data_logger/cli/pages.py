@@ -14,15 +14,15 @@ import click
 
 from shadowhound_data_logger.cli.common import MEANINGS
 from shadowhound_data_logger.cli.main import SECTIONS as VERBS
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.options import DEFAULT_SENSORS, GIBI, GROUPS, MEBI, SensorSettings
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.options import DEFAULT_SENSORS, GIBI, GROUPS, MEBI, SensorSettings
 
 DOCS: Final = Path(__file__).parents[2] / 'docs'
 COLUMNS: Final = ('parameter', 'default', 'allowed', 'live', '')
 HEAD: Final = """\
 # Parameters
 
-*Made from the code by `make docs`: change `shadowhound_data_logger/options.py`, not this page.*
+*Made from the code by `make docs`: change `shadowhound_data_logger/core/options.py`, not this page.*
 
 The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`;
 [go2.yaml](../launch_configs/go2.yaml) has all of them with their defaults: copy it and delete what you do not change) or one by

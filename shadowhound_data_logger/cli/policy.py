@@ -26,10 +26,10 @@ from shadowhound_data_logger.cli.common import (
     the_store,
 )
 from shadowhound_data_logger.cli.output import plain_table, print_json, print_page
-from shadowhound_data_logger.errors import DataLoggerError, PolicyError, PolicyRefused
+from shadowhound_data_logger.core.errors import DataLoggerError, PolicyError, PolicyRefused
+from shadowhound_data_logger.core.mlflow_rest import MlflowRest
+from shadowhound_data_logger.core.options import GIBI
 from shadowhound_data_logger.missions.active import MissionFinder
-from shadowhound_data_logger.mlflow_rest import MlflowRest
-from shadowhound_data_logger.options import GIBI
 from shadowhound_data_logger.policies import packing, running
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.registry import CANARY, CHAMPION, MlflowRegistry

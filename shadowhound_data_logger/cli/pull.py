@@ -13,10 +13,10 @@ import click
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
-from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter, offer
-from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import visible
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter, offer
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.core.untrusted import visible
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.select import Wanted

@@ -29,9 +29,9 @@ from shadowhound_data_logger.cli.output import (
     with_dates,
 )
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.lake.bucket import default_source
-from shadowhound_data_logger.untrusted import csv_cell, visible
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.values import ValueAnswer

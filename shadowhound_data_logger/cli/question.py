@@ -11,8 +11,8 @@ import click
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
-from shadowhound_data_logger.errors import LakeError, SettingError, UnknownName
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, from_json
+from shadowhound_data_logger.core.errors import LakeError, SettingError, UnknownName
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_json
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings

@@ -14,7 +14,7 @@ import click
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store_settings
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress
 from shadowhound_data_logger.cli.question import asking, quietly, tell_left_out
-from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.core.errors import StoreUnavailable
 
 SHOWN: Final = 10
 

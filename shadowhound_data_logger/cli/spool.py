@@ -16,7 +16,6 @@ import click
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     ProgressBar,
@@ -30,11 +29,12 @@ from shadowhound_data_logger.cli.output import (
     progress,
     volume,
 )
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
-from shadowhound_data_logger.ship.uploader import Uploader, UploadStatus, delivering
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, tell_gaps_again, usage_by_sensor
 from shadowhound_data_logger.spool.listing import retry as retry_objects

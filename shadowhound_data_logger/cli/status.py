@@ -38,7 +38,7 @@ from shadowhound_data_logger.cli.output import (
     unsure,
     volume,
 )
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
 from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 from shadowhound_data_logger.spool.gaps import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, robots

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.untrusted import csv_rows
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.untrusted import csv_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

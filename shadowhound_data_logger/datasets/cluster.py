@@ -24,12 +24,12 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 import shadowhound_data_logger
+from shadowhound_data_logger.core.durable_files import fingerprint, flock, lock, replacing
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.datasets.episodes import TOLD, build
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.plan import EpisodePlan
-from shadowhound_data_logger.durable_files import fingerprint, flock, lock, replacing
-from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.options import StoreSettings
 
 ATTEMPTS: Final = 3
 """Workers that a mission may lose before the export gives it up."""

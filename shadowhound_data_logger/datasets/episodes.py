@@ -21,9 +21,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from shadowhound_data_logger.catalogue import labels as catalogue_labels
-from shadowhound_data_logger.catalogue.gaps import GAPS as STATEMENTS
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.errors import BagDamaged, LakeError, ObjectRefused, Rejected
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets.clocks import ClockOffset
 from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions
 from shadowhound_data_logger.datasets.plan import BEFORE_NS, ArmPlan, EpisodePlan, StreamPlan, refusal
@@ -40,12 +41,11 @@ from shadowhound_data_logger.datasets.ticks import (
     ticks_of,
 )
 from shadowhound_data_logger.datasets.video import VideoWriter
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.errors import BagDamaged, LakeError, ObjectRefused, Rejected
+from shadowhound_data_logger.formats.rows import labels as catalogue_labels
+from shadowhound_data_logger.formats.rows.gaps import GAPS as STATEMENTS
 from shadowhound_data_logger.lake import decode, labels
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import arrow_schema, narrow
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
@@ -67,9 +67,9 @@ SOURCE_SCHEMA: Final = pa.schema([
 ])  # fmt: skip
 """One row a frame and message that it was made from: ``held_s`` is how much older than the tick it was."""
 GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
-"""The statements of the gap journal that were believed (catalogue/gaps.py)."""
+"""The statements of the gap journal that were believed (formats/rows/gaps.py)."""
 LABEL_SCHEMA: Final = narrow(labels.FIELDS, catalogue_labels.LABELS).insert(0, GAP_SCHEMA.field(EPISODE))
-"""The labels that stood, with their boxes (catalogue/labels.py)."""
+"""The labels that stood, with their boxes (formats/rows/labels.py)."""
 PICTURE: Final = pa.struct([('bytes', pa.binary()), ('path', pa.string())])
 
 

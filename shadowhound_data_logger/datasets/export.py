@@ -21,6 +21,9 @@ from shutil import rmtree
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
+from shadowhound_data_logger.core.durable_files import flock, replacing
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets import plan as planning
 from shadowhound_data_logger.datasets.episodes import TOLD, build
 from shadowhound_data_logger.datasets.features import ExportOptions
@@ -29,13 +32,10 @@ from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of
 from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
 from shadowhound_data_logger.datasets.report import draw
 from shadowhound_data_logger.datasets.ticks import whole_fps
-from shadowhound_data_logger.durable_files import flock, replacing
-from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.track import Track
 from shadowhound_data_logger.lake.training import INFO
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.lake import decode
 
 _POSE: Final = decode.ODOMETRY[:7]

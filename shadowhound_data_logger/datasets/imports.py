@@ -28,18 +28,18 @@ import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, iso, utc
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, iso, utc
+from shadowhound_data_logger.core.errors import ForeignObject, LakeError, SettingError
+from shadowhound_data_logger.core.keys import dated
+from shadowhound_data_logger.core.model import Put, SpooledObject
+from shadowhound_data_logger.core.untrusted import csv_rows
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS, JOINT_STATE
 from shadowhound_data_logger.datasets.lerobot import matrix
-from shadowhound_data_logger.errors import ForeignObject, LakeError, SettingError
-from shadowhound_data_logger.keys import dated
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import put_part
 from shadowhound_data_logger.lake.training import INFO
-from shadowhound_data_logger.model import Put, SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import csv_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

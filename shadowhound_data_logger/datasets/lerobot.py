@@ -19,6 +19,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.episodes import (
     EPISODE,
     GAP_SCHEMA,
@@ -44,8 +46,6 @@ from shadowhound_data_logger.datasets.features import (
     StatePart,
 )
 from shadowhound_data_logger.datasets.video import Clip, count_frames, feature_info, frames_at, frames_of, join
-from shadowhound_data_logger.durable_files import fingerprint, replacing, sync
-from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.training import DIGEST_FILES, INFO, LABEL_TABLE, digest_of
 

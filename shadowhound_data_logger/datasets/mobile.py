@@ -20,7 +20,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.keys import is_name, printable
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets.clocks import ClockOffset
 from shadowhound_data_logger.datasets.episodes import EPISODE
 from shadowhound_data_logger.datasets.features import ARM_COMMANDS, ARM_JOINTS, ARM_TOPICS
@@ -28,14 +32,10 @@ from shadowhound_data_logger.datasets.lerobot import OURS, SOURCE_TABLE, Episode
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.datasets.video import join
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.keys import is_name, printable
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.catalogue.schema import Row
-from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.datasets.clocks import NEAR_NS, ClockOffset, measured
 from shadowhound_data_logger.datasets.features import (
     ACTIONS,
@@ -34,7 +35,7 @@ from shadowhound_data_logger.datasets.features import (
 )
 from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, bags_of, manifests_of
 from shadowhound_data_logger.datasets.ticks import whole_fps
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.formats.rows.schema import Row
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -44,7 +45,6 @@ from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.times import moment
 
 from daft import col  # isort: skip
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.datasets.lerobot import OURS, EpisodeRow, Lerobot
 
 if TYPE_CHECKING:

@@ -19,26 +19,26 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags import naming
 from shadowhound_data_logger.bags.contents import McapFile
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.remote import find_bags, read_manifest
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.encode.definitions import SEPARATOR
-from shadowhound_data_logger.encode.image import encode_png
-from shadowhound_data_logger.encode.payload import Job
-from shadowhound_data_logger.encode.types import MessageTypes, header_stamp_ns
-from shadowhound_data_logger.errors import BagDamaged, LakeError, Rejected
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.errors import BagDamaged, LakeError, Rejected
+from shadowhound_data_logger.core.model import Batch, ObjectInfo, Sample
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, DEFAULT_SENSORS, IMAGE, SensorSettings
+from shadowhound_data_logger.formats.definitions import SEPARATOR
+from shadowhound_data_logger.formats.image import encode_png
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage
+from shadowhound_data_logger.formats.mcap.ranges import StoredFile
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.payload import Job
+from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.gaps import BAGS, OBJECTS
 from shadowhound_data_logger.lake.prefetch import Place, Prefetch
 from shadowhound_data_logger.lake.track import Object, Track
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage
-from shadowhound_data_logger.mcap.ranges import StoredFile
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.model import Batch, ObjectInfo, Sample
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, DEFAULT_SENSORS, IMAGE, SensorSettings
 from shadowhound_data_logger.stores.base import ObjectStore
 
 if TYPE_CHECKING:

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.untrusted import from_json, path_below
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, Lerobot
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake.training import INFO
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import download
-from shadowhound_data_logger.untrusted import from_json, path_below
 
 SCHEME: Final = 's3://'
 BUCKET: Final = 'lerobot'

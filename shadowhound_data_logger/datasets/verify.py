@@ -20,18 +20,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.untrusted import from_json, is_path
 from shadowhound_data_logger.datasets.episodes import EPISODE, SOURCES
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURCE_TABLE, EpisodeRow, Lerobot
 from shadowhound_data_logger.datasets.series import pictures_of
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
 from shadowhound_data_logger.datasets.video import ssim
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import from_json, is_path
 
 THREADS: Final = 16
 FRAMES: Final = 5

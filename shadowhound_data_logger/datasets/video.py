@@ -20,8 +20,8 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import av
 import numpy as np
 
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.features import AV1, H264
-from shadowhound_data_logger.errors import LakeError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from typing import Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, ok
 from shadowhound_data_logger.spool import clock_record
 

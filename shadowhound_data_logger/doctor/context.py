@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from shadowhound_data_logger.config import ENDPOINTS, Settings
+from shadowhound_data_logger.core.config import ENDPOINTS, Settings
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.ros_arguments import NODE, read_parameters
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.ros_arguments import NODE, read_parameters
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001

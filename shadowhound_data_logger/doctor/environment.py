@@ -8,15 +8,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import ENDPOINTS, endpoint_url
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import ENDPOINTS, endpoint_url
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.spool import status
 
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')

@@ -12,12 +12,12 @@ from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.mlflow_rest import MlflowRest
 from shadowhound_data_logger.doctor import s3_put, services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped, warning
-from shadowhound_data_logger.errors import StoreError, TrackingError, TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.mlflow_rest import MlflowRest
 
 NAME: Final = 'mlflow'
 PROBE: Final = '_doctor'

@@ -8,8 +8,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
 
 
 class Role(str, Enum):

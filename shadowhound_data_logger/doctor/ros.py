@@ -9,12 +9,12 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shadowhound_data_logger.capture.middleware import Middleware
-from shadowhound_data_logger.config import SensorSettings
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.node.intake.middleware import Middleware
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import Heard

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.capture.middleware import Middleware, choose
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.doctor.machine import MAX_DOMAIN, Process, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, of_error, ok, warning
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.node.intake.middleware import Middleware, choose
 from shadowhound_data_logger.spool import status
 
 NAME: Final = 'ros.environment'

@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.doctor.context import to_child
 from shadowhound_data_logger.doctor.model import Check, Context, Result, Severity, error
 from shadowhound_data_logger.doctor.s3_put import single_requests
-from shadowhound_data_logger.errors import DataLoggerError
 from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans
 

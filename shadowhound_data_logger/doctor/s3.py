@@ -19,6 +19,15 @@ from typing import TYPE_CHECKING, Final
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
+from shadowhound_data_logger.core.errors import (
+    AccessDenied,
+    BucketMissing,
+    CredentialsRejected,
+    ObjectRefused,
+    SettingError,
+    StoreError,
+)
+from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, inbox_key
 from shadowhound_data_logger.doctor import network, s3_put, services
 from shadowhound_data_logger.doctor.model import (
     Context,
@@ -34,15 +43,6 @@ from shadowhound_data_logger.doctor.model import (
     warning,
 )
 from shadowhound_data_logger.doctor.services import ANSWER_S, TowerService
-from shadowhound_data_logger.errors import (
-    AccessDenied,
-    BucketMissing,
-    CredentialsRejected,
-    ObjectRefused,
-    SettingError,
-    StoreError,
-)
-from shadowhound_data_logger.mailbox import MAILBOX_BUCKET, inbox_key
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.stores.s3_requests import S3Requests

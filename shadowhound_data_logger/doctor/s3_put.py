@@ -11,11 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from shadowhound_data_logger.config import Settings, StoreSettings, UploadSettings
+from shadowhound_data_logger.core.config import Settings, StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.doctor.model import Result, error, measured, of_error, ok, warning
 from shadowhound_data_logger.doctor.services import ANSWER_S, CONNECT_S
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.model import SpooledObject
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.stores.s3_requests import S3Requests

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.config import ENDPOINTS
+from shadowhound_data_logger.core.config import ENDPOINTS
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.model import Context, Result, info, ok, warning

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.options import IMAGE, POINT_CLOUD
 from shadowhound_data_logger.doctor.machine import Process, number, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.options import IMAGE, POINT_CLOUD
 from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED
 from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans

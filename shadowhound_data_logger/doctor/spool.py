@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.capture.unheard import REMEDY
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.doctor.machine import command, lock_holder
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.node.intake.unheard import REMEDY
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Final
 
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, ok, warning
 from shadowhound_data_logger.spool import status
 

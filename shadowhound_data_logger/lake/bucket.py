@@ -13,14 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, TypeVar
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.catalogue.parts import CONTENT_TYPE
-from shadowhound_data_logger.catalogue.schema import BUCKET, SENSOR
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import ForeignObject
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import ForeignObject
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.formats.rows.parts import CONTENT_TYPE
+from shadowhound_data_logger.formats.rows.schema import BUCKET, SENSOR
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of

@@ -22,11 +22,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.catalogue.gaps import GAPS
-from shadowhound_data_logger.catalogue.parquet import INT32, STRING
-from shadowhound_data_logger.catalogue.schema import KEPT, OBJECTS, TableSchema
-from shadowhound_data_logger.catalogue.statistics import STATISTICS
-from shadowhound_data_logger.errors import AccessDenied
+from shadowhound_data_logger.core.errors import AccessDenied
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.formats.rows.gaps import GAPS
+from shadowhound_data_logger.formats.rows.parquet import INT32, STRING
+from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import folded
@@ -44,7 +45,6 @@ from shadowhound_data_logger.lake.live_files import (
 )
 from shadowhound_data_logger.lake.reading import arrow_schema, whole
 from shadowhound_data_logger.lake.scan import ROW, superseding, unrepeated
-from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 GRACE: Final = timedelta(hours=1)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.lake import shards
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Prefetch

@@ -18,9 +18,9 @@ import numpy as np
 import orjson
 import simplejpeg
 
-from shadowhound_data_logger.encode.statistics import INFINITE
-from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
+from shadowhound_data_logger.formats.statistics import INFINITE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,15 +16,15 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Final
 
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.untrusted import is_path
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import FOLDER, UNWRITABLE, Fetched, Verified
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import download
-from shadowhound_data_logger.untrusted import is_path
 
 THREADS: Final = 16
 AHEAD: Final = 8

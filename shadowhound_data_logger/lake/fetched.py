@@ -15,9 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Final
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.durable_files import lock
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.durable_files import lock
+from shadowhound_data_logger.core.errors import LakeError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import COLUMNS
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.schema import COLUMNS
 from shadowhound_data_logger.lake.live_files import backfilled_key
 
 FOLDER: Final = '.fetch'

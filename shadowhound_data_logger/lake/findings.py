@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from shadowhound_data_logger.untrusted import visible
+from shadowhound_data_logger.core.untrusted import visible
 
 log = logging.getLogger(__name__)
 

@@ -12,13 +12,13 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.schema import FORGOTTEN
-from shadowhound_data_logger.clock import utc
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import Day, dates_of, days, robots
 from shadowhound_data_logger.lake.reading import narrow, tables
-from shadowhound_data_logger.model import ObjectInfo
 
 NAME_COLUMNS: Final = ('bucket', 'key')
 

@@ -1,8 +1,8 @@
 """What is known of a stream between two times: what the store has, what was lost and why, and where nobody knows.
 
 ``known`` is the one question for everything that shows data or trains on it. It reads the statements of the gap journal
-(catalogue/gaps.py): the newest about each gap counts, whatever else was said before and in whatever part it lies. No gap is known
-to be none only where a watermark reaches; a robot that is off, or out of reach, leaves the time open until it tells.
+(formats/rows/gaps.py): the newest about each gap counts, whatever else was said before and in whatever part it lies. No gap is
+known to be none only where a watermark reaches; a robot that is off, or out of reach, leaves the time open until it tells.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.gaps import COMPLETE, GAP, GAPS
-from shadowhound_data_logger.catalogue.schema import BUCKET, UNDATED
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
+from shadowhound_data_logger.formats.rows.schema import BUCKET, UNDATED
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import arrow_schema, tables
-from shadowhound_data_logger.times import moment
 
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 SINKS: Final = (OBJECTS, BAGS, EVENTS)

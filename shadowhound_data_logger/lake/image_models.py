@@ -16,10 +16,10 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import LakeError, PolicyRefused
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import LakeError, PolicyRefused
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
 from shadowhound_data_logger.policies.content import check_content
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
 
 Vectors = NDArray[np.float32]
 IMAGE_MODELS: Final = ('vision_model.onnx', 'image.onnx', 'model.onnx')

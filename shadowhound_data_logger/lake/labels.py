@@ -20,20 +20,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.labels import LABEL, LABELS, MOST_TEXT, REMOVED
-from shadowhound_data_logger.catalogue.schema import BUCKET, Row
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.keys import check_name, is_name
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.keys import check_name, is_name
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MOST_TEXT, REMOVED
+from shadowhound_data_logger.formats.rows.schema import BUCKET, Row
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import days, robots
 from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
 
 MOST_IN_LAYER: Final = 50_000
 _BOX: Final = ('x', 'y', 'width', 'height')

@@ -25,15 +25,15 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.bags.fetch import Told
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, is_path, open_image
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.image_models import MOST_NUMBERS, ImageModel, Vectors
 from shadowhound_data_logger.lake.pictures import IMAGES
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, is_path, open_image
 
 FOLDER: Final = '_vectors'
 ABOUT: Final = b'shadowhound.vectors'

@@ -7,14 +7,14 @@ import time
 from statistics import median
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import ObjectRefused
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import ObjectRefused
+from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.scan import folders
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.untrusted import from_json
 
 LINK: Final = '_wifi'
 MOST_LINK_BYTES: Final = 1 << 20

@@ -17,14 +17,14 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.untrusted import from_json
+from shadowhound_data_logger.formats.rows.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.untrusted import from_json
 
 SOURCES: Final = 'shadowhound.leaves'
 """The key in a compacted part's Parquet metadata; its value: the names of its sources, as JSON, zlib, base64."""

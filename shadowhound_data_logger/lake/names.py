@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Final
 
-from shadowhound_data_logger.config import DEFAULT_SENSORS
-from shadowhound_data_logger.errors import UnknownName
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS
+from shadowhound_data_logger.core.errors import UnknownName
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import robots

@@ -14,14 +14,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, visible
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
 from shadowhound_data_logger.lake.link import LinkSample
 from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, visible
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
 THREADS: Final = 8

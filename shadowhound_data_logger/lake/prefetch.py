@@ -13,14 +13,14 @@ from functools import lru_cache
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
-from shadowhound_data_logger.errors import LakeError, NameRefused, ObjectRefused
+from shadowhound_data_logger.core.errors import LakeError, NameRefused, ObjectRefused
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, path_below
 from shadowhound_data_logger.lake.track import Object
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import damaged, twice
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, path_below
 
 if TYPE_CHECKING:
     from pathlib import Path

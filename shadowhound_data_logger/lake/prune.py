@@ -1,6 +1,6 @@
 """``lake prune``: deletes objects that rules name, and leaves a row of each that says so.
 
-In this order: a part with the rows of what goes (``catalogue/schema.py``, ``FORGOTTEN``), statements of the gap journal, the
+In this order: a part with the rows of what goes (``formats/rows/schema.py``, ``FORGOTTEN``), statements of the gap journal, the
 objects, and a mark beside the part that says that they are deleted. So a run may be killed at any moment, and two may run at
 once: a row may say for a while that an object is gone that is still there, which the next run mends, but never the reverse.
 
@@ -25,13 +25,18 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.catalogue import gaps as journal
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES
+from shadowhound_data_logger.formats.rows import gaps as journal
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
 from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -41,12 +46,7 @@ from shadowhound_data_logger.lake.live_files import Day, name_of, robots
 from shadowhound_data_logger.lake.reading import narrow, tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.mailbox import KeptFilter
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES
 
 FOREVER: Final = 'forever'
 BAGS, EVENTS = 'bags', 'events'

@@ -21,15 +21,8 @@ from typing import Any, Final, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.schema import KEPT
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket
-from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days, robots
-from shadowhound_data_logger.lake.reading import arrow_schema, tables
-from shadowhound_data_logger.lake.scan import KEY, folders, superseding
-from shadowhound_data_logger.lake.select import Wanted, wanted
-from shadowhound_data_logger.mailbox import (
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.mailbox import (
     BAG_SENSOR,
     DEFAULT_EXPIRY_NS,
     DEFAULT_PRIORITY,
@@ -46,12 +39,19 @@ from shadowhound_data_logger.mailbox import (
     read_entry,
     size_of,
 )
-from shadowhound_data_logger.model import ON_ROBOT, SpooledObject
-from shadowhound_data_logger.options import UploadSettings
-from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.core.model import ON_ROBOT, SpooledObject
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.untrusted import from_json, visible
+from shadowhound_data_logger.formats.rows.schema import KEPT
+from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.live_files import days, robots
+from shadowhound_data_logger.lake.reading import arrow_schema, tables
+from shadowhound_data_logger.lake.scan import KEY, folders, superseding
+from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import from_json, visible
 
 FINAL: Final = frozenset({'done', 'expired', 'cancelled', 'refused'})
 """States after which a request gets no answer any more."""

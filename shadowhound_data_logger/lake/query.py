@@ -21,11 +21,12 @@ from typing import Any, Final, TypeVar
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.gaps import GAP, GAPS
-from shadowhound_data_logger.catalogue.labels import LABELS
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import LakeError, ObjectRefused, PolicyRefused, StoreError
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, PolicyRefused, StoreError
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
+from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
+from shadowhound_data_logger.formats.rows.labels import LABELS
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings
@@ -37,7 +38,6 @@ from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, parse_manifest, split_id
 from shadowhound_data_logger.policies.registry import BUCKET as POLICIES
 from shadowhound_data_logger.policies.registry import PREFIX
-from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
 os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
 os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
@@ -105,7 +105,7 @@ class _Asked:
 
 
 def objects(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """One row an object, with the columns of ``catalogue/schema.py``.
+    """One row an object, with the columns of ``formats/rows/schema.py``.
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
     Without a source, of the store that the environment names. Parts that are none are left out: ``findings`` has them once

@@ -24,19 +24,19 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.catalogue.gaps import GAPS, STATEMENT_KINDS
-from shadowhound_data_logger.catalogue.labels import LABEL_KINDS, LABELS
-from shadowhound_data_logger.catalogue.parquet import DOUBLE, INT32, INT64, STRING, TIME
-from shadowhound_data_logger.catalogue.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
-from shadowhound_data_logger.catalogue.statistics import STATISTICS
-from shadowhound_data_logger.encode.statistics import NUMBERS
-from shadowhound_data_logger.errors import ObjectRefused
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.errors import ObjectRefused
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.untrusted import check_size, is_path
+from shadowhound_data_logger.formats.rows.gaps import GAPS, STATEMENT_KINDS
+from shadowhound_data_logger.formats.rows.labels import LABEL_KINDS, LABELS
+from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS
+from shadowhound_data_logger.formats.statistics import NUMBERS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.untrusted import check_size, is_path
 
 SMALL_BYTES: Final = 256 << 10
 """Up to here a file is read whole: of one-minute parts there are thousands, and a compacted day of a robot is larger."""

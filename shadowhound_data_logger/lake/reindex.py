@@ -14,21 +14,21 @@ from typing import Any, Final
 
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
-from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
-from shadowhound_data_logger.encode.statistics import ALL
-from shadowhound_data_logger.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
+from shadowhound_data_logger.formats.statistics import ALL
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import backfilled_key
 from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.scan import KEY, folders
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember, Table, table
 from shadowhound_data_logger.lake.prefetch import Prefetch
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 AlignedSample = dict[str, Any]
 POSE_GAP_NS: Final = 1_500_000_000
-"""As on the robot: between poses that are farther apart there is none (capture/pose_track.py)."""
+"""As on the robot: between poses that are farther apart there is none (node/encoding/pose_track.py)."""
 DECODED_BYTES: Final = 48 << 20
 """Of tables and archives that are kept: a batch of 1 s serves all frames of it."""
 

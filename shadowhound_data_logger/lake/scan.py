@@ -16,7 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.formats.rows.schema import OBJECTS, TableSchema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -24,7 +25,6 @@ from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_
 from shadowhound_data_logger.lake.live_files import Day, days, robots
 from shadowhound_data_logger.lake.reading import SMALL_BYTES, Only
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.model import ObjectInfo
 
 PARTS_AT_A_TIME: Final = 720
 """The most small parts in a group: half a day of a robot."""

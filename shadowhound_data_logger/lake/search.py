@@ -28,18 +28,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.errors import ForeignObject, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.errors import ForeignObject, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.model import SpooledObject
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import robots
 from shadowhound_data_logger.lake.names import check_name_of
 from shadowhound_data_logger.lake.select import Wanted
-from shadowhound_data_logger.model import SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.times import moment
-from shadowhound_data_logger.untrusted import MOST_SUMMARY_BYTES, from_json
 
 MISSION, EVENT, ERROR, LABEL_KIND = 'mission', 'event', 'error', 'label'
 KINDS: Final = (MISSION, EVENT, ERROR, LABEL_KIND)

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.catalogue.schema import UNDATED
-from shadowhound_data_logger.clock import FUTURE_SLACK_NS, SECOND, utc
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.times import moment
+from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.times import moment
+from shadowhound_data_logger.formats.rows.schema import UNDATED
 
 DAY: Final = timedelta(days=1)
 LONGEST_BATCH_NS: Final = 3600 * SECOND

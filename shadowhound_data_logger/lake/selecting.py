@@ -10,9 +10,11 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shadowhound_data_logger.catalogue.schema import SENSOR
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.untrusted import MOST_MEMBERS
+from shadowhound_data_logger.formats.rows.schema import SENSOR
 from shadowhound_data_logger.lake import labels, query  # first: it turns Daft's telemetry off
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
@@ -22,8 +24,6 @@ from shadowhound_data_logger.lake.pull import bring
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.untrusted import MOST_MEMBERS
 
 from daft import col  # isort: skip
 

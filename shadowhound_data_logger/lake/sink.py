@@ -33,20 +33,20 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 import pyarrow as pa
 import urllib3
 
-from shadowhound_data_logger.catalogue.gaps import GAPS, WITHDRAWN
-from shadowhound_data_logger.catalogue.labels import LABELS, REMOVED
-from shadowhound_data_logger.catalogue.schema import FORGOTTEN, OBJECTS, TableSchema
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.retry import backoff, steadily
+from shadowhound_data_logger.core.untrusted import from_json, visible
+from shadowhound_data_logger.formats.rows.gaps import GAPS, WITHDRAWN
+from shadowhound_data_logger.formats.rows.labels import LABELS, REMOVED
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake import search
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import days, folder_of, name_of, robots
 from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.retry import backoff, steadily
-from shadowhound_data_logger.untrusted import from_json, visible
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.config import home
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.config import home
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.missions.replay import open_tracking
 from shadowhound_data_logger.missions.tracking import MlflowTracking
 

@@ -1,6 +1,6 @@
 """When the numbers in the objects were so: from a condition such as ``imu.accelerometer.2 > 15`` to ranges of time.
 
-A name is that of a sensor and of a field (encode/statistics.py), or what several fields begin with: then any of them will do.
+A name is that of a sensor and of a field (formats/statistics.py), or what several fields begin with: then any of them will do.
 A plain name is about each message; ``max(...)`` and the other statistics are about each object, a batch of messages, as a whole.
 ``and``, ``or`` and parentheses join comparisons. What is missing, NaN or infinite compares as false.
 
@@ -23,13 +23,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.catalogue.statistics import STATISTICS
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.conditions import COMPARISONS, NUMBER
-from shadowhound_data_logger.encode.image import of_jpeg
-from shadowhound_data_logger.encode.pointcloud import of_points
-from shadowhound_data_logger.encode.records import AT_ONCE
-from shadowhound_data_logger.encode.statistics import (
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.conditions import COMPARISONS, NUMBER
+from shadowhound_data_logger.core.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
+from shadowhound_data_logger.formats.image import of_jpeg
+from shadowhound_data_logger.formats.pointcloud import of_points
+from shadowhound_data_logger.formats.records import AT_ONCE
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS
+from shadowhound_data_logger.formats.statistics import (
     ALL,
     MEAN_ERROR,
     NUMBERS,
@@ -38,7 +40,6 @@ from shadowhound_data_logger.encode.statistics import (
     covers,
     values_of,
 )
-from shadowhound_data_logger.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
@@ -48,7 +49,6 @@ from shadowhound_data_logger.lake.live_files import robots
 from shadowhound_data_logger.lake.reading import Only, narrow, tables
 from shadowhound_data_logger.lake.scan import catalogue_rows, folders, planned
 from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, wanted
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES
 
 ALLOWED: Final = (
     "comparisons such as 'imu.accelerometer.2 > 15' or 'max(states.foot_force) > 200': sensor.field, or one of first last min "

@@ -1,4 +1,4 @@
-"""What a catalogue says that a store holds: every object that has a row, for ``ship/audit.py`` to ask for.
+"""What a catalogue says that a store holds: every object that has a row, for ``shipping/audit.py`` to ask for.
 
 A store that lost a part of its own catalogue does not know what else it lost. So the catalogue of another store, fetched into a
 folder, can be laid beside it.
@@ -20,12 +20,12 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
-from shadowhound_data_logger.durable_files import lock
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.durable_files import lock
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.model import ObjectInfo
 
 if TYPE_CHECKING:
     from typing_extensions import Self

@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from shadowhound_data_logger.durable_files import flock, replacing, sync
-from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.untrusted import check_size
+from shadowhound_data_logger.core.durable_files import flock, replacing, sync
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.untrusted import check_size
 
 log = logging.getLogger(__name__)
 

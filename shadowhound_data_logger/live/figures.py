@@ -7,8 +7,8 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND, Clock, utc
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.clock import SECOND, Clock, utc
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
 from shadowhound_data_logger.spool.status import read as read_status

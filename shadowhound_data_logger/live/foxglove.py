@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final, TypeGuard
 
-from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem
 
 PROTOCOLS: Final = ('foxglove.sdk.v1', 'foxglove.websocket.v1')

@@ -21,9 +21,9 @@ from typing import Any, Final
 import numpy as np
 import simplejpeg
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.untrusted import check_pixels, from_json
 from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
-from shadowhound_data_logger.untrusted import check_pixels, from_json
 
 log = logging.getLogger(__name__)
 

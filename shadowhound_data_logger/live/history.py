@@ -28,13 +28,20 @@ import numpy as np
 import simplejpeg
 
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.encode.statistics import INFINITE
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import BagDamaged, DataLoggerError, LakeError, Rejected, SettingError
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import BagDamaged, DataLoggerError, LakeError, Rejected, SettingError
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.core.model import ON_ROBOT
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.core.untrusted import check_pixels, visible
+from shadowhound_data_logger.formats.mcap.index import McapIndex, read_summary
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import Ranged
+from shadowhound_data_logger.formats.rows.schema import BUCKET
+from shadowhound_data_logger.formats.statistics import INFINITE
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.live.kept import KeptSource, SpoolKept, StoreKept, offers
 from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, frames, points_items, series, table_item
@@ -48,14 +55,7 @@ from shadowhound_data_logger.live.past import (
     StorePast,
     dates_between,
 )
-from shadowhound_data_logger.mailbox import KeptFilter
-from shadowhound_data_logger.mcap.index import McapIndex, read_summary
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import Ranged
-from shadowhound_data_logger.model import ON_ROBOT
-from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.stores import open_store
-from shadowhound_data_logger.untrusted import check_pixels, visible
 
 MOST_SPAN_NS: Final = 50 * 3600 * SECOND
 """Of a timeline."""

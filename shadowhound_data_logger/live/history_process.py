@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
 
 IDLE_S: Final = 60.0
 ANSWER_S: Final = 45.0

@@ -16,13 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import LakeError, SpoolError
-from shadowhound_data_logger.mailbox import KeptFilter, offer
-from shadowhound_data_logger.model import ON_ROBOT, State
-from shadowhound_data_logger.options import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import LakeError, SpoolError
+from shadowhound_data_logger.core.mailbox import KeptFilter, offer
+from shadowhound_data_logger.core.model import ON_ROBOT, State
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.status import read as read_status

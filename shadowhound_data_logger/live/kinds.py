@@ -19,12 +19,12 @@ import numpy as np
 import orjson
 import simplejpeg
 
-from shadowhound_data_logger.encode.image import JPEG_MAGIC
-from shadowhound_data_logger.encode.pointcloud import xyz_of
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
-from shadowhound_data_logger.untrusted import check_pixels
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from shadowhound_data_logger.core.untrusted import check_pixels
+from shadowhound_data_logger.formats.image import JPEG_MAGIC
+from shadowhound_data_logger.formats.pointcloud import xyz_of
+from shadowhound_data_logger.formats.types import MessageTypes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -26,21 +26,21 @@ import numpy as np
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.catalogue.gaps import GAP
-from shadowhound_data_logger.clock import SECOND, SystemClock, utc
-from shadowhound_data_logger.config import home, store_settings
-from shadowhound_data_logger.errors import BagDamaged, LakeError, SpoolError, StoreError
+from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
+from shadowhound_data_logger.core.config import home, store_settings
+from shadowhound_data_logger.core.errors import BagDamaged, LakeError, SpoolError, StoreError
+from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, MOST_OBJECT_BYTES, is_path
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
+from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows.gaps import GAP
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
-from shadowhound_data_logger.mcap.ranges import LocalFile, Ranged, StoredFile
-from shadowhound_data_logger.model import State
-from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import HERE
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.stores import open_reader, open_store
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, MOST_OBJECT_BYTES, is_path
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -23,7 +23,7 @@ import aiohttp
 import numpy as np
 import orjson
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.access import TokenRefused, token_of
 from shadowhound_data_logger.live.kinds import FULL, KINDS, MOST_NAMES, LiveItem, check_jpeg
 from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE

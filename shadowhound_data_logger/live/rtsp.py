@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import simplejpeg
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
 from shadowhound_data_logger.live.h264 import BLOCKS_4_0, H264_AGAIN_S, H264Element, fitted, of_size
 from shadowhound_data_logger.live.kinds import LiveItem

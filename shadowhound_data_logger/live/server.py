@@ -28,11 +28,11 @@ from typing import TYPE_CHECKING, Any, Final
 from aiohttp import WSCloseCode, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from shadowhound_data_logger import heap
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.errors import DataLoggerError, NodeUnavailable
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core import heap
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.errors import DataLoggerError, NodeUnavailable
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.live.access import (
     COOKIE,
     LASTS_S,

@@ -18,16 +18,16 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import Rejected
-from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, clouds, frames, series
-from shadowhound_data_logger.model import Taken
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
 from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

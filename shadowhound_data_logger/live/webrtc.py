@@ -31,10 +31,10 @@ from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCRtp
 from aiortc.exceptions import InvalidAccessError, InvalidStateError, OperationError
 from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPacket, unpack_remb_fci
 
+from shadowhound_data_logger.core.untrusted import check_pixels
+from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.live.h264 import H264_AGAIN_S, KEY_EVERY_S, H264Element, H264Encoder
 from shadowhound_data_logger.live.kinds import LiveItem
-from shadowhound_data_logger.untrusted import check_pixels
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

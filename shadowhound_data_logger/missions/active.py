@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock, SystemClock
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock, SystemClock
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from shadowhound_data_logger.errors import TrackingRefused
+from shadowhound_data_logger.core.errors import TrackingRefused
 from shadowhound_data_logger.missions.story import Point
 from shadowhound_data_logger.missions.tracking import RUN_GONE, Tracking
 

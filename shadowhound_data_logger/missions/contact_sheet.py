@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 
 from PIL import Image, ImageDraw, ImageFont
 
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.untrusted import open_image
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.untrusted import open_image
 
 WIDTH: Final = 800
 MOST: Final = 20

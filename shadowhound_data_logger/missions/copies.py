@@ -11,7 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.core.errors import Rejected
 
 MIN_FREE_BYTES: Final = 64 << 20
 """Below it no file is kept: the journal's few bytes are worth more."""

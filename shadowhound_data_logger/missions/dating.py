@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, Clock
-from shadowhound_data_logger.dating import Dating
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock
+from shadowhound_data_logger.core.dating import Dating
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import MissionFolder
 

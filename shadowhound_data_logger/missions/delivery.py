@@ -17,9 +17,9 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.errors import TrackingRefused
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared
 from shadowhound_data_logger.missions.batch import send

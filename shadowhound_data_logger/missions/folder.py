@@ -26,10 +26,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import MAX_NAME_BYTES, check_name
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.keys import MAX_NAME_BYTES, check_name
 from shadowhound_data_logger.missions.journal import Line, dated, read
 
 MISSIONS: Final = 'missions'

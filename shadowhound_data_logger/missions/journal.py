@@ -17,8 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.durable_files import lock
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.durable_files import lock
 
 CHUNK: Final = 1 << 20
 TAIL_BYTES: Final = 64 << 10

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
 from shadowhound_data_logger.missions.batch import MOST_POINTS

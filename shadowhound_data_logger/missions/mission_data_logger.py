@@ -18,10 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import home as home_of
-from shadowhound_data_logger.errors import NameRefused, SettingError
-from shadowhound_data_logger.keys import check_name
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import home as home_of
+from shadowhound_data_logger.core.errors import NameRefused, SettingError
+from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.new_run import RunRequests
@@ -29,7 +30,6 @@ from shadowhound_data_logger.missions.overview import Report, has_arrived, repor
 from shadowhound_data_logger.missions.recorder import Beginning, Mission
 from shadowhound_data_logger.missions.story import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
-from shadowhound_data_logger.worker import Worker
 
 log = logging.getLogger(__name__)
 

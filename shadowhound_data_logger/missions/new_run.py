@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit, urlunsplit
 
-from shadowhound_data_logger.durable_files import lock
-from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.keys import is_name
+from shadowhound_data_logger.core.durable_files import lock
+from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.mlflow_rest import LOGIN, MlflowRest
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
 from shadowhound_data_logger.missions.story import run_request
 from shadowhound_data_logger.missions.tracking import MISSION_TAG
-from shadowhound_data_logger.mlflow_rest import LOGIN, MlflowRest
 
 log = logging.getLogger(__name__)
 

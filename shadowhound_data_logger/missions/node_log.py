@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.durable_files import replacing
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.missions import copies, journal
 from shadowhound_data_logger.missions.active import Active
 from shadowhound_data_logger.missions.odometer import MAX_SPEED_MPS, Odometer, Pose

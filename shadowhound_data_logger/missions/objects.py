@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import SpoolError, StoreUnavailable
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import Clock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import SpoolError, StoreUnavailable
+from shadowhound_data_logger.core.model import Binding, DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
 from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
-from shadowhound_data_logger.model import Binding, DataObject
-from shadowhound_data_logger.ship.uploader import delivering
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool

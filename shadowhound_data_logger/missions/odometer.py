@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot, isfinite
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 
 MAX_SPEED_MPS: Final = 5.0
 """No Go2 walks faster."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import iso
+from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json

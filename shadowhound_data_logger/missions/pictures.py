@@ -19,12 +19,12 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.untrusted import csv_encoding
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
 from shadowhound_data_logger.missions.folder import MissionFolder, write_json
 from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE, named
-from shadowhound_data_logger.untrusted import csv_encoding
 
 log = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND, Clock
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.missions import copies, values
 from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, stamped

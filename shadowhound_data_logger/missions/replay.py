@@ -25,11 +25,12 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.dating import Dating
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.dating import Dating
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import DataLoggerError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.retry import backoff
 from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Drawing
@@ -37,7 +38,6 @@ from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, mis
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.overview import LOCK, STATE
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
-from shadowhound_data_logger.retry import backoff
 from shadowhound_data_logger.spool import clock_record
 
 LONGEST_PAUSE_S: Final = 60.0

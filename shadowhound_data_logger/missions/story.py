@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.clock import SECOND, iso, utc
+from shadowhound_data_logger.core.clock import SECOND, iso, utc
 from shadowhound_data_logger.missions.folder import MissionSent, Run, run_name, stamped
 from shadowhound_data_logger.missions.values import MAX_PARAM, MAX_STEP
 

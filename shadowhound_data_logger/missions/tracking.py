@@ -17,11 +17,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from shadowhound_data_logger.config import ENDPOINTS
-from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.config import ENDPOINTS
+from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.tls import causes, distrust
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
-from shadowhound_data_logger.tls import causes, distrust
 
 MISSION_TAG: Final = 'shadowhound.mission_id'
 DUPLICATE_TAG: Final = 'shadowhound.duplicate_of'

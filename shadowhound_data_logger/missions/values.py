@@ -13,7 +13,7 @@ import posixpath
 import re
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.core.errors import Rejected
 
 MAX_KEY: Final = 250
 MAX_KEYS: Final = 50

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
 from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
-from shadowhound_data_logger.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
 
 MOST_HEADER_BYTES: Final = 1 << 20
 """Of a safetensors file: enough for some 8,000 tensors. The library's own bound of 100 MB would take gigabytes to parse."""

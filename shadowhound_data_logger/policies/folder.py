@@ -26,8 +26,9 @@ from typing import Any, Final
 
 import orjson
 
-from shadowhound_data_logger import durable_files
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core import durable_files
+from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core.untrusted import from_strict_json
 from shadowhound_data_logger.policies.content import check_files
 from shadowhound_data_logger.policies.manifest import (
     MANIFEST,
@@ -37,7 +38,6 @@ from shadowhound_data_logger.policies.manifest import (
     split_id,
 )
 from shadowhound_data_logger.policies.trust import ROOT
-from shadowhound_data_logger.untrusted import from_strict_json
 
 MOST_STATE_BYTES: Final = 4 << 20
 MOST_REMEMBERED: Final = 1000

@@ -21,9 +21,9 @@ from securesystemslib.signer import CryptoSigner, SSlibKey
 from tuf.api.exceptions import RepositoryError
 from tuf.api.metadata import Metadata, Targets
 
-from shadowhound_data_logger.errors import PolicyError
-from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.untrusted import from_strict_json
+from shadowhound_data_logger.core.errors import PolicyError
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.untrusted import from_strict_json
 
 PRIVATE: Final = '.key'
 PUBLIC: Final = '.pub'

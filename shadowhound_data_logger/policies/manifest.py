@@ -14,9 +14,9 @@ from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import PolicyRefused
-from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.untrusted import from_strict_json, is_path
+from shadowhound_data_logger.core.errors import PolicyRefused
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.untrusted import from_strict_json, is_path
 
 FORMAT: Final = 1
 MANIFEST: Final = 'manifest.json'

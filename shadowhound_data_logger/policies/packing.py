@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import ForeignObject, PolicyError, PolicyRefused
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import ForeignObject, PolicyError, PolicyRefused
+from shadowhound_data_logger.core.model import SpooledObject
+from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.manifest import (
     FORMAT,
@@ -27,9 +29,7 @@ from shadowhound_data_logger.policies.manifest import (
 from shadowhound_data_logger.policies.registry import BUCKET, ID_TAG, ROBOTS_TAG, MlflowRegistry, source_of
 from shadowhound_data_logger.policies.smoke import open_model, worst_difference
 from shadowhound_data_logger.policies.trust import MISSING_PACKAGE, target_of
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.untrusted import from_json
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.policies.repository import Repository

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol
 from urllib.parse import urlencode
 
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused, TrackingRefused
-from shadowhound_data_logger.keys import is_name
-from shadowhound_data_logger.mlflow_rest import MlflowRest
+from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused, TrackingRefused
+from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.mlflow_rest import MlflowRest
 
 BUCKET: Final = 'lerobot'
 PREFIX: Final = 'policies'

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import config, durable_files
-from shadowhound_data_logger.errors import PolicyError
+from shadowhound_data_logger.core import config, durable_files
+from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 

@@ -26,10 +26,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
-from shadowhound_data_logger.keys import printable
+from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, SmokeSample, parse_manifest
-from shadowhound_data_logger.untrusted import from_json
 
 SMOKE_S: Final = 60.0
 MEMORY_BYTES: Final = 8 << 30

@@ -15,18 +15,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import durable_files
-from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT
-from shadowhound_data_logger.errors import DataLoggerError, ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.options import GIBI
+from shadowhound_data_logger.core import durable_files
+from shadowhound_data_logger.core.errors import DataLoggerError, ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.options import GIBI
+from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.content import files_of
 from shadowhound_data_logger.policies.folder import PolicyFolder, newest_of
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, parse_manifest, split_id
 from shadowhound_data_logger.policies.registry import BUCKET, PolicyRegistry, RegisteredVersion, choose, folder_of
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, is_enough, run_smoke
-from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
 

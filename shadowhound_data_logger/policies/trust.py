@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote
 
-from shadowhound_data_logger import durable_files
-from shadowhound_data_logger.clock import FUTURE_SLACK_NS, SECOND, utc
-from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, PolicyError, PolicyRefused
+from shadowhound_data_logger.core import durable_files
+from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
+from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, PolicyError, PolicyRefused
+from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.policies.registry import BUCKET, PREFIX
-from shadowhound_data_logger.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 
 if TYPE_CHECKING:

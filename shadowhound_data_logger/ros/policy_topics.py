@@ -22,11 +22,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.running import judge
 from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
-from shadowhound_data_logger.untrusted import from_json
 
 log = logging.getLogger(__name__)
 

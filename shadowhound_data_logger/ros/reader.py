@@ -31,9 +31,9 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from rosidl_generator_py.import_type_support_impl import UnsupportedTypeSupport
 from std_msgs.msg import String
 
-from shadowhound_data_logger.clock import MAX_AGE_NS
-from shadowhound_data_logger.keys import printable
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.clock import MAX_AGE_NS
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.ros import librcl
 from shadowhound_data_logger.ros.endpoints import Endpoint, Plan
 

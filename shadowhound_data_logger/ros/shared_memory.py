@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.durable_files import lock
+from shadowhound_data_logger.core.durable_files import lock
 from shadowhound_data_logger.ros import port_guard
 from shadowhound_data_logger.ros.port_guard import FOLDER, settle
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.durable_files import replacing
-from shadowhound_data_logger.untrusted import from_json
+from shadowhound_data_logger.core.durable_files import replacing
+from shadowhound_data_logger.core.untrusted import from_json
 
 log = logging.getLogger(__name__)
 

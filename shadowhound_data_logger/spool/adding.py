@@ -17,10 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State, waits_for
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.keys import check_key
+from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State, waits_for
 from shadowhound_data_logger.spool.binding import free_key
 from shadowhound_data_logger.spool.files import Tree, content_sha256, describe, description, facts
 from shadowhound_data_logger.spool.index import Index

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import check_key, check_name
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.keys import check_key, check_name
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.files import Tree, description_of

@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.keys import check_key, unique
-from shadowhound_data_logger.model import Binding, SpooledObject, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.keys import check_key, unique
+from shadowhound_data_logger.core.model import Binding, SpooledObject, State
 from shadowhound_data_logger.spool.files import Tree, describe
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.object_table import MISSING, spooled

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger import metadata_words as words
+from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table, after
 

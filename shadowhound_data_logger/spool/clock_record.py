@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import iso
-from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.durable_files import replacing
+from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.durable_files import replacing
 
 log = logging.getLogger(__name__)
 

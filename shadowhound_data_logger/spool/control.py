@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.errors import NodeUnavailable
+from shadowhound_data_logger.core.errors import NodeUnavailable
 
 NAME: Final = 'control.sock'
 MAX_REQUEST_BYTES: Final = 1 << 16

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.spool.index import Index
 
 PAGE: Final = 256

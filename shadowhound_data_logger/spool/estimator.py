@@ -21,7 +21,7 @@ from operator import sub
 from statistics import fmean, median, pstdev
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.spool.account_rows import RhythmRow
 
 LEARN: Final = 200

@@ -26,10 +26,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 
 log = logging.getLogger(__name__)
 

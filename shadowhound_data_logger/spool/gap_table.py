@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, UNTIMED, Gap, GapRow, TakenBack, Watermark, split
 from shadowhound_data_logger.spool.table import Table
 

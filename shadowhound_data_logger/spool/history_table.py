@@ -6,8 +6,8 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.model import ObjectInfo, State
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.model import ObjectInfo, State
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table, after, split
 

@@ -14,8 +14,8 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool.account_table import AccountTable
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.gap_table import GapTable

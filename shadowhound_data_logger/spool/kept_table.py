@@ -7,8 +7,8 @@ import sqlite3
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.object_table import ObjectTable
 from shadowhound_data_logger.spool.table import Table

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 

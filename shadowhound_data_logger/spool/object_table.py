@@ -15,8 +15,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.model import (
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.model import (
     EVENTS_WHEN,
     UPLOAD_WHEN,
     Binding,

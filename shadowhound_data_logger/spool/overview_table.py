@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.history_table import CATALOG
 from shadowhound_data_logger.spool.object_table import IN_SPOOL
 from shadowhound_data_logger.spool.table import Table, after

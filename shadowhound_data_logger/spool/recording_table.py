@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow
+from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceRow
 from shadowhound_data_logger.spool.table import Table
 
 

@@ -10,7 +10,7 @@ that at a clean stop only). Then a part that is whole by its own description is 
 names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
 other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
 
-This mends a spool; ``bags/recovery.py`` decides about a bag, ``mcap/recovery.py`` repairs the bytes of a slice.
+This mends a spool; ``bags/recovery.py`` decides about a bag, ``formats/mcap/recovery.py`` repairs the bytes of a slice.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.durable_files import fingerprint, lock
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.durable_files import fingerprint, lock
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said

@@ -18,13 +18,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS
-from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.dating import Dating
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.keys import dated, unsynced
-from shadowhound_data_logger.model import Binding, DataObject, HeldObject, SpooledObject
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.dating import Dating
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.keys import dated, unsynced
+from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, SpooledObject
 from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.spool import Spool
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 

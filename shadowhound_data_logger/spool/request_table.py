@@ -45,7 +45,7 @@ class RequestRow:
     """That it found."""
     bytes: int = 0
     gone: str = '{}'
-    """JSON: what it would have found, had that not left before (``ship/requests.py``)."""
+    """JSON: what it would have found, had that not left before (``shipping/requests.py``)."""
     answers: int = 0
     """The number of the newest answer that is durable."""
     told: str = ''

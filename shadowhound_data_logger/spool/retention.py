@@ -13,9 +13,9 @@ from pathlib import Path
 from sqlite3 import Row
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import KeepSettings, SpoolSettings
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import KeepSettings, SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.ballast import BALLAST_BYTES
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.errors import SpoolError
 
 SCHEMA: Final = Path(__file__).with_name('schema.sql').read_text(encoding='utf-8')
 SCHEMA_VERSION: Final = 1

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-from shadowhound_data_logger.clock import Clock
-from shadowhound_data_logger.durable_files import lock
+from shadowhound_data_logger.core.clock import Clock
+from shadowhound_data_logger.core.durable_files import lock
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index

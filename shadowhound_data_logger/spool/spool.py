@@ -19,11 +19,11 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.clock import SECOND, Clock
-from shadowhound_data_logger.config import KeepSettings, SpoolSettings
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
+from shadowhound_data_logger.core.clock import SECOND, Clock
+from shadowhound_data_logger.core.config import KeepSettings, SpoolSettings
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts

@@ -14,9 +14,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.clock import SECOND, Clock, iso
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.clock import SECOND, Clock, iso
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.usage import usage_of
 

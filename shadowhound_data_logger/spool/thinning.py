@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.durable_files import sync
-from shadowhound_data_logger.model import FileBody, State
+from shadowhound_data_logger.core.durable_files import sync
+from shadowhound_data_logger.core.model import FileBody, State
 from shadowhound_data_logger.spool.adding import link_or_copy
 from shadowhound_data_logger.spool.binding import free_key, renew
 from shadowhound_data_logger.spool.files import Tree, content_sha256

@@ -6,8 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from shadowhound_data_logger.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.index import Index
 
 

@@ -19,10 +19,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.keys import check_key
-from shadowhound_data_logger.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject, State
+from shadowhound_data_logger.core.keys import check_key
+from shadowhound_data_logger.core.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject, State
+from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
-from shadowhound_data_logger.worker import Worker
 
 COMMIT_S: Final = 0.1
 """Least time between two commits."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:

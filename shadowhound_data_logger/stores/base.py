@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.errors import ObjectRefused
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.errors import ObjectRefused
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.content import warn_of
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Content:
 class ObjectStore(Protocol):
     """Puts, gets and lists objects in buckets. Thread-safe after ``open``; life: New; open once; use from any thread; close once.
 
-    Each request is one try (``retry.steadily`` makes it more). Errors are those of ``shadowhound_data_logger.errors``:
+    Each request is one try (``retry.steadily`` makes it more). Errors are those of ``shadowhound_data_logger.core.errors``:
     StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other
     exception leaves a store. Whatever reads raises ObjectRefused with ``data['reason'] == 'missing'`` where there is no such
     object, and ``'name'`` for a key that can be no path.

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Final
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.keys import check_key, check_name
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.untrusted import is_path, visible
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.keys import check_key, check_name
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.untrusted import is_path, visible
 
 _PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
 """Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""

@@ -20,8 +20,8 @@ from botocore.credentials import Credentials, ReadOnlyCredentials
 from botocore.exceptions import BotoCoreError, CredentialRetrievalError, NoCredentialsError
 from botocore.session import Session
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import SettingError
 
 REREAD_S: Final = 1.0
 """Refused keys are not read again sooner: a file is read, a program (``credential_process``) run."""

@@ -18,10 +18,11 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.durable_files import fingerprint, flock, sync
-from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.durable_files import fingerprint, flock, sync
+from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.untrusted import from_json, is_path
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
@@ -33,7 +34,6 @@ from shadowhound_data_logger.stores.content import (
     paths,
     warn_of,
 )
-from shadowhound_data_logger.untrusted import from_json, is_path
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'

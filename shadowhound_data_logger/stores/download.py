@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
-from shadowhound_data_logger.errors import ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.core.errors import ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
 

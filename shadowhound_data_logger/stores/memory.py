@@ -8,10 +8,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.errors import ObjectRefused
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import ObjectRefused
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,

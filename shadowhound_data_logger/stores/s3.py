@@ -20,9 +20,8 @@ from enum import Enum
 from operator import attrgetter
 from typing import IO, Final, TypeVar
 
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import (
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
     CredentialsRejected,
@@ -30,12 +29,13 @@ from shadowhound_data_logger.errors import (
     ObjectRefused,
     StoreUnavailable,
 )
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.untrusted import is_path
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.base import Content, joined
 from shadowhound_data_logger.stores.content import check_read, check_target, chunks, identical_or_foreign, opened, paths, warn_of
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
-from shadowhound_data_logger.untrusted import is_path
 
 STREAM_BYTES: Final = 4 << 20
 """Larger objects are read twice from the disk (hash, send) instead of once into memory, of which each thread takes so much."""

@@ -15,7 +15,7 @@ from botocore import exceptions as boto
 from botocore.parsers import ResponseParserError
 from urllib3 import exceptions as urllib3
 
-from shadowhound_data_logger.errors import (
+from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
     CredentialsRejected,
@@ -24,7 +24,7 @@ from shadowhound_data_logger.errors import (
     StoreUnavailable,
     StoreUntrusted,
 )
-from shadowhound_data_logger.tls import causes, distrust, distrust_told
+from shadowhound_data_logger.core.tls import causes, distrust, distrust_told
 
 REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, urllib3.HTTPError, OSError, ValueError)
 """Everything a request through botocore can raise; ValueError comes of a header that broke off.

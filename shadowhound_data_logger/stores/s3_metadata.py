@@ -12,7 +12,7 @@ from email.errors import HeaderParseError
 from email.header import decode_header, make_header
 from typing import Final
 
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores.content import object_metadata
 
 _PLAIN: Final = re.compile(r'(?!=\?)([!-~]+( [!-~]+)*)?')

@@ -18,8 +18,8 @@ from typing import Any, Final
 
 from botocore.exceptions import ClientError
 
-from shadowhound_data_logger.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores.content import Part, check_content, opened, parts
 from shadowhound_data_logger.stores.s3_errors import code_of, status_of
 from shadowhound_data_logger.stores.s3_metadata import to_headers

@@ -20,23 +20,23 @@ import obstore
 from obstore import exceptions as refused
 from obstore.store import S3Store as Client
 
-from shadowhound_data_logger.config import endpoint_url
-from shadowhound_data_logger.errors import (
+from shadowhound_data_logger.core.config import endpoint_url
+from shadowhound_data_logger.core.errors import (
     BucketMissing,
     CredentialsRejected,
     ObjectRefused,
     StoreError,
     StoreUnavailable,
 )
-from shadowhound_data_logger.model import ObjectInfo, Put, SpooledObject
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.retry import steadily
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read, paths, warn_of
 from shadowhound_data_logger.stores.s3_metadata import from_headers
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.bandwidth import Pace
+    from shadowhound_data_logger.stores.bandwidth import Pace
     from shadowhound_data_logger.stores.s3 import S3Store
 
 _CONNECT: Final = timedelta(seconds=10)

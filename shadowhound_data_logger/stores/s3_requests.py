@@ -17,10 +17,10 @@ from botocore.exceptions import BotoCoreError, ClientError
 from botocore.handlers import add_expect_header
 from botocore.session import Session
 
-from shadowhound_data_logger.bandwidth import Body, Pace
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, CredentialsRejected, SettingError, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.stores.bandwidth import Body, Pace
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
 from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted

@@ -17,8 +17,8 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Ring
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.options import BagSettings, EventSettings
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import EVENT, Losses
 from shadowhound_data_logger.spool.writer import SpoolWriter

@@ -11,14 +11,14 @@ from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
-from shadowhound_data_logger.durable_files import fingerprint
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import MessageFilter, RecordedMessage, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.durable_files import fingerprint
+from shadowhound_data_logger.core.model import SpooledObject
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.base import ObjectStore
 
 T0 = 1_760_788_800_000_000_000

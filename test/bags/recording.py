@@ -18,9 +18,9 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import Taken
-from shadowhound_data_logger.options import BagSettings
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.options import BagSettings
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Spool

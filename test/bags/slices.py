@@ -12,8 +12,8 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Chunk, Footer, MessageIndex, SummaryOffset
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 STRING = 'string data\n'
 TALK = Channel('/talk', 'std_msgs/msg/String', 'ros2msg', STRING, 'RIHS01_' + 'a' * 64, '')

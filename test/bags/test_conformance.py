@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
 from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
-from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 FOUND = tuple(sorted(variants(), key=lambda each: natural(f'{each[0]}.mcap')))

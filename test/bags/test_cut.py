@@ -12,6 +12,7 @@ from bags.real_bags import IMU, NAME, STEP_NS, T0, by_rosbags, messages_of, put_
 from click.testing import CliRunner
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from ruamel.yaml import YAML
+from shadowhound_tower.embedded import Tower
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
@@ -20,12 +21,11 @@ from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
-from shadowhound_data_logger.mcap.messages import RecordedMessage
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.errors import BagDamaged, BagError, SettingError
+from shadowhound_data_logger.formats.mcap.messages import RecordedMessage
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore

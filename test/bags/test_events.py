@@ -12,8 +12,8 @@ from spool.making import NOON_NS
 
 from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.model import DataObject, RecordingRows
-from shadowhound_data_logger.options import EventSettings
+from shadowhound_data_logger.core.model import DataObject, RecordingRows
+from shadowhound_data_logger.core.options import EventSettings
 
 
 def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:

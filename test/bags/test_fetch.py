@@ -16,11 +16,11 @@ import pytest
 from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from shadowhound_data_logger import retry
 from shadowhound_data_logger.bags.fetch import Told, fetch
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
-from shadowhound_data_logger.errors import BagDamaged, BagError, StoreUnavailable
+from shadowhound_data_logger.core import retry
+from shadowhound_data_logger.core.errors import BagDamaged, BagError, StoreUnavailable
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore

@@ -21,9 +21,9 @@ from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
 from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
 from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_name
-from shadowhound_data_logger.mcap.index import read_index, read_summary
-from shadowhound_data_logger.mcap.ranges import LocalFile
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
+from shadowhound_data_logger.formats.mcap.index import read_index, read_summary
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 

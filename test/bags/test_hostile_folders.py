@@ -9,7 +9,7 @@ import pytest
 from bags.recording import ROBOT, desk, manifest
 from bags.slices import closed, fill, messages
 
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 BAG = 'patrol_20251018_120000'
 

@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.manifest import (
     TriggerOf,
     topics_of,
 )
-from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.core.errors import BagDamaged
 
 ENTRY = SliceEntry('bag_0.mcap', 'thor/rosbags/bag/bag_0.mcap', 1000, 'ab' * 32, 5, 10, 20, {'/imu': 5}, {'/imu': 1})
 WHOLE = Manifest(

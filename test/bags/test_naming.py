@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from shadowhound_data_logger.bags.naming import bag_name, key_of, slice_file, slice_number, unsynced_name
-from shadowhound_data_logger.keys import MAX_BAG_BYTES, check_key, check_name
+from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_key, check_name
 
 NOON_NS = 1_760_788_800 * 10**9
 BOOT = '3e2c1f6a-8a4e-4d0e-9d0a-0f6a5b7c9d11'

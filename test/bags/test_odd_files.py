@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.cut import Choice, cut_folder
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
 
 SCHEMA, CHANNEL = Schema(1, STRING[2], STRING[1], STRING[0]), Channel(1, '/x', 'cdr', {}, 1)
 OTHER = Channel(2, '/y', 'cdr', {'k': 'v'}, 1)

@@ -12,11 +12,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.mcap.recovery import recover
-from shadowhound_data_logger.mcap.rosbag2_metadata import metadata_yaml
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.recovery import recover
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 QOS = """- history: 1
   depth: 10

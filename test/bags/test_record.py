@@ -18,7 +18,7 @@ from e2e.processes import until
 from shadowhound_data_logger.bags import record_and_upload_rosbag
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.record import record
-from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.core.errors import BagError
 
 pytestmark = pytest.mark.ros
 long = pytest.mark.long('starts more processes')
@@ -80,7 +80,7 @@ def test_other_topics_and_nothing(home: Path) -> None:
 @long
 def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
     """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
-    program = 'shadowhound_data_logger.capture.bag_process'
+    program = 'shadowhound_data_logger.node.recording.bag_process'
     child = subprocess.Popen([sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'cut_off'])
     end = time.monotonic() + 60
     while not any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')):
@@ -99,7 +99,7 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
 @long
 def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
     """The bag is made whole and another follows it; both are in the store, and the call tells of the last."""
-    program = 'shadowhound_data_logger.capture.bag_process'
+    program = 'shadowhound_data_logger.node.recording.bag_process'
     command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records')

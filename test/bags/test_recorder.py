@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.core.model import Outcome, State
 
 
 def test_a_bag_from_start_to_stop(tmp_path: Path) -> None:

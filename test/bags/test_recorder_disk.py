@@ -16,10 +16,10 @@ from pyarrow.parquet import read_table
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import bag_overview
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.config import CatalogueSettings
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import DataObject
+from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.memory import MemoryStore
 

@@ -14,7 +14,7 @@ from clocks import NOON_NS, Clocks
 
 from shadowhound_data_logger.bags.naming import slice_file
 from shadowhound_data_logger.bags.state import RECORD, BagState
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 BAG = 'patrol_20251018_120000'
 

@@ -13,9 +13,9 @@ from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview, named_ns
 from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import BagError
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import BagError
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 

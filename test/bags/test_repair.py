@@ -17,7 +17,7 @@ from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from shadowhound_data_logger.bags.cut import Choice, cut_folder
 from shadowhound_data_logger.bags.repair import BagRepair, repair_bag
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
 
 
 def content(folder: Path) -> dict[str, bytes]:

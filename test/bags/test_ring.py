@@ -96,7 +96,7 @@ from pathlib import Path
 sys.path.insert(0, {str(__file__).rpartition('/test/')[0] + '/test'!r})
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.ring import Ring
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.model import Taken
 size, limit = int(sys.argv[1]), 32 << 20
 def rss():
     return int(Path('/proc/self/statm').read_text().split()[1]) * 4096

@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
 from shadowhound_data_logger.bags.upload_plan import finished
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 QOS = '- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2'

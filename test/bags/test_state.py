@@ -11,10 +11,10 @@ from bags.slices import fill, messages
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, Missing, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.naming import slice_file
 from shadowhound_data_logger.bags.state import LEAST_ROWS_BYTES, RECORD, BagState
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.index import read_metadata
-from shadowhound_data_logger.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.formats.mcap.index import read_metadata
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 
 IMU = Channel('/imu', 'x/msg/Y', 'ros2msg', 'float32 x', 'RIHS01_0', '- history: 1')
 POSE = Channel('/pose', 'x/msg/Z', 'ros2msg', 'float32 z', 'RIHS01_1', '')

@@ -13,16 +13,16 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, by_rosbags, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.remote import find_bag, find_bags
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.bags.watch import Watch
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.errors import BagDamaged, BagError, NameRefused
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import BagDamaged, BagError, NameRefused
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

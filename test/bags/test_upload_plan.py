@@ -9,7 +9,7 @@ import pytest
 from bags.real_bags import NAME, write_ours
 
 from shadowhound_data_logger.bags.upload_plan import finished
-from shadowhound_data_logger.errors import BagDamaged
+from shadowhound_data_logger.core.errors import BagDamaged
 
 BOMB = b'a: &a [x, x]\n' + b''.join(
     b'%c: &%c [%s]\n' % (ord('b') + n, ord('b') + n, b', '.join([b'*%c' % (ord('a') + n)] * 9)) for n in range(12)

@@ -12,11 +12,11 @@ import pytest
 from bags.real_bags import NAME, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
-from shadowhound_data_logger.errors import BagError
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
 

@@ -17,9 +17,9 @@ from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.keys import unsynced
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.keys import unsynced
+from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.stores.memory import MemoryStore
 

@@ -15,8 +15,8 @@ from lake.test_values import BATCHES, filled
 
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 LAST = 'thor/s/20261028/000009_s.json'

@@ -14,12 +14,12 @@ from bags.real_bags import NAME, stored, write_ours
 from bags.reference import write
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
+from shadowhound_tower.embedded import Tower
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.errors import BagDamaged, BagError, SettingError
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.errors import BagDamaged, BagError, SettingError
 from shadowhound_data_logger.stores import open_store
 
 

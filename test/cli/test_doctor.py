@@ -12,11 +12,11 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 from doctor.scene import FOREIGN
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.cli import doctor as verb
 from shadowhound_data_logger.doctor import model
 from shadowhound_data_logger.doctor.model import Check, Context
-from shadowhound_data_logger.sim.tower import Tower
 
 BAD = model.error('some.thing', 'seen [bold]so\x1b[31m', 'the cause', 'echo a very long command ' + 'x' * 200)
 ODD = model.warning('some.other', 'an oddity', 'it is odd', 'mend it')

@@ -16,9 +16,9 @@ from datasets.recorded import House, Mission
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.export import export
 from shadowhound_data_logger.cli.fetch import fetch
+from shadowhound_data_logger.core.errors import LakeError, TrackingUnavailable
 from shadowhound_data_logger.datasets import transfer
 from shadowhound_data_logger.datasets.lerobot import REPORT, SOURCE_TABLE, Lerobot
-from shadowhound_data_logger.errors import LakeError, TrackingUnavailable
 
 URL = 's3://lerobot/datasets/go2/patrols'
 pytestmark = pytest.mark.long('exports again and again')

@@ -13,8 +13,8 @@ from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, 
 
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.fetch import fetch
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.lake import query, selecting
 from shadowhound_data_logger.stores import open_store
 

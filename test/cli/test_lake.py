@@ -11,9 +11,9 @@ from lake.gap_parts import IMU, lost, mark, tell
 from lake.making import NOON_NS, fill, folder_store
 from PIL import Image
 
-from shadowhound_data_logger.catalogue.gaps import GAP, statement
 from shadowhound_data_logger.cli.label import label
 from shadowhound_data_logger.cli.lake import lake
+from shadowhound_data_logger.formats.rows.gaps import GAP, statement
 
 
 @pytest.fixture

@@ -15,13 +15,13 @@ import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
 
-from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.cli.lake import lake
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, StoreUnavailable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, StoreUnavailable
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import verify
-from shadowhound_data_logger.ship.audit import _judge
+from shadowhound_data_logger.shipping.audit import _judge
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(5)]
@@ -137,7 +137,7 @@ def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(verify, 'PAGE', 2)
     monkeypatch.setattr('shadowhound_data_logger.cli.lake.THREADS', 1)
     with monkeypatch.context() as patched:
-        patched.setattr('shadowhound_data_logger.ship.audit._judge', judge)
+        patched.setattr('shadowhound_data_logger.shipping.audit._judge', judge)
         assert as_json(home)['unreachable']
     (notes,) = (home / 'verify').iterdir()
     assert notes.stat().st_size == 4 * verify.DIGEST_BYTES

@@ -16,8 +16,8 @@ from spool.making import NOON_NS, abandon, make, new_spool, put, settle
 from shadowhound_data_logger.cli.ledger import ledger, page
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import State
 
 STATES = ('delivered', 'pending', 'held', 'evicted', 'quarantined', 'deduplicated')
 

@@ -20,7 +20,7 @@ import shadowhound_data_logger
 from shadowhound_data_logger.cli import main as main_module
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.main import PROGRAM, SECTIONS, cli, described, main, verb_of
-from shadowhound_data_logger.errors import BagError, DataLoggerError, PolicyRefused, SettingError, UnknownName
+from shadowhound_data_logger.core.errors import BagError, DataLoggerError, PolicyRefused, SettingError, UnknownName
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:

@@ -14,8 +14,8 @@ from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, write_json

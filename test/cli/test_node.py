@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from capture.serving import Serving
 from click.testing import CliRunner, Result
+from node.serving import Serving
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.errors import NodeUnavailable
+from shadowhound_data_logger.core.errors import NodeUnavailable
 
 PARAMETERS = [
     {'name': 'camera.format', 'value': 'jpeg', 'description': 'What it is.', 'constraints': '', 'read_only': True},

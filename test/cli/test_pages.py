@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from shadowhound_data_logger.cli.common import MEANINGS, ExitCode
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pages import DOCS, EXAMPLE, SECTIONS, VARIABLES, commands, main, parameters
-from shadowhound_data_logger.config import DEFAULT_SENSORS, Settings, default_parameters
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings, default_parameters
 
 PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
 
@@ -72,7 +72,7 @@ def test_live_parameters_are_marked() -> None:
 
 def test_every_environment_variable_is_on_it() -> None:
     """The page tells the variables that config.py reads, all of them and no others."""
-    read = set(re.findall(r"environ\.get\('(\w+)'\)", (PACKAGE / 'config.py').read_text(encoding='utf-8')))
+    read = set(re.findall(r"environ\.get\('(\w+)'\)", (PACKAGE / 'core' / 'config.py').read_text(encoding='utf-8')))
     assert read == {name for name, _, _ in VARIABLES}
 
 

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from tuf.api.metadata import Metadata, Root, Timestamp
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.errors import DataLoggerError
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.repository import Repository

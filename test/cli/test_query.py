@@ -18,8 +18,8 @@ from PIL import Image
 
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.query import query
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.stores import open_store
 
 

@@ -13,17 +13,17 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from shadowhound_tower.embedded import Tower
 from spool.making import BUCKET, assert_whole, make, new_spool, put, rows, settle
 
 from shadowhound_data_logger.cli import spool as drains
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.output import progress
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import Outcome, State
-from shadowhound_data_logger.ship.uploader import UploadStatus
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import Outcome, State
+from shadowhound_data_logger.shipping.uploader import UploadStatus
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.listing import retry
 

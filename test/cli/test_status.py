@@ -20,7 +20,7 @@ from spool.making import make, new_spool, put
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.cli.status import status, view
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.spool.status import file
 
 ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, and the WiFi up? it is tried again until it works)'

@@ -17,7 +17,7 @@ from spool.making import abandon, make, new_spool, put, settle
 
 from shadowhound_data_logger.cli.ledger import ledger
 from shadowhound_data_logger.cli.main import main
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 SECRET = 'a-Secret-that-nobody-may-see'
@@ -112,7 +112,7 @@ def test_a_store_that_is_away(home: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', SECRET)
-    monkeypatch.setattr('shadowhound_data_logger.retry.TRIES', 1)
+    monkeypatch.setattr('shadowhound_data_logger.core.retry.TRIES', 1)
     answer = run('--verify')
     assert answer.return_value == 1
     text = ' '.join(answer.output.split())

@@ -17,10 +17,10 @@ from lake.gap_parts import tell
 from lake.making import NOON_NS, add, folder_store
 from lake.training import COMPRESSED, IMU, JOINTS, ODOMETRY, Drive
 
-from shadowhound_data_logger.catalogue.gaps import GAP, Statement, complete, statement
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.clock import SECOND, iso
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.rows.gaps import GAP, Statement, complete, statement
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores import open_store
 

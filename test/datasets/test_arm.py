@@ -17,15 +17,15 @@ import pytest
 from datasets.recorded import House, Mission, header, x_of
 from lake.making import NOON_NS
 from lake.training import JOINTS
+from shadowhound_sim import so_arm
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.clocks import ClockOffset, measured
 from shadowhound_data_logger.datasets.export import Exported, export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import OURS, Lerobot
 from shadowhound_data_logger.datasets.verify import verify
-from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.sim import so_arm
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 PATROLS = {'mission_type': 'patrol'}

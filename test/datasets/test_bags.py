@@ -14,16 +14,16 @@ from lake.making import add
 from lake.training import COMPRESSED, ODOMETRY
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
-from shadowhound_data_logger.catalogue.gaps import complete
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, Lerobot, matrix
 from shadowhound_data_logger.datasets.verify import verify
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.gaps import complete
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

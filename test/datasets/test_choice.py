@@ -20,18 +20,18 @@ from lake.training import COMPRESSED, ODOMETRY
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import slice_file
-from shadowhound_data_logger.catalogue.gaps import complete
 from shadowhound_data_logger.cli import export as verb
 from shadowhound_data_logger.cli.common import ExitCode
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.datasets.export import Exported, export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import SOURCE_TABLE, Lerobot
 from shadowhound_data_logger.datasets.verify import verify
-from shadowhound_data_logger.encode.definitions import describe
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.gaps import complete
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

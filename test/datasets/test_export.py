@@ -22,7 +22,9 @@ from PIL import Image, ImageColor
 
 from shadowhound_data_logger.cli import export as verb
 from shadowhound_data_logger.cli.common import BadUsage
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.datasets import cluster, report
 from shadowhound_data_logger.datasets.export import Exported, drop, export, resumed, split_of
 from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
@@ -30,12 +32,10 @@ from shadowhound_data_logger.datasets.lerobot import DATA, OURS, SOURCE_TABLE, L
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
 from shadowhound_data_logger.datasets.video import VideoWriter, frames_at
-from shadowhound_data_logger.errors import LakeError, SettingError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.training import LABEL_TABLE, digest_of
-from shadowhound_data_logger.options import UploadSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

@@ -14,18 +14,18 @@ import pytest
 from click.testing import CliRunner
 from datasets.recorded import House, Mission
 from datasets.test_arm import CLOCK, LEKIWI
+from shadowhound_sim import so_arm
 
 from shadowhound_data_logger.cli.common import ExitCode
 from shadowhound_data_logger.cli.export import export as command
-from shadowhound_data_logger.clock import SECOND, iso
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.imports import Imported, bring, identity_of, of_hdf5, of_lerobot, times_of
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
-from shadowhound_data_logger.errors import LakeError, SettingError
-from shadowhound_data_logger.sim import so_arm
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

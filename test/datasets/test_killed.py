@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from datasets.recorded import House, Mission
 
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.export import drop, export, resumed
 from shadowhound_data_logger.datasets.features import ExportOptions
-from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.lake.training import INFO
 
 PATROLS = {'mission_type': 'patrol'}
@@ -25,11 +25,11 @@ pytestmark = pytest.mark.long('an export for each file that it writes')
 DYING = """
 import os, signal, sys
 from pathlib import Path
-from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.core.options import StoreSettings
 
 folder, store, at, real, done = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), os.replace, 0
 def replace(*arguments, **more):

@@ -10,6 +10,7 @@ import pytest
 from datasets.recorded import House, Mission
 from datasets.test_killed import Killed, contents, dying
 
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.export import drop, export, resumed
 from shadowhound_data_logger.datasets.features import AV1, H264, SHARED, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, Lerobot
@@ -17,7 +18,6 @@ from shadowhound_data_logger.datasets.mobile import SET
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.datasets.video import Clip, count_frames, frames_of, join
-from shadowhound_data_logger.errors import LakeError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 KEY = 'observation.images.front'

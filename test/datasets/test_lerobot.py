@@ -14,7 +14,7 @@ import pytest
 from datasets.recorded import House, Mission, x_of
 from datasets.test_arm import record_arm
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import SHARED, ExportOptions
 from shadowhound_data_logger.datasets.imports import Imported, bring, of_lerobot

@@ -14,14 +14,14 @@ import pytest
 from datasets.recorded import House, Mission, video_frames, x_of
 from datasets.test_arm import CLOCK, arm_stamps, record_arm
 from rosbags.highlevel import AnyReader
+from shadowhound_sim import so_arm
 
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.export import Exported, drop, export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.mobile import SET, forget
-from shadowhound_data_logger.errors import LakeError
-from shadowhound_data_logger.sim import so_arm
 from shadowhound_data_logger.stores import open_store
 
 DETECTION = 'vision_msgs/msg/Detection2DArray'

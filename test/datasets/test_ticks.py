@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.datasets.ticks import interpolated, motion, sample
 
 

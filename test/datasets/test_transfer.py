@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING
 import pytest
 from datasets.recorded import House, Mission
 
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, fetch_dataset, upload
 from shadowhound_data_logger.stores import open_reader, open_store
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('starts a process for each kill')]
 DYING = """
 import os, signal, sys
 from pathlib import Path
-from shadowhound_data_logger.config import UploadSettings, store_settings
+from shadowhound_data_logger.core.config import UploadSettings, store_settings
 from shadowhound_data_logger.datasets import transfer
 from shadowhound_data_logger.stores import open_store
 

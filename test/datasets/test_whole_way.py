@@ -18,7 +18,7 @@ from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import SOURCE_TABLE
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 ROOT: Final = Path(__file__).parents[2]
 PYTHON: Final = Path(os.environ.get('SHADOWHOUND_TRAIN', '~/.cache/shadowhound/train/bin/python')).expanduser()

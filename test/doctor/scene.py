@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SpoolSettings
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Context, Result, Role

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from doctor.scene import Scene
 
+from shadowhound_data_logger.core.ros_arguments import ParametersUnreadable, read_parameters
 from shadowhound_data_logger.doctor import context, machine
 from shadowhound_data_logger.doctor.context import make
 from shadowhound_data_logger.doctor.model import Role
-from shadowhound_data_logger.ros_arguments import ParametersUnreadable, read_parameters
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from unittest import mock
 import pytest
 from stores.fake_s3 import FakeS3, served
 
-from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.core.config import StoreSettings
 from shadowhound_data_logger.doctor import s3
 from shadowhound_data_logger.doctor.model import Result, Severity
 from shadowhound_data_logger.doctor.s3_put import single_requests

@@ -17,13 +17,13 @@ import pytest
 from doctor.scene import Scene, expect
 from spool.making import make, put, settle
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.doctor import disk, environment
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.doctor.run import fix
-from shadowhound_data_logger.model import State
 from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED
 
 SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'

@@ -20,14 +20,14 @@ from doctor.scene import Scene, expect
 from faults.front import Front
 from faults.kinds import Condition, Fault
 from open_seaweed import open_seaweed
+from shadowhound_tower.embedded import Tower
 from shared_tower import BUCKETS
 from stores.fake_s3 import FakeS3, hung, refused, served
 
-from shadowhound_data_logger import mlflow_rest
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core import mlflow_rest
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.doctor import mlflow, network, s3, s3_put, seaweedfs
 from shadowhound_data_logger.doctor.model import Result, Role, Severity
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3_requests import S3Requests
 
 pytestmark = pytest.mark.seaweedfs

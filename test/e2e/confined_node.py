@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from e2e.machines import inside
 
-from shadowhound_data_logger.capture import unheard
-from shadowhound_data_logger.capture.middleware import RMW, choose
+from shadowhound_data_logger.node.intake import unheard
+from shadowhound_data_logger.node.intake.middleware import RMW, choose
 
 pid, interface, *arguments = sys.argv[1:]
 if pid != 'inside':
@@ -21,6 +21,6 @@ uri = f'<CycloneDDS><Domain>{general}</Domain></CycloneDDS>'
 robot = dict(os.environ)
 middleware = replace(choose('auto', {**robot, RMW: 'rmw_cyclonedds_cpp', 'CYCLONEDDS_URI': uri}), has_robot=True)
 middleware.enter(os.environ)
-from shadowhound_data_logger.capture.node import run  # noqa: E402 - loads the RMW that the environment names
+from shadowhound_data_logger.node.node import run  # noqa: E402 - loads the RMW that the environment names
 
 sys.exit(run(arguments, middleware, robot))

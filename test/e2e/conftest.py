@@ -13,9 +13,9 @@ from e2e.processes import Processes
 from e2e.reading import Objects
 from e2e.session import Session
 from e2e.station import Station
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytest.importorskip('rclpy')

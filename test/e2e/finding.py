@@ -55,7 +55,7 @@ def listen(cases: Sequence[Mapping[str, str]]) -> None:
 
 def find(case: Mapping[str, str]) -> None:
     """A list of topics."""
-    from shadowhound_data_logger.capture.middleware import RMW, choose
+    from shadowhound_data_logger.node.intake.middleware import RMW, choose
 
     loaded = choose('fastrtps', os.environ | {RMW: case[RMW]}).profile_variable  # whatever version the case pretends to have
     middleware = replace(choose('fastrtps', os.environ | case), profile_variable=loaded)

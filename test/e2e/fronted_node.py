@@ -2,8 +2,8 @@
 
 import sys
 
-from shadowhound_data_logger.capture.middleware import Middleware
-from shadowhound_data_logger.capture.sensor_logger_node import main
+from shadowhound_data_logger.node.intake.middleware import Middleware
+from shadowhound_data_logger.node.sensor_logger_node import main
 
 Middleware.is_foreign = property(lambda _: True)  # type: ignore[assignment, method-assign]
 sys.exit(main())

@@ -8,9 +8,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.capture.pipeline import Pipeline
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.worker import Worker
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.node.pipeline import Pipeline
 
 orders = Path(os.environ['ORDERS'])
 clock = SystemClock.of_this_machine()

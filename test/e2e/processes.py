@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from forking import Forked, can_fork, fork
+from shadowhound_sim.demo_processes import THIS_MACHINE
 
-from shadowhound_data_logger.sim.demo_processes import THIS_MACHINE
 from shadowhound_data_logger.spool import ledger
 
 HERE = Path(__file__).parent
-NODE = 'shadowhound_data_logger.capture.sensor_logger_node'
-SIM = 'shadowhound_data_logger.sim.sim_go2_node'
+NODE = 'shadowhound_data_logger.node.sensor_logger_node'
+SIM = 'shadowhound_sim.sim_go2_node'
 COMMANDS = 'shadowhound_data_logger.cli.main'
 LONG = bool(os.environ.get('SHADOWHOUND_TEST_LONG'))
 """``SHADOWHOUND_TEST_LONG=1 make test PYTEST_ARGS=test/e2e`` runs the minutes that are promised, instead of seconds."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 
 TYPES = {

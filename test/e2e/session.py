@@ -13,8 +13,8 @@ from e2e.bag_reading import Bag, Recorded, bags, by_topic
 from e2e.processes import LONG, WAIT_S, Node, Processes, is_accounted, published
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import Heard, recorded
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import ObjectStore
 
 DURATION_S = 60.0 if LONG else 7.0

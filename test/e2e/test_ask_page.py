@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'ask.md'
 HOME = '/home/ann/.shadowhound'
@@ -80,7 +79,7 @@ def test_the_commands_of_the_page_have_answers_of_the_form_that_it_shows(tmp_pat
     """Tables have the columns of the page, and no command fails, or says nothing where the page shows an answer."""
     pytest.importorskip('rclpy')
     pytest.importorskip('go2_interfaces')
-    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--duration', '20', '--outage', '0', '--folder', 'demo']
+    command = [sys.executable, '-m', 'shadowhound_sim.demo', '--duration', '20', '--outage', '0', '--folder', 'demo']
     made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400, check=False)
     assert 'read back from the S3 server' in made.stdout, made.stdout + made.stderr
     page = PAGE.read_text(encoding='utf-8')

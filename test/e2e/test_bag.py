@@ -12,8 +12,8 @@ from e2e.processes import Processes, until
 from e2e.reading import STRING, TYPES, decode, texts
 from e2e.session import DURATION_S, SLICE_S, Session
 from e2e.station import Station
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import ObjectStore
 
 SOON_NS = 30 * 10**9

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from e2e.bag_reading import bags, in_slice
 from e2e.processes import Processes, published, until
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.mcap.recovery import recover
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.mcap.recovery import recover
 from shadowhound_data_logger.spool.retention import NO_ROOM
 from shadowhound_data_logger.stores.s3 import S3Store
 

@@ -14,15 +14,15 @@ import pyarrow.parquet
 import pytest
 from e2e.processes import Processes, until
 from e2e.session import DURATION_S, Session
+from shadowhound_sim.world import World
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger, lake
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.sim.tower import Tower
-from shadowhound_data_logger.sim.world import World
 from shadowhound_data_logger.stores.s3 import S3Store
 
 SEED = 1

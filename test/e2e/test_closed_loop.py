@@ -23,11 +23,11 @@ from geometry_msgs.msg import Twist
 from missions.server import Server, complete
 from nav_msgs.msg import Odometry
 from policies.models import bucket_of
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.lake.training import digest_of
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
-from shadowhound_data_logger.sim.tower import Tower
 
 ROOT: Final = Path(__file__).parents[2]
 MAIN: Final = [sys.executable, '-m', 'shadowhound_data_logger.cli.main']

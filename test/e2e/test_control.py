@@ -14,10 +14,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, Objects, texts
 from e2e.station import Station
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.spool import status
 from shadowhound_data_logger.spool.control import connect
 

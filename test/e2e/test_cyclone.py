@@ -11,7 +11,7 @@ import pytest
 from e2e.processes import Processes, until
 from e2e.reading import STRING, cdr, texts
 
-from shadowhound_data_logger.capture.middleware import possible_buffer
+from shadowhound_data_logger.node.intake.middleware import possible_buffer
 
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children
 

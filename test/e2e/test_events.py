@@ -12,10 +12,10 @@ from e2e.bag_reading import Bag, bags
 from e2e.processes import GENTLE, Node, Processes, Publisher, until
 from e2e.reading import STRING, TYPES, decode, texts
 from e2e.station import Station
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.mcap.recovery import scan
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.formats.mcap.recovery import scan
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -12,9 +12,9 @@ import pytest
 from e2e.processes import Node, Processes, Publisher, until
 from e2e.reading import STRING, Objects, texts
 from e2e.wire import HANG, PASS, REFUSE, Wire
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.stores.s3 import S3Store
 
 TOPIC = '/talk'

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from e2e.processes import until
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SpoolSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.ship.uploader import Uploader
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
+from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter

@@ -23,13 +23,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
 from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.status import read
 
 FRONTED = (str(HERE / 'fronted_node.py'),)
-FRONT = 'shadowhound_data_logger.capture.front'
+FRONT = 'shadowhound_data_logger.node.reporting.front'
 OFFERED = 'services and parameters are offered in'
 DIRECT, BESIDE = '/direct', '/beside'
 COUNT = 20
@@ -46,7 +46,7 @@ def nodes(shared: Processes) -> dict[str, Node]:
     """One that speaks for itself, and one with a front, alike in all else; each with a home of its own."""
     given = {
         space: shared.node(None, SENSORS, '-r', f'__ns:={space}', home=space.strip('/'), program=program)
-        for space, program in ((DIRECT, ('-m', 'shadowhound_data_logger.capture.sensor_logger_node')), (BESIDE, FRONTED))
+        for space, program in ((DIRECT, ('-m', 'shadowhound_data_logger.node.sensor_logger_node')), (BESIDE, FRONTED))
     }
     given[BESIDE].said(OFFERED)
     return given

@@ -20,8 +20,7 @@ from e2e import rclpy_names
 from e2e.bag_reading import in_slice
 from e2e.processes import HERE, Processes
 from e2e.reading import STRING, Objects, texts
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 FAST_DDS, CYCLONE_DDS = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 PROBE = """

@@ -19,13 +19,13 @@ import yaml
 from e2e.processes import GENTLE, Node, Processes, until
 from live.test_history import items
 from missions.server import complete
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.live.history import PastReader
 from shadowhound_data_logger.live.kept import StoreKept
 from shadowhound_data_logger.live.past import StorePast
-from shadowhound_data_logger.sim.tower import Tower
 
 ROOT: Final = Path(__file__).parents[2]
 MAIN: Final = [sys.executable, '-m', 'shadowhound_data_logger.cli.main']

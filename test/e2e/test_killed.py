@@ -16,9 +16,9 @@ from e2e.processes import HERE, NODE, Node, Processes, published, until
 from e2e.reading import TYPES, Objects, decode, stamp_ns
 from e2e.witness import recorded
 from ros.ports import SETTLED, ports_of, seem_to_process
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.ros.shared_memory import FOLDER, orphans
-from shadowhound_data_logger.sim.tower import Tower
 
 SECOND = 10**9
 KILLS = 3

@@ -10,9 +10,9 @@ from e2e.processes import Processes, until
 from e2e.reading import STRING, decode, texts
 from e2e.station import Station
 from rosbags.highlevel import AnyReader
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -14,14 +14,14 @@ from e2e.reading import Objects
 from e2e.station import NODE, Station
 from missions.server import Server, complete
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from shadowhound_tower.embedded import Tower
 from std_msgs.msg import String
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.overview import told
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 
 ENOUGH = 40

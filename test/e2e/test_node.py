@@ -18,8 +18,7 @@ import simplejpeg
 from e2e.processes import GENTLE, Processes, until
 from e2e.reading import STRING, Objects, cdr, message_class, texts
 from e2e.wire import HANG, PASS, Wire
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 TALK = {'sensors': ['talk'], 'talk.topics': ['talk'], 'talk.types': [STRING], 'talk.rate_hz': 0.0, 'talk.batch_s': 600.0}
 """A batch that no test sees the end of: it is open until the node closes it."""

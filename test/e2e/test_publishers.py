@@ -1,6 +1,6 @@
 """Publishers in processes of their own, a node and a store: all they send after the match is stored, and once.
 
-Publishers of every kind, in the test's own process, are in test/capture/test_publishers.py.
+Publishers of every kind, in the test's own process, are in test/node/test_publishers.py.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import pytest
 from e2e.processes import Node, Processes
 from e2e.reading import STRING, Objects, texts
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 WARM_UP = texts(['warm-up'])[0]
 TOPICS = ['killed', 'mixed']

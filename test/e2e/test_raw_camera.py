@@ -13,8 +13,7 @@ import pytest
 import simplejpeg
 from e2e.processes import Node, Processes, until
 from e2e.reading import Objects, cdr
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 RAW_TOPIC, JPEG_TOPIC = '/camera/image_raw', '/camera/compressed'

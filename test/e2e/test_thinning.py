@@ -15,7 +15,7 @@ import pytest
 from e2e.processes import Processes, until
 from spool.making import assert_whole
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 
 SETTINGS = {
     'camera.rate_hz': 0.0, 'camera.batch_s': 1.0, 'camera.format': 'tar', 'camera.ship': 'on_request', 'lidar.enabled': False,

@@ -13,7 +13,7 @@ import pytest
 from e2e.processes import HERE, Node, Processes, Publisher, until
 from e2e.reading import STRING, texts
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.spool import status
 
 WORKERS = ('intake', 'encode-0', 'spool-writer', 'upload-0')

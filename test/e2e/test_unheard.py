@@ -13,7 +13,7 @@ from e2e.machines import Machines
 from e2e.processes import HERE, Node, Processes, until
 from e2e.reading import STRING
 
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.spool import status
 
 pytestmark = pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')  # imported by children

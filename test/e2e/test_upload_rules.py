@@ -10,9 +10,9 @@ from e2e.processes import Node, Processes, until
 from e2e.reading import STRING, Objects, texts
 from e2e.station import Station
 from rclpy.serialization import serialize_message
+from shadowhound_tower.embedded import Tower
 from std_msgs.msg import Bool
 
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.spool.status import file
 from shadowhound_data_logger.stores.base import ObjectStore
 

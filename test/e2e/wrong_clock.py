@@ -8,8 +8,8 @@ import os
 import time
 from pathlib import Path
 
-from shadowhound_data_logger import model
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core import model
+from shadowhound_data_logger.core.clock import SystemClock
 
 behind = Path(os.environ['WRONG_CLOCK'])
 Taken = model.Taken

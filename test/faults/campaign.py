@@ -13,9 +13,9 @@ from typing import Final
 
 from faults import live_day, simulated_day
 from faults.report import Report, Summary
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.stores.s3 import S3Store
 
 MEMORY: Final = Path('/dev/shm')  # noqa: S108 - folders with random names are made in it

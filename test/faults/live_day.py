@@ -21,10 +21,10 @@ from faults.report import Report
 from spool.making import NOON_NS, assert_whole, receive, rows
 from stores.spooled import Spool as Spooled
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject, Put
-from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings, StoreSettings, UploadSettings
+from shadowhound_data_logger.core.model import DataObject, Put
+from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores.s3 import S3Store

@@ -23,9 +23,9 @@ from faults.simulated_s3 import LATEST_S, Line, Server
 from faults.virtual_time import Actor, VirtualLock, VirtualTime
 from spool.making import NOON_NS, assert_whole, put, rows
 
-from shadowhound_data_logger.config import SpoolSettings, StoreSettings, UploadSettings
-from shadowhound_data_logger.model import DataObject, ObjectInfo, Outcome, State
-from shadowhound_data_logger.ship.uploader import Uploader
+from shadowhound_data_logger.core.config import SpoolSettings, StoreSettings, UploadSettings
+from shadowhound_data_logger.core.model import DataObject, ObjectInfo, Outcome, State
+from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores import s3
 from shadowhound_data_logger.stores.s3 import S3Store

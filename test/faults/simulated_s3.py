@@ -11,9 +11,9 @@ from typing import IO, Final, TypeVar
 from faults.kinds import Condition, Fault, Script
 from faults.virtual_time import VirtualTime
 
-from shadowhound_data_logger.bandwidth import Pace
-from shadowhound_data_logger.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.stores.bandwidth import Pace
 from shadowhound_data_logger.stores.content import object_metadata
 from shadowhound_data_logger.stores.s3_requests import Sent
 

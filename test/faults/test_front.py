@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 from faults.front import STATUS_LINE, Front
 from faults.kinds import FAULTS, STORING, Condition, Fault, Script
-from ship.fakes import until
+from shadowhound_tower.embedded import Tower
+from shipping.fakes import until
 from stores.spooled import Spool
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, ForeignObject, StoreError, StoreUnavailable
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs

@@ -17,13 +17,13 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from faults.front import Front
 from faults.kinds import Fault, Script
-from ship.fakes import until
+from shadowhound_tower.embedded import Tower
+from shipping.fakes import until
 from stores.spooled import Spool
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import StoreError
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import StoreError
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -163,8 +163,8 @@ def test_kill_between_parts(store: S3Store, front: Front, seaweed: Tower, item: 
     """A process that dies with two of three parts delivered leaves its successor the third."""
     program = f"""
 from pathlib import Path, PosixPath
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores import content, s3
 content.PART_BYTES = s3.MULTIPART_BYTES = {PART}
 store = s3.S3Store(StoreSettings(endpoint_url={front.url!r}), UploadSettings())

@@ -13,8 +13,7 @@ from faults.campaign import live, simulated
 from faults.kinds import given_seed, is_long
 from faults.report import Summary
 from faults.simulated_day import Day
-
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower.embedded import Tower
 
 SIMULATED = 1000 if is_long() else 10
 LIVE = 5

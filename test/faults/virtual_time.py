@@ -8,8 +8,8 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.ship.schedule import Rest, Schedule
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.shipping.schedule import Rest, Schedule
 
 STUCK_S: Final = 30.0
 """Real seconds without a word from the one thread that may run: it waits for something that is not of this time."""

@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow.parquet import encryption
 
-from shadowhound_data_logger.catalogue import parquet, parts, schema
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parquet, parts, schema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.live_files import SOURCES, compacted_key
-from shadowhound_data_logger.options import StoreSettings
 
 DATE: Final = '2026-10-28'
 LONG: Final = 'thor/camera/' + 42_000 * 'a'

@@ -38,9 +38,15 @@ from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.cli.output import shown_time
-from shadowhound_data_logger.errors import DataLoggerError
+from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.untrusted import csv_cell, visible
+from shadowhound_data_logger.formats.mcap.format import CHUNK, RECORD, record, text
+from shadowhound_data_logger.formats.mcap.index import records
+from shadowhound_data_logger.formats.mcap.messages import unpack
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import decode, query, reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
@@ -51,14 +57,8 @@ from shadowhound_data_logger.lake.live_files import sources_of
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
 from shadowhound_data_logger.lake.track import NEEDED, Track
-from shadowhound_data_logger.mcap.format import CHUNK, RECORD, record, text
-from shadowhound_data_logger.mcap.index import records
-from shadowhound_data_logger.mcap.messages import unpack
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
-from shadowhound_data_logger.untrusted import csv_cell, visible
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -24,13 +24,13 @@ from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.errors import BagDamaged
-from shadowhound_data_logger.mcap.format import CHUNK, MAGIC, record, text
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
+from shadowhound_data_logger.core.errors import BagDamaged
+from shadowhound_data_logger.formats.mcap.format import CHUNK, MAGIC, record, text
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.messages import read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if sys.version_info >= (3, 14):

@@ -21,8 +21,9 @@ from hostile.test_bags import LIMIT_BYTES
 from lake.making import NOON_NS, folder_store, row
 from PIL import Image
 
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, MOST_PIXELS, from_json, from_yaml, unpacked
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
@@ -30,7 +31,6 @@ from shadowhound_data_logger.lake.prefetch import Prefetch
 from shadowhound_data_logger.lake.query import _summary
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
-from shadowhound_data_logger.untrusted import MOST_OBJECT_BYTES, MOST_PIXELS, from_json, from_yaml, unpacked
 
 SIDE = 12_000
 """Of a picture of 144 megapixels, 430 MB: below what Pillow itself refuses."""
@@ -67,7 +67,7 @@ def tiff(side: int) -> bytes:
 READ = """
 import pathlib, resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import decode
 try:
     decode.image(pathlib.Path(sys.argv[1]).read_bytes())
@@ -238,7 +238,7 @@ def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path
     from hostile import bad_parts
 
     from shadowhound_data_logger import lake
-    from shadowhound_data_logger.catalogue import parts
+    from shadowhound_data_logger.formats.rows import parts
 
     rows = [
         row('camera', NOON_NS),

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from shadowhound_data_logger.core.errors import DataLoggerError, LakeError
+from shadowhound_data_logger.core.mailbox import RequestRefused, decode_inbox
+from shadowhound_data_logger.core.untrusted import MOST_JSON_DEPTH, from_json, from_strict_json
 from shadowhound_data_logger.datasets.transfer import _digests
-from shadowhound_data_logger.errors import DataLoggerError, LakeError
 from shadowhound_data_logger.lake.decode import members, records
-from shadowhound_data_logger.mailbox import RequestRefused, decode_inbox
-from shadowhound_data_logger.untrusted import MOST_JSON_DEPTH, from_json, from_strict_json
 
 DEPTHS = (MOST_JSON_DEPTH + 1, 500, 990, 1000, 5000, 200_000)
 

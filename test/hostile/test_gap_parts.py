@@ -18,11 +18,11 @@ from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, folder_store
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.catalogue.gaps import GAPS
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

@@ -18,11 +18,11 @@ from lake.making import NOON_NS, add_part, folder_store, row
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.query import query
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.missions.folder import new_folder
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.stores import open_store
-from shadowhound_data_logger.untrusted import csv_cell, visible
 
 CLIPBOARD = '\x1b]52;c;cm0gLXJmIH4=\x07'
 """OSC 52: puts a command where the next paste takes it from."""

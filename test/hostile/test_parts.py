@@ -27,11 +27,11 @@ from hypothesis import strategies as st
 from lake.making import NOON_NS, add, add_part, content, fill, folder_store, keys, row
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import parts, schema
 from shadowhound_data_logger.cli.fetch import fetch
 from shadowhound_data_logger.cli.lake import lake as lake_command
 from shadowhound_data_logger.cli.query import query
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

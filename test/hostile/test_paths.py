@@ -16,15 +16,15 @@ from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, find_bag
 from shadowhound_data_logger.bags.verify import verify_folder
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import BagDamaged, LakeError, NameRefused, ObjectRefused, StoreError
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.untrusted import path_below
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.memory import MemoryStore
-from shadowhound_data_logger.untrusted import path_below
 
 OUT = ['../secret.jpg', '/etc/passwd', 'a/../../secret.jpg', 'a//b', 'a/./b', '', '.', '..', 'a/', '/', 'a\0b', 'a\x1bb', 'a\nb',
        'x' * 256, 'a/' * 600, '\ud800']  # fmt: skip

@@ -8,11 +8,11 @@ from typing import Any
 
 from lake.making import NOON_NS, add
 
-from shadowhound_data_logger.catalogue import parts
-from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, Statement, complete, date_of, statement
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.options import StoreSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts
+from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, Statement, complete, date_of, statement
 from shadowhound_data_logger.stores import open_store
 
 IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}

@@ -11,12 +11,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of

@@ -13,18 +13,18 @@ import pytest
 from lake.making import NOON_NS, SENSORS, Watched, add_part, fill, folder_store, keys, row, watched
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, StoreUnavailable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, StoreUnavailable
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import Compacted, compact
 from shadowhound_data_logger.lake.live_files import is_compacted
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 TODAY = datetime(2026, 10, 29, 15, tzinfo=timezone.utc)
 LATER = datetime.now(timezone.utc) + timedelta(hours=2)

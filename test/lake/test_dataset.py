@@ -14,10 +14,10 @@ import simplejpeg
 from lake.making import NOON_NS, folder_store
 from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
 
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
@@ -29,7 +29,7 @@ from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 ALIGN = {'odom': 0.5, 'imu': Window(0.5, rows=8), 'joints': 0.2, 'lowstate': 5.0, 'lidar': 0.5}
 SECONDS = 6

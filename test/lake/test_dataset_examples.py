@@ -15,7 +15,7 @@ from lake.making import folder_store
 from lake.training import Drive
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 200

@@ -18,13 +18,13 @@ import pytest
 from lake.making import folder_store
 from lake.training import FRAMES_HZ, Drive, in_a_child
 
-from shadowhound_data_logger.catalogue.schema import BUCKET
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, dataset, prefetch, shards
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.options import StoreSettings
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 SECONDS = 10
 CHILD_S = 60

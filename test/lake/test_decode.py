@@ -21,7 +21,7 @@ from PIL import Image
 from profiles import examples
 from pypcd4 import Encoding, PointCloud
 
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.decode import table
 

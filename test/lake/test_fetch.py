@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from lake.making import NOON_NS, add, folder_store, row
 
-from shadowhound_data_logger import retry
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import CredentialsRejected, LakeError, StoreUnavailable
+from shadowhound_data_logger.core import retry
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, StoreUnavailable
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import FetchResult, Wish, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 COUNT = 30
 PREFIX = 'thor/camera/20261028/'

@@ -20,14 +20,14 @@ from faults.kinds import Fault
 from faults.upstream import Request
 from lake.making import NOON_NS, add, add_part
 
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 pytestmark = pytest.mark.seaweedfs
 COUNT = 300

@@ -16,17 +16,17 @@ from lake.gap_parts import IMU, lost, mark, tell
 from lake.making import DAY_NS, MINUTE_NS, NOON_NS, folder_store
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue.gaps import GAP, GAPS, WITHDRAWN, Statement, statement
-from shadowhound_data_logger.catalogue.schema import BUCKET
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, WITHDRAWN, Statement, statement
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps, reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, folded, known, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 

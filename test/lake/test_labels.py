@@ -12,9 +12,9 @@ import duckdb
 import pytest
 from lake.making import NOON_NS, fill, folder_store
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, NameRefused, SettingError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, NameRefused, SettingError
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.dataset import MissionDataset

@@ -23,9 +23,9 @@ from lake.image_pairs import SIDE, make_pair
 from lake.making import DAY_NS, NOON_NS, add, add_part, folder_store, row
 from PIL import Image
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import likeness
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

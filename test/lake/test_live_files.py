@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.errors import LakeError
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.lake.live_files import Day, compacted_key, folder_of, is_compacted, live_files, name_of
-from shadowhound_data_logger.model import ObjectInfo
 
 NOW = datetime(2026, 10, 28, tzinfo=timezone.utc)
 ROBOT, DATE = 'thor', '2026-10-27'

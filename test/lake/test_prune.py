@@ -14,21 +14,21 @@ from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, add_part, content, fold
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.bags.manifest import EventOf, Manifest, RecordedTopic
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.catalogue.gaps import complete
-from shadowhound_data_logger.catalogue.parts import encode
-from shadowhound_data_logger.clock import SECOND, utc
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import AccessDenied, LakeError, SettingError
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, LakeError, SettingError
+from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows.gaps import complete
+from shadowhound_data_logger.formats.rows.parts import encode
 from shadowhound_data_logger.lake import compact as compaction
 from shadowhound_data_logger.lake import gaps, labels, prune, pull, verify
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten
 from shadowhound_data_logger.lake.reindex import reindex
-from shadowhound_data_logger.mailbox import KeptFilter
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.ship.audit import audit
+from shadowhound_data_logger.shipping.audit import audit
 from shadowhound_data_logger.stores import open_store
 
 NOW_NS = NOON_NS + 10 * DAY_NS

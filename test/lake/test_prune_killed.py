@@ -22,16 +22,16 @@ from faults.kinds import Fault
 from faults.upstream import Request
 from lake.making import DAY_NS, add, add_part, content, row
 
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 ROBOT = 'pruned'
 KEPT_DAYS = 4

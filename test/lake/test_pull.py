@@ -15,14 +15,16 @@ import pytest
 from click.testing import CliRunner
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.kept import KeptCut
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pull import _sentence
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
-from shadowhound_data_logger.errors import LakeError, SettingError
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.mailbox import KeptFilter, PullRequest
+from shadowhound_data_logger.core.model import Outcome, State
+from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -31,12 +33,10 @@ from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.scan import superseding
-from shadowhound_data_logger.mailbox import KeptFilter, PullRequest
-from shadowhound_data_logger.model import Outcome, State
-from shadowhound_data_logger.ship.requests import RequestServer
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.untrusted import visible
 
 NOON = '2025-10-18T12:00:00Z'
 

@@ -17,18 +17,17 @@ from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_par
 from policies.models import Spark
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import CredentialsRejected, LakeError, SettingError
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, SettingError
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.query import answering
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
     from faults.upstream import Request
-
-    from shadowhound_data_logger.sim.tower import Tower
+    from shadowhound_tower.embedded import Tower
 
 DAY = {'since': '2026-10-28', 'until': '2026-10-29'}
 

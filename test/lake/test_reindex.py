@@ -11,14 +11,14 @@ import pytest
 from lake.making import DAY_NS, NOON_NS, SENSORS, Watched, add, add_part, content, folder_store, keys, row
 
 from shadowhound_data_logger import lake
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import StoreUnavailable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import StoreUnavailable
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import reindex as library
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(0, 60, 20)] + [NOON_NS + DAY_NS]

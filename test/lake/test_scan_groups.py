@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.lake import scan
-from shadowhound_data_logger.model import ObjectInfo
 
 
 @pytest.mark.parametrize(('sizes', 'groups'), [

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lake.making import NOON_NS, add, folder_store
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, SettingError, UnknownName
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, SettingError, UnknownName
 from shadowhound_data_logger.lake import labels, search
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings

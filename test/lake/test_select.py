@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lake.making import DAY_NS, NOON_NS
 
-from shadowhound_data_logger.catalogue.schema import UNDATED
-from shadowhound_data_logger.clock import utc
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.clock import utc
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.formats.rows.schema import UNDATED
 from shadowhound_data_logger.lake.select import Wanted, wanted
 
 MIDNIGHT_NS = NOON_NS - DAY_NS // 2

@@ -22,17 +22,17 @@ from click.testing import CliRunner
 from lake import gap_parts
 from lake.making import NOON_NS, add, fill, folder_store, minutes
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.catalogue.gaps import WITHDRAWN
 from shadowhound_data_logger.cli.common import ExitCode
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows.gaps import WITHDRAWN
 from shadowhound_data_logger.lake import compact, labels, sink
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 osmem_server = pytest.importorskip('osmem_server')

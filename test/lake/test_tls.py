@@ -13,16 +13,16 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 from lake.training import Drive
+from shadowhound_tower.embedded import Tower
 from stores.certificates import WRONG, Authority
 from stores.tls_front import Secured, behind_tls
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.errors import SettingError, StoreUntrusted
+from shadowhound_data_logger.core.errors import SettingError, StoreUntrusted
+from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.lake import scan
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.options import StoreSettings
-from shadowhound_data_logger.sim.tower import Tower
 
 pytestmark = pytest.mark.seaweedfs
 ROBOT = 'secured'

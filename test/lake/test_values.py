@@ -20,12 +20,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lake.making import NOON_NS, add, folder_store
 
-from shadowhound_data_logger.catalogue import parts, schema
-from shadowhound_data_logger.catalogue.statistics import STATISTICS, statistic_rows
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.encode.statistics import MOST_FIELDS, FieldStatistics
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.formats.rows import parts, schema
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
+from shadowhound_data_logger.formats.statistics import MOST_FIELDS, FieldStatistics
 from shadowhound_data_logger.lake import compact as compacting
 from shadowhound_data_logger.lake import query, reading, values
 from shadowhound_data_logger.lake.bucket import Bucket

@@ -13,15 +13,15 @@ from typing import Any, Final
 
 import numpy as np
 import simplejpeg
-from encode.conftest import GO2_MESSAGES, Ros
+from formats.conftest import GO2_MESSAGES, Ros
 from lake.making import NOON_NS, add, add_part
 
-from shadowhound_data_logger.catalogue import schema
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import MissionDataset
-from shadowhound_data_logger.model import DataObject
-from shadowhound_data_logger.options import StoreSettings
 from shadowhound_data_logger.stores import open_store
 
 COMPRESSED, CLOUD, IMU = 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/PointCloud2', 'go2_interfaces/msg/IMU'

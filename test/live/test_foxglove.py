@@ -14,7 +14,7 @@ import pytest
 from domains import free_domain
 from live.test_access import Page, serving
 
-from shadowhound_data_logger.encode.definitions import describe
+from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live.access import Access, SignIn, make_tokens
 from shadowhound_data_logger.live.foxglove import MOST_WAITING, PROTOCOLS, FoxgloveClient

@@ -24,8 +24,12 @@ from live.test_kinds import cdr, header, new
 from spool.making import FakeClock, index_of, make, new_spool, put, settle
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, TriggerOf
-from shadowhound_data_logger.catalogue.schema import BUCKET, Row, row_of
-from shadowhound_data_logger.clock import SECOND, utc
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, UploadSettings
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.schema import BUCKET, Row, row_of
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.live import history as module
@@ -34,10 +38,6 @@ from shadowhound_data_logger.live.history import LabelRefused, PastReader, PullR
 from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kept import SpoolKept, StoreKept
 from shadowhound_data_logger.live.past import SpoolPast, StorePast
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import State
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -12,8 +12,9 @@ import simplejpeg
 from e2e.live_frames import opened
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.encode.types import MessageTypes
-from shadowhound_data_logger.errors import Rejected
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.live.kinds import (
     FULL,
     HALF,
@@ -27,7 +28,6 @@ from shadowhound_data_logger.live.kinds import (
     frames,
     series,
 )
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 STORE = get_typestore(Stores.LATEST)
 TYPES = MessageTypes()

@@ -16,7 +16,7 @@ from domains import free_domain
 from e2e.machines import ROBOT, Machines, inside
 from e2e.processes import COMMANDS, HERE, Node, Processes, until
 
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.spool.status import read
 
 pytestmark = [pytest.mark.ros, pytest.mark.long('a node and two machines')]

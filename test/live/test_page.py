@@ -37,15 +37,15 @@ from spool.test_status import written
 import shadowhound_data_logger
 from shadowhound_data_logger.bags.recording import UNWRITABLE
 from shadowhound_data_logger.bags.ring import RING_FULL
-from shadowhound_data_logger.capture.encode_pool import ENCODER_FAILED
-from shadowhound_data_logger.capture.sampling import QUEUE_FULL, SAMPLER_FAILED
-from shadowhound_data_logger.clock import SystemClock
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, UploadSettings
 from shadowhound_data_logger.lake.prune import CAUSE as RETENTION
 from shadowhound_data_logger.live import server as server_module
 from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
-from shadowhound_data_logger.options import COMPRESSED_IMAGE, UploadSettings
+from shadowhound_data_logger.node.encoding.encode_pool import ENCODER_FAILED
+from shadowhound_data_logger.node.intake.sampling import QUEUE_FULL, SAMPLER_FAILED
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.ros.fast_dds_profile import SHIPPED
 from shadowhound_data_logger.spool.accounts import PAUSED, WRONG_TYPE

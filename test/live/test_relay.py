@@ -18,11 +18,11 @@ from e2e.live_frames import Frames
 from live.test_access import Page, serving
 from live.test_kinds import of_too_many_pixels
 
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.live import access, relay, server
 from shadowhound_data_logger.live.access import make_tokens
 from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
 
 CAMERA, IMU = '/camera', '/imu'
 GRAPH = {CAMERA: COMPRESSED_IMAGE, IMU: 'sensor_msgs/msg/Imu'}

@@ -25,6 +25,7 @@ from live.test_h264 import software_encoder
 from live.test_webrtc import CAMERA, LEVELS, Robot, robot, until
 from PIL import Image
 
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.live import gstreamer as module
 from shadowhound_data_logger.live import h264, rtsp, rtsp_process
 from shadowhound_data_logger.live.access import make_tokens, rtsp_password
@@ -32,7 +33,6 @@ from shadowhound_data_logger.live.gstreamer import PYTHON
 from shadowhound_data_logger.live.h264 import SOFTWARE
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.rtsp import RtspServer, RtspUnavailable, unsuited
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
 
 PROBE = """import gi
 for name in ('Gst', 'GstRtspServer'):

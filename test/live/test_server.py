@@ -15,13 +15,13 @@ from live.test_access import UPGRADE, serving
 from spool.making import FakeClock
 from spool.test_status import written
 
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live.access import COOKIE
 from shadowhound_data_logger.live.figures import SpoolFigures
 from shadowhound_data_logger.live.kinds import FULL, HALF, LiveItem
 from shadowhound_data_logger.live.server import NARROW_S, LiveServer, LiveSettings
 from shadowhound_data_logger.live.viewer import Viewer
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
 
 CAMERA = '/camera'
 

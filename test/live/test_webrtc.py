@@ -17,10 +17,10 @@ import simplejpeg
 from live.test_access import Page, serving
 from live.test_h264 import software_encoder
 
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.live import h264
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live.kinds import LiveItem
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 CAMERA = '/camera'

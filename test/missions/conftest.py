@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from e2e.wire import Wire
 from missions.server import FOREIGN, Server, end_replayers, until
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.folder import MISSIONS, read_json
-from shadowhound_data_logger.sim.tower import Tower
 
 
 @pytest.fixture

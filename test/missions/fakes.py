@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions.story import Point
-from shadowhound_data_logger.model import DataObject
 
 
 @dataclass

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from e2e.wire import Wire
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 
 FOREIGN: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_')

@@ -19,7 +19,7 @@ from missions.server import Server
 from profiles import examples
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.overview import report

@@ -15,8 +15,8 @@ from missions.fakes import FakeDrawing, FakeTracking
 from spool.making import rows
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.missions.folder import missions
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.replay import OBJECTS, Replay

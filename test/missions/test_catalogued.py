@@ -8,8 +8,8 @@ from pathlib import Path
 import pyarrow.parquet
 from missions.fakes import journalling
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.missions.folder import Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of

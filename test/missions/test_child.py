@@ -17,7 +17,7 @@ from missions.fakes import journal
 from missions.server import end_replayers, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.missions import child
 from shadowhound_data_logger.missions.child import interpreter
 from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json

@@ -9,8 +9,8 @@ import pytest
 from clocks import NOON_NS, Clocks
 from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.dating import Dating
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.dating import Dating
 from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import WAITS, give_date
 from shadowhound_data_logger.missions.folder import MissionFolder, missions

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from missions.fakes import FakeSpooler, FakeTracking, journalling
 
-from shadowhound_data_logger.errors import TrackingError, TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, missions

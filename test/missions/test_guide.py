@@ -18,8 +18,8 @@ from missions.agent import jpeg
 from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores import open_store
 
 pytestmark = pytest.mark.seaweedfs

@@ -13,7 +13,7 @@ from missions.fakes import journal, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import SettingError
+from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.missions.copies import SPARES
 from shadowhound_data_logger.missions.folder import MISSIONS, missions
 from shadowhound_data_logger.missions.recorder import Mission

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.story import Point
 from shadowhound_data_logger.missions.tracking import MISSION_TAG, MlflowTracking

@@ -10,16 +10,16 @@ from pathlib import Path
 import pyarrow.parquet
 import pytest
 from missions.fakes import FakeSpooler, FakeTracking, journalling
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings, UploadSettings
-from shadowhound_data_logger.keys import check_key
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings, UploadSettings
+from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.missions import recorder
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 
 NOON_NS = 1_760_788_800 * 10**9

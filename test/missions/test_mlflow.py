@@ -16,7 +16,7 @@ from missions.agent import FRAME_EVERY, jpeg
 from missions.server import Server, complete, until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import TrackingRefused, TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.folder import MISSIONS, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.tracking import DUPLICATE_TAG, MISSION_TAG, MlflowTracking

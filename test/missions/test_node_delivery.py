@@ -9,7 +9,7 @@ from pathlib import Path
 from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.errors import TrackingError
+from shadowhound_data_logger.core.errors import TrackingError
 from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
 from shadowhound_data_logger.missions.delivery import NODE_S, Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder

@@ -10,14 +10,14 @@ import pytest
 from missions.fakes import journalling
 from spool.making import make, new_spool, put, rows
 
-from shadowhound_data_logger.clock import SystemClock
-from shadowhound_data_logger.config import Settings
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of
-from shadowhound_data_logger.model import DataObject
 from shadowhound_data_logger.spool.status import file
 
 RUN = Run('abc', '1', 'x')

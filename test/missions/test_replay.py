@@ -18,8 +18,8 @@ from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.durable_files import flock
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.overview import report

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from missions.fakes import FakeSpooler, FakeTracking, journalling
 
-from shadowhound_data_logger.durable_files import flock
+from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.journal import Journal

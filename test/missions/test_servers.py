@@ -21,8 +21,7 @@ from typing import Any, Final
 import pytest
 from missions.server import FOREIGN
 from missions.voyage import POINTS
-
-from shadowhound_data_logger.sim.servers import Ports, Server
+from shadowhound_tower.servers import Ports, Server
 
 TWO: Final = os.environ.get('SHADOWHOUND_MLFLOW2', '')
 POSTGRES: Final = shutil.which('postgres')

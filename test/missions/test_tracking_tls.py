@@ -13,7 +13,7 @@ import pytest
 from stores.certificates import DAY, Authority
 from stores.tls_front import behind_tls
 
-from shadowhound_data_logger.errors import TrackingUnavailable
+from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT, MlflowTracking
 
 WRONG: dict[str, tuple[str, dict[str, Any], str, str]] = {

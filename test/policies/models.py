@@ -15,9 +15,10 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.errors import PolicyRefused
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import PolicyRefused
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import packing, repository
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
@@ -25,7 +26,6 @@ from shadowhound_data_logger.policies.registry import RegisteredVersion, source_
 from shadowhound_data_logger.policies.repository import Repository
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync
 from shadowhound_data_logger.policies.trust import ROOT, target_of
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

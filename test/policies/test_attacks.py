@@ -22,11 +22,12 @@ from urllib.parse import urlsplit
 
 import pytest
 from policies.models import Aliases, Spark, bucket_of, linear
+from shadowhound_tower.embedded import Tower
 from tuf.api.metadata import DelegatedRole, Delegations, Metadata, MetaFile, Root, Snapshot, TargetFile, Targets, Timestamp
 
-from shadowhound_data_logger.errors import DataLoggerError, PolicyError, PolicyRefused
-from shadowhound_data_logger.model import SpooledObject
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import DataLoggerError, PolicyError, PolicyRefused
+from shadowhound_data_logger.core.model import SpooledObject
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import repository, sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.keys import load_key, load_public, make_key
@@ -35,7 +36,6 @@ from shadowhound_data_logger.policies.registry import BUCKET
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
 from shadowhound_data_logger.policies.sync import PolicySettings, PolicySync
 from shadowhound_data_logger.policies.trust import METADATA, SIGNED_AT, target_of, why_stale
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -19,13 +19,13 @@ from domains import free_domain
 from e2e.processes import Process, until
 from policies.models import Spark, bucket_of, linear
 from rclpy.node import Node
+from shadowhound_tower.embedded import Tower
 from std_msgs.msg import String
 
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.policies import packing
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.ros.policy_topics import NODE
-from shadowhound_data_logger.sim.tower import Tower
 
 pytestmark = [pytest.mark.seaweedfs, pytest.mark.slow, pytest.mark.long('an MLflow server, a service, and a dozen smoke runs')]
 

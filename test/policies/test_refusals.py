@@ -23,8 +23,8 @@ import pytest
 from onnx import helper, numpy_helper
 from policies.models import ACTION, STATE, Scene, Spark, linear, trained
 
-from shadowhound_data_logger import durable_files
-from shadowhound_data_logger.errors import PolicyError, PolicyRefused
+from shadowhound_data_logger.core import durable_files
+from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused
 from shadowhound_data_logger.policies import active, packing, smoke, sync
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.folder import PolicyFolder

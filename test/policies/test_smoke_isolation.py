@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from policies.models import Scene, Spark
 
-from shadowhound_data_logger.errors import PolicyError
+from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.policies import smoke, sync
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX, SmokeRun, is_enough, open_sandbox, run_smoke

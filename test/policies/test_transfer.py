@@ -13,14 +13,14 @@ from urllib.parse import urlsplit
 
 import pytest
 from policies.models import Aliases, Scene, Spark, bucket_of, linear
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import PolicyRefused, StoreUnavailable
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.policies import sync
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
 from shadowhound_data_logger.policies.trust import target_of
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.download import TRIES

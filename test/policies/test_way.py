@@ -11,11 +11,11 @@ from uuid import uuid4
 import pytest
 from click.testing import CliRunner
 from policies.models import bucket_of, linear, trained
+from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.errors import PolicyError
+from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.policies import active, registry
-from shadowhound_data_logger.sim.tower import Tower
 
 pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a process for each smoke run')]
 

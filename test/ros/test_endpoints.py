@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shadowhound_data_logger.capture.stream import Senders
+from shadowhound_data_logger.node.intake.stream import Senders
 from shadowhound_data_logger.ros.endpoints import Endpoint, HistoryDepth, Plan, logged_type, plans
 
 TYPE, OTHER = 'std_msgs/msg/String', 'std_msgs/msg/Int32'

@@ -17,7 +17,7 @@ from rclpy.serialization import serialize_message
 from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import String
 
-from shadowhound_data_logger.model import Taken
+from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.ros import librcl, reader
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused

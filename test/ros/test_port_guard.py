@@ -14,7 +14,7 @@ import pytest
 from domains import free_domain
 from ros.ports import CONDITION, DEAD, HEAD, LISTENERS, MUTEX, OTHER_MUTEX, SETTLED, ports_of, seem_to_process
 
-from shadowhound_data_logger.durable_files import flock
+from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.ros import port_guard
 from shadowhound_data_logger.ros.port_guard import IN_USE, MAKING_S, PROCESSING, WAITING, settle
 from shadowhound_data_logger.ros.shared_memory import PortGuard

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.durable_files import flock
+from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, dead_ports_avoided, orphans
 
 DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'

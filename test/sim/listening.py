@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 
-MODULE = 'shadowhound_data_logger.sim.sim_go2_node'
+MODULE = 'shadowhound_sim.sim_go2_node'
 COMMON = {
     'odom': 50, 'joint_states': 50, 'camera/image_raw': 30, 'camera/camera_info': 30, 'camera/compressed': 30, 'point_cloud2': 10,
 }  # fmt: skip

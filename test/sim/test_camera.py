@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 import simplejpeg
-
-from shadowhound_data_logger.sim import camera, glyphs
-from shadowhound_data_logger.sim.camera import Camera
-from shadowhound_data_logger.sim.world import World
+from shadowhound_sim import camera, glyphs
+from shadowhound_sim.camera import Camera
+from shadowhound_sim.world import World
 
 
 @pytest.fixture(scope='module')

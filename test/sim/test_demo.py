@@ -20,17 +20,17 @@ from urllib.request import ProxyHandler, build_opener
 import pytest
 from PIL import Image
 from rich.console import Console
-from ship.fakes import until
+from shadowhound_sim import demo, demo_processes, demo_report
+from shadowhound_sim.demo_audit import DemoAudit, audit
+from shadowhound_sim.demo_run import Record, SpoolReading, StoreOutage
+from shipping.fakes import until
 from spool.making import FakeClock, make, new_spool, settle
 
-from shadowhound_data_logger.catalogue.parts import encode
-from shadowhound_data_logger.catalogue.schema import row_of
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.config import CatalogueSettings
-from shadowhound_data_logger.model import DataObject, SpooledObject, State
-from shadowhound_data_logger.sim import demo, demo_processes, demo_report
-from shadowhound_data_logger.sim.demo_audit import DemoAudit, audit
-from shadowhound_data_logger.sim.demo_run import Record, SpoolReading, StoreOutage
+from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.formats.rows.parts import encode
+from shadowhound_data_logger.formats.rows.schema import row_of
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.memory import MemoryStore
 
@@ -371,7 +371,7 @@ def test_a_short_demo_ends_well(tmp_path: Path) -> None:
     """
     pytest.importorskip('rclpy')
     folder = tmp_path / 'demo'
-    command = [sys.executable, '-m', 'shadowhound_data_logger.sim.demo', '--keep']
+    command = [sys.executable, '-m', 'shadowhound_sim.demo', '--keep']
     options = ['--duration', '6', '--outage', '2', '--folder', str(folder)]
     environ = os.environ | {'COLUMNS': '80', 'PYTHONUNBUFFERED': '1'}
     with (tmp_path / 'errors').open('w+') as errors, ExitStack() as stack:

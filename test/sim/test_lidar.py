@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from shadowhound_data_logger.sim.floor_plan import CEILING
-from shadowhound_data_logger.sim.lidar import Lidar
-from shadowhound_data_logger.sim.world import World
+from shadowhound_sim.floor_plan import CEILING
+from shadowhound_sim.lidar import Lidar
+from shadowhound_sim.world import World
 
 TIMES = [0.0, 5.0, 11.3, 19.9, 27.5, 38.0, 52.1]
 

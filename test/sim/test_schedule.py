@@ -7,8 +7,7 @@ from itertools import islice, pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from shadowhound_data_logger.sim.sim_go2_node import count, schedule
+from shadowhound_sim.sim_go2_node import count, schedule
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from shadowhound_data_logger.errors import SettingError
-from shadowhound_data_logger.sim.sim_go2_node import SimSettings, run
+from shadowhound_sim.sim_go2_node import SimSettings, run
+
+from shadowhound_data_logger.core.errors import SettingError
 
 pytestmark = pytest.mark.ros
 

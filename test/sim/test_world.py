@@ -7,11 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from shadowhound_data_logger.sim import gait
-from shadowhound_data_logger.sim.floor_plan import ROOMS
-from shadowhound_data_logger.sim.patrol import SPEED, Patrol, wrapped
-from shadowhound_data_logger.sim.world import GRAVITY, World
+from shadowhound_sim import gait
+from shadowhound_sim.floor_plan import ROOMS
+from shadowhound_sim.patrol import SPEED, Patrol, wrapped
+from shadowhound_sim.world import GRAVITY, World
 
 STEP = 1e-4
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from spool.making import make, new_spool, put, receive
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import Binding, State
 from shadowhound_data_logger.spool.estimator import Hearing
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from spool.making import FakeClock, files, make, new_spool, put, settle
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.spool import Spool
 
 Open = Callable[..., Spool]

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import DataObject, SpooledObject, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.catalog_table import UncataloguedObject
 from shadowhound_data_logger.spool.index import Index

@@ -11,8 +11,8 @@ from spool.child import started
 from spool.conftest import Moments, Open
 from spool.making import BUCKET, NOON_NS, READY, FakeClock, assert_whole, files, make, new_spool, put, rows, settle
 
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.model import Binding, State
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.model import Binding, State
 from shadowhound_data_logger.spool import recovery
 from shadowhound_data_logger.spool.files import Tree, description_of
 from shadowhound_data_logger.spool.object_table import ObjectTable

@@ -10,8 +10,8 @@ import pytest
 from spool.conftest import Open
 from spool.making import FakeClock, clear_uncatalogued, index_of, make, new_spool, receive, settle
 
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.span import NumberRun

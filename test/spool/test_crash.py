@@ -15,7 +15,7 @@ from spool.child import started
 from spool.conftest import Moments, Open
 from spool.making import BUCKET, abandon, assert_whole, files, make, new_spool, put, receive, rows, settle
 
-from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.spool.spool import Spool
 
 

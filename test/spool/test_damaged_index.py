@@ -15,8 +15,8 @@ from profiles import examples
 from spool.conftest import Open
 from spool.making import BUCKET, FakeClock, abandon, assert_whole, files, make, new_spool, put, reopened, rows, settle
 
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool import adoption
 from shadowhound_data_logger.spool import files as files_module
 from shadowhound_data_logger.spool.schema import SCHEMA_VERSION

@@ -11,7 +11,7 @@ import pytest
 from spool.conftest import Moments, Open
 from spool.making import BUCKET, FakeClock, abandon, assert_whole, files, make, new_spool, put, rows, settle
 
-from shadowhound_data_logger.model import DataObject, FileBody, State
+from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter

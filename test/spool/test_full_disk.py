@@ -14,9 +14,9 @@ import pytest
 from spool.conftest import Open
 from spool.making import FakeClock, assert_whole, files, make, put, receive, rows, settle
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import Outcome, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.spool.account_table import AccountTable
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.object_table import ObjectTable

@@ -12,8 +12,8 @@ from profiles import examples
 from spool.conftest import Open
 from spool.making import NOON_NS, FakeClock, abandon, make, new_spool, put
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.model import Outcome, SpooledObject, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.spool import gap_table, gaps, ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.gap_table import GapTable

@@ -10,7 +10,7 @@ import pytest
 from spool.conftest import Open
 from spool.making import abandon, new_spool
 
-from shadowhound_data_logger.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from spool.making import make, put
 
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import spool as spool_module
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool

@@ -12,8 +12,8 @@ import pytest
 from spool.conftest import Open
 from spool.making import NOON_NS, FakeClock, make
 
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import MissingRow, RecordingRows, SliceRow, State
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceRow, State
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.recording_table import RecordingTable
 from shadowhound_data_logger.spool.spool import Spool

@@ -9,8 +9,8 @@ from spool.child import started
 from spool.conftest import Open
 from spool.making import assert_whole, make, put, rows, settle
 
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 

@@ -10,7 +10,7 @@ from spool.child import started
 from spool.conftest import Open
 from spool.making import assert_whole, make, put, reopened, rows, settle
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.files import ATTRIBUTE
 
 

@@ -11,7 +11,7 @@ from bags.recording import desk
 from clocks import Clocks
 from spool.making import make, new_spool, put
 
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.listing import retry

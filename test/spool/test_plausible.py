@@ -14,7 +14,7 @@ from spool import editing, rotting
 from spool.conftest import Open
 from spool.making import index_of, make, put, settle
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 
 ROUNDS = examples(40)
 

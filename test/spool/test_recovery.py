@@ -23,7 +23,7 @@ from spool.making import (
     settle,
 )
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 
 
 def test_nothing_to_do_after_a_clean_stop(opened: Open, root: Path, used: dict[str, bytes]) -> None:

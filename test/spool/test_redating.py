@@ -12,10 +12,10 @@ import pytest
 from clocks import NOON_NS, Clocks
 from spool.making import assert_whole, make, receive, rows
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.clock_watch import ClockWatch
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import DataObject, SpooledObject
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, SpooledObject
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.clock_record import BOOTS, ClockRecord, file
 from shadowhound_data_logger.spool.redating import STEP, Redating

@@ -9,8 +9,8 @@ import pytest
 from spool.conftest import Open
 from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncatalogued
 
-from shadowhound_data_logger.metadata_words import CONTENT_KEY
-from shadowhound_data_logger.model import DataObject, State
+from shadowhound_data_logger.core.metadata_words import CONTENT_KEY
+from shadowhound_data_logger.core.model import DataObject, State
 from shadowhound_data_logger.spool.spool import Spool
 
 

@@ -13,7 +13,7 @@ from spool import rotting
 from spool.conftest import Open
 from spool.making import READY, files, make, put, rows
 
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.files import Tree
 
 ROUNDS = examples(40)

@@ -16,8 +16,8 @@ from profiles import examples
 from spool.conftest import Open
 from spool.making import BUCKET, NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows, short_rows
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.model import DataObject, Outcome, State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.model import DataObject, Outcome, State
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.history_table import COMPACT_STATES

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from ship.fakes import until
+from shipping.fakes import until
 from spool.conftest import Open
 from spool.making import FakeClock, assert_whole, files, make, new_spool, put, receive, rows
 
-from shadowhound_data_logger import worker
-from shadowhound_data_logger.errors import SpoolError
+from shadowhound_data_logger.core import worker
+from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import ballast
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter

@@ -26,10 +26,10 @@ from spool.making import (
 )
 
 from shadowhound_data_logger.bags.local import RECORDS
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.errors import SpoolError
-from shadowhound_data_logger.keys import MAX_SEGMENT_BYTES
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.keys import MAX_SEGMENT_BYTES
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from spool.making import NOON_NS, FakeClock, make, new_spool, put, settle
 
-from shadowhound_data_logger.clock import SECOND, SystemClock
-from shadowhound_data_logger.config import SpoolSettings
-from shadowhound_data_logger.model import State
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.status import file, limits, read, robots
 
 

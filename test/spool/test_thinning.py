@@ -17,21 +17,21 @@ import pytest
 from spool.conftest import Moments
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
 
-from shadowhound_data_logger import metadata_words as words
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
-from shadowhound_data_logger.capture.halving import Halving
-from shadowhound_data_logger.catalogue.writer import CatalogueWriter
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import CatalogueSettings, KeepSettings, SpoolSettings
-from shadowhound_data_logger.encode.archive import ArchiveFile, pack_tar, pack_zip
-from shadowhound_data_logger.mcap.index import read_index
-from shadowhound_data_logger.mcap.messages import MessageFilter, read_messages
-from shadowhound_data_logger.mcap.ranges import LocalFile
-from shadowhound_data_logger.mcap.slice_info import Channel
-from shadowhound_data_logger.mcap.writer import SliceWriter
-from shadowhound_data_logger.model import DataObject, FileBody
-from shadowhound_data_logger.options import COMPRESSED_IMAGE
-from shadowhound_data_logger.ship.thinning import Thinner, may_halve
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings
+from shadowhound_data_logger.core.model import DataObject, FileBody
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
+from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar, pack_zip
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.formats.mcap.slice_info import Channel
+from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.thinning import Thinner, may_halve
 from shadowhound_data_logger.spool.files import description_of
 from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.spool import Spool

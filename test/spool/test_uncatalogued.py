@@ -20,7 +20,7 @@ from spool.making import (
     uncatalogued,
 )
 
-from shadowhound_data_logger.model import DataObject, Outcome, State
+from shadowhound_data_logger.core.model import DataObject, Outcome, State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.spool import Spool
 

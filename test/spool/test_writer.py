@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ship.fakes import until
+from shipping.fakes import until
 from spool.making import assert_whole, files, make, new_spool, receive, rows
 
-from shadowhound_data_logger import metadata_words as words
-from shadowhound_data_logger import worker
-from shadowhound_data_logger.errors import NameRefused
-from shadowhound_data_logger.model import DataObject, FileBody, SpooledObject, State
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import worker
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.spool import writer as writer_module
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES

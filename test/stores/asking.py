@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import DataLoggerError, ObjectRefused
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import DataLoggerError, ObjectRefused
 
 SECRET = 'a-Secret-that-nobody-may-see'
 

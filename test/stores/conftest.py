@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 from botocore.exceptions import ClientError
+from shadowhound_tower.embedded import Tower
 from stores.asking import settings_for
 from stores.spooled import MOTO, QUICK, Spool
 
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_reader, open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.memory import MemoryStore

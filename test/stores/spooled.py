@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import StoreUnavailable
-from shadowhound_data_logger.model import SpooledObject
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import StoreUnavailable
+from shadowhound_data_logger.core.model import SpooledObject
 
 MOTO = pytest.param('moto', marks=pytest.mark.long('a second S3 server, a slow one'))
 """The request for moto beside SeaweedFS."""

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from spool.making import make, new_spool, put, settle
 
-from shadowhound_data_logger.errors import AccessDenied, CredentialsRejected, StoreError, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo, SpooledObject, State
-from shadowhound_data_logger.ship.audit import KEYS, Audit, audit
+from shadowhound_data_logger.core.errors import AccessDenied, CredentialsRejected, StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject, State
+from shadowhound_data_logger.shipping.audit import KEYS, Audit, audit
 from shadowhound_data_logger.spool import deliveries as deliveries_module
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.spool import Spool

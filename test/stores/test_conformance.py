@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from profiles import examples
 from stores.spooled import Spool
 
-from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
-from shadowhound_data_logger.model import Put, SpooledObject
+from shadowhound_data_logger.core.errors import ForeignObject, ObjectRefused
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores.base import ObjectStore
 
 ALL_CHARACTERS = "thor/AZaz09!_.*'()=+@-/AZaz09!_.*'()=+@-.jpg"

@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 from botocore.credentials import InstanceMetadataProvider
 from botocore.exceptions import NoCredentialsError, PartialCredentialsError
+from shadowhound_tower.embedded import Tower
 from stores.asking import SECRET, error_of
 from stores.fake_s3 import FakeS3, error, served
 from stores.spooled import Spool
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import CredentialsRejected, SettingError
-from shadowhound_data_logger.model import Put
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import CredentialsRejected, SettingError
+from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.credentials import REREAD_S, Keys
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES

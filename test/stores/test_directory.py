@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from stores.spooled import QUICK, Spool
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import AccessDenied, ForeignObject, ObjectRefused, StoreError, StoreUnavailable
-from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, ObjectRefused, StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 

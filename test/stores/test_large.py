@@ -10,12 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from shadowhound_tower.embedded import Tower
 from stores.spooled import MOTO, QUICK, Spool
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import ForeignObject, ObjectRefused
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import ForeignObject, ObjectRefused
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store

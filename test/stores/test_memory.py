@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from stores.spooled import Spool
 
-from shadowhound_data_logger.errors import StoreUnavailable
-from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.core.errors import StoreUnavailable
+from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.memory import MemoryStore
 
 

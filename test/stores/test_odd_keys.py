@@ -11,14 +11,14 @@ import boto3
 import pytest
 from botocore.config import Config
 from botocore.exceptions import ClientError
+from shadowhound_tower.embedded import Tower
 from stores.spooled import MOTO, QUICK
 
-from shadowhound_data_logger.config import StoreSettings
+from shadowhound_data_logger.core.config import StoreSettings
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetch import fetch, under
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reindex import reindex
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores import open_reader, open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 

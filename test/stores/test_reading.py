@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from stores.spooled import Spool
 
-from shadowhound_data_logger.errors import ObjectRefused, StoreUnavailable
-from shadowhound_data_logger.model import ObjectInfo
+from shadowhound_data_logger.core.errors import ObjectRefused, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.stores.base import Content, ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
 from shadowhound_data_logger.stores.download import TRIES, download

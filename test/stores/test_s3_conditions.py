@@ -12,8 +12,8 @@ from stores.asking import error_of
 from stores.fake_s3 import FakeS3, served
 from stores.spooled import Spool
 
-from shadowhound_data_logger.errors import AccessDenied, ForeignObject, StoreError
-from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, StoreError
+from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.s3 import S3Store
 
 

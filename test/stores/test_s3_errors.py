@@ -7,7 +7,7 @@ from botocore import exceptions as boto
 from botocore.parsers import ResponseParserError
 from urllib3 import exceptions as urllib3
 
-from shadowhound_data_logger.errors import (
+from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
     CredentialsRejected,

@@ -9,15 +9,15 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
+from shadowhound_tower.embedded import Tower
 from stores import fake_s3
 from stores.asking import error_of
 from stores.fake_s3 import FakeS3, served
 from stores.spooled import QUICK, Spool, with_room
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.errors import StoreError, StoreUnavailable
-from shadowhound_data_logger.model import Put
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import StoreError, StoreUnavailable
+from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores import s3
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent

@@ -13,10 +13,10 @@ import pytest
 from stores.asking import settings_for
 from stores.fake_s3 import refused, resetting
 
-from shadowhound_data_logger.errors import ObjectRefused, SettingError, StoreUnavailable
+from shadowhound_data_logger.core.errors import ObjectRefused, SettingError, StoreUnavailable
+from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.model import ObjectInfo
-from shadowhound_data_logger.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.content import CHUNK_BYTES

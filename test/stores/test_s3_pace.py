@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from ship.fakes import until
+from shipping.fakes import until
 from stores.fake_s3 import error, etag
 from stores.spooled import Spool
 
-from shadowhound_data_logger.bandwidth import BYTES_PER_MEGABIT, LATE_S, PIECE_S
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import ForeignObject, StoreUnavailable
-from shadowhound_data_logger.model import Put
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import ForeignObject, StoreUnavailable
+from shadowhound_data_logger.core.model import Put
+from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT, LATE_S, PIECE_S
 from shadowhound_data_logger.stores.s3 import LOOK_FIRST_BYTES, S3Store
 
 

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from shadowhound_tower.embedded import Tower
 from stores.asking import SECRET, error_of, settings_for
 from stores.fake_s3 import FakeS3, served
 from stores.spooled import QUICK, Spool, with_room
 
-from shadowhound_data_logger.config import StoreSettings
-from shadowhound_data_logger.errors import (
+from shadowhound_data_logger.core.config import StoreSettings
+from shadowhound_data_logger.core.errors import (
     AccessDenied,
     BucketMissing,
     CredentialsRejected,
@@ -21,8 +22,7 @@ from shadowhound_data_logger.errors import (
     SettingError,
     StoreUnavailable,
 )
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores import open_store, s3
 from shadowhound_data_logger.stores.content import chunks
 from shadowhound_data_logger.stores.s3 import S3Store

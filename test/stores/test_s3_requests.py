@@ -14,7 +14,7 @@ def test_botocore_brings_no_pyopenssl() -> None:
     pytest.importorskip('OpenSSL')
     program = (
         'import sys\n'
-        'from shadowhound_data_logger.options import StoreSettings, UploadSettings\n'
+        'from shadowhound_data_logger.core.options import StoreSettings, UploadSettings\n'
         'from shadowhound_data_logger.stores import open_store\n'
         "open_store(StoreSettings(endpoint_url='http://127.0.0.1:9'), UploadSettings()).close()\n"
         "print('botocore.httpsession' in sys.modules, 'cryptography' in sys.modules)\n"

@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from shadowhound_tower.embedded import Tower
 from stores.asking import error_of
 from stores.certificates import DAY, WRONG, Authority
 from stores.fake_s3 import FakeS3, served
 from stores.spooled import QUICK, Spool, with_room
 from stores.tls_front import Secured, behind_tls
 
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.errors import SettingError, StoreUnavailable, StoreUntrusted
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.ship.failures import Verdict, decide
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import SettingError, StoreUnavailable, StoreUntrusted
+from shadowhound_data_logger.core.model import Put, SpooledObject
+from shadowhound_data_logger.shipping.failures import Verdict, decide
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES

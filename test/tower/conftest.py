@@ -9,9 +9,8 @@ from typing import Any, Final
 
 import boto3
 import pytest
+from shadowhound_tower.embedded import Tower
 from tower_scripts import make_secrets, prepare
-
-from shadowhound_data_logger.sim.tower import Tower
 
 PORTS: Final = (9000, 5001, 5432, 9333, 8080, 8888)
 

@@ -18,10 +18,9 @@ import pytest
 import urllib3
 import yaml
 from missions.server import until
+from shadowhound_tower import mlflow_access
+from shadowhound_tower.servers import Ports, Server, find_program
 from tower_scripts import TOWER, make_secrets, prepare
-
-from shadowhound_data_logger.sim import mlflow_access
-from shadowhound_data_logger.sim.servers import Ports, Server, find_program
 
 
 @pytest.fixture(scope='module')

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 from botocore.configloader import raw_config_parse
+from shadowhound_tower import mlflow_access
 from tower_scripts import TOWER, make_secrets
 
-from shadowhound_data_logger.mlflow_rest import login
-from shadowhound_data_logger.sim import mlflow_access
+from shadowhound_data_logger.core.mlflow_rest import login
 
 
 def _modes(folder: Path) -> set[str]:

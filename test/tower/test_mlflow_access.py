@@ -20,9 +20,8 @@ from urllib.parse import urlencode
 
 import pytest
 import urllib3
-
-from shadowhound_data_logger.sim import mlflow_access
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_tower import mlflow_access
+from shadowhound_tower.embedded import Tower
 
 pytestmark = pytest.mark.seaweedfs
 API = ('/api/2.0/mlflow', '/api/2.0/preview/mlflow', '/ajax-api/2.0/mlflow', '/ajax-api/2.0/preview/mlflow')

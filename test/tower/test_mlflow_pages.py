@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from shadowhound_tower.embedded import Tower
 from tower.test_mlflow_access import User, _artifact
-
-from shadowhound_data_logger.sim.tower import Tower
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 pytestmark = pytest.mark.seaweedfs

@@ -19,11 +19,11 @@ import boto3
 import pytest
 from click.testing import CliRunner
 from lake.making import NOON_NS, add, add_part
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.catalogue import schema
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.stores import open_store
 
 pytestmark = [

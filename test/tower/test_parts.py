@@ -20,10 +20,10 @@ from botocore.exceptions import ClientError
 from faults.front import Front
 from faults.kinds import Fault
 from faults.upstream import Request
+from shadowhound_tower.embedded import Tower
 
-from shadowhound_data_logger.config import UploadSettings
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.stores import content, s3
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -37,7 +37,7 @@ BEFORE = 2
 PROGRAM = """
 import sys
 from pathlib import Path
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import content, s3
 sys.path.insert(0, sys.argv[1])
 from tower.test_parts import KEY, PART, slice_of

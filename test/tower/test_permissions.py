@@ -17,20 +17,20 @@ import urllib3
 from botocore.config import Config
 from botocore.exceptions import ClientError
 from lake.making import add, add_part, row
+from shadowhound_tower.embedded import Tower
 from tower_scripts import make_secrets, prepare
 
-from shadowhound_data_logger.clock import SECOND
-from shadowhound_data_logger.config import UploadSettings
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, LakeError
+from shadowhound_data_logger.core.mailbox import KeptFilter, decode_inbox, inbox_key
+from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.doctor.model import Severity
 from shadowhound_data_logger.doctor.s3 import RACED, race_mailboxes
 from shadowhound_data_logger.doctor.s3_put import single_requests
-from shadowhound_data_logger.errors import AccessDenied, ForeignObject, LakeError
 from shadowhound_data_logger.lake import prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.mailbox import KeptFilter, decode_inbox, inbox_key
-from shadowhound_data_logger.model import Put, SpooledObject
-from shadowhound_data_logger.sim.tower import Tower
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs

@@ -22,10 +22,9 @@ import boto3
 import pytest
 from botocore.exceptions import ClientError
 from open_seaweed import free_offset
+from shadowhound_tower.servers import ServerFailed
 from tower_scripts import TOWER, make_secrets, processes_of, reload_s3, remove_database, run
 from tower_scripts import run as run_module
-
-from shadowhound_data_logger.sim.servers import ServerFailed
 
 pytestmark = [
     pytest.mark.seaweedfs,

@@ -26,11 +26,10 @@ import pytest
 import yaml
 from botocore.exceptions import ClientError
 from open_seaweed import HOST, KEY, PORTS, free_offset, open_seaweed
+from shadowhound_tower.embedded import Tower
+from shadowhound_tower.servers import GRPC, Server, find_program, seaweed_sockets
 from tower.stranger import ask, field, methods, reach
 from tower_scripts import TOWER, make_secrets, prepare, processes_of, remove_database, run
-
-from shadowhound_data_logger.sim.servers import GRPC, Server, find_program, seaweed_sockets
-from shadowhound_data_logger.sim.tower import Tower
 
 pytestmark = pytest.mark.seaweedfs
 START_S: Final = 150.0

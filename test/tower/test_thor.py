@@ -18,7 +18,7 @@ from missions.server import complete
 from tower_scripts import TOWER, make_secrets, reload_s3, remove_database
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.missions.folder import missions
 from shadowhound_data_logger.stores.s3 import S3Store
 

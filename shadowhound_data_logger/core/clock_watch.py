@@ -1,0 +1,116 @@
+"""Watches the wall clock by the boot clock: whether it was ever set, and when it steps.
+
+A robot without a battery for its clock starts in 1970 (or in the year of its image) and learns the time minutes later, or
+never. The boot clock does not step; the difference between the two does when somebody sets the wall clock.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock
+
+log = logging.getLogger(__name__)
+
+STEP_NS: Final = SECOND
+"""A clock that is slewed (at most 0.5 ms a second) never moves so far between two looks."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockState:
+    """What is known of the wall clock at one instant."""
+
+    is_set: bool
+    gave_up: bool
+    """Whether it was not set for so long that nothing is held for it any more."""
+    unset_s: float
+    """How long it has not been set, as far as this process knows; 0 when it is set."""
+    steps: int
+    """Steps so far; the first setting is one."""
+    last_step_s: float | None
+    """By how much it stepped last, seconds."""
+    last_step_age_s: float | None
+
+
+class ClockWatch:
+    """A Clock that knows how far it can be trusted. New; ``look`` once a second on one thread, the rest on any.
+
+    ``_lock`` guards what the last look found. ``steps`` are those that earlier processes have counted.
+    """
+
+    def __init__(self, clock: Clock, hold_s: float, steps: int = 0) -> None:
+        self._clock = clock
+        self.hold_s = hold_s
+        self._hold_ns = round(hold_s * SECOND)
+        self._lock = threading.Lock()
+        self._offset_ns = clock.wall_ns() - clock.boot_ns()
+        self._unset_since_ns = clock.boot_ns()
+        self._was_set = self.is_set
+        self._told = self._gave_up = False
+        self._steps = steps
+        self._last_step_ns: int | None = None
+        self._stepped_ns = 0
+
+    @property
+    def boot_id(self) -> str:
+        return self._clock.boot_id
+
+    def wall_ns(self) -> int:
+        return self._clock.wall_ns()
+
+    def boot_ns(self) -> int:
+        return self._clock.boot_ns()
+
+    @property
+    def unset_since_ns(self) -> int:
+        """By the boot clock: since when it is not set, as far as this process knows. It says nothing while it is set."""
+        with self._lock:
+            return self._unset_since_ns
+
+    @property
+    def is_set(self) -> bool:
+        return self._clock.wall_ns() >= EARLIEST_SANE_NS
+
+    def offset_ns(self) -> int | None:
+        """What has to be added to the boot clock to have UTC; None while the clock is not set."""
+        wall_ns = self._clock.wall_ns()
+        return wall_ns - self._clock.boot_ns() if wall_ns >= EARLIEST_SANE_NS else None
+
+    def state(self) -> ClockState:
+        with self._lock:
+            now_ns, is_set = self._clock.boot_ns(), self.is_set
+            unset_ns = 0 if is_set else now_ns - self._unset_since_ns
+            step, age_s = self._last_step_ns, round((now_ns - self._stepped_ns) / SECOND, 1)
+            return ClockState(is_set, unset_ns > self._hold_ns, round(unset_ns / SECOND, 1), self._steps,
+                              None if step is None else round(step / SECOND, 3), None if step is None else age_s)  # fmt: skip
+
+    def look(self) -> bool:
+        """Compare with the last look and say what changed; whether anything did."""
+        with self._lock:
+            was_set, self._was_set = self._was_set, self.is_set
+            before_ns, self._offset_ns = self._offset_ns, self._clock.wall_ns() - self._clock.boot_ns()
+            step_ns = self._offset_ns - before_ns
+            stepped = abs(step_ns) > STEP_NS
+            if was_set and not self._was_set:
+                self._unset_since_ns = self._clock.boot_ns()
+            if stepped:
+                self._steps += 1
+                self._last_step_ns, self._stepped_ns = step_ns, self._clock.boot_ns()
+        self._tell(step_ns if stepped else None, was_set=was_set)
+        return stepped or was_set != self._was_set
+
+    def _tell(self, step_ns: int | None, *, was_set: bool) -> None:
+        state = self.state()
+        if state.is_set and not was_set:
+            log.warning('the clock was set; it stepped by %.3f s', (step_ns or 0) / SECOND)
+        elif step_ns is not None:
+            log.warning('the clock stepped by %.3f s', step_ns / SECOND)
+        if not state.is_set and not self._told:
+            log.warning('the clock of this machine is not set: objects wait up to %.0f s for their date; does it reach a time'
+                        ' server? `timedatectl`', self._hold_ns / SECOND)  # fmt: skip
+        if state.gave_up and not self._gave_up:
+            log.warning('the clock was not set for %.0f s: objects go to _unsynced/%s', state.unset_s, self.boot_id)
+        self._told, self._gave_up = not state.is_set, state.gave_up

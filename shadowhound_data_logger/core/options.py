@@ -1,0 +1,317 @@
+"""Everything that can be set, with its default, its bounds and its help text. Values only: ``config`` reads and checks them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.core.clock import SECOND
+
+MEBI: Final = 1 << 20
+GIBI: Final = 1 << 30
+FORMATS: Final = ('jpeg', 'png', 'pcd', 'json', 'cdr', 'zip', 'tar')
+ARCHIVES: Final = ('zip', 'tar')
+"""Formats that hold a file of each message; they make sense for batches alone."""
+BATCHED: Final = ('json', *ARCHIVES)
+"""Formats that can hold several messages."""
+CAPTURES: Final = ('always', 'mission')
+RECORDS: Final = ('service', 'mission', 'always')
+ALWAYS, ON_REQUEST = 'always', 'on_request'
+SHIPS: Final = (ALWAYS, ON_REQUEST)
+COMPRESSIONS: Final = ('zstd', 'none')
+RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS = 'auto', 'robot', 'fastrtps'
+COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
+IMAGE: Final = 'sensor_msgs/msg/Image'
+POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
+BULK: Final = frozenset({COMPRESSED_IMAGE, IMAGE, POINT_CLOUD})
+"""Types of which one message is as large as hundreds of others."""
+
+
+def _setting(default: Any, text: str, *, low: float | None = None, high: float | None = None,
+             choices: Sequence[str] = (), live: bool = False) -> Any:  # fmt: skip
+    """A dataclass field that knows its help text, what values it allows, and whether it can be changed while the node runs."""
+    metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices), 'live': live}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorSettings:
+    """One sensor: the topic it is taken from, what is kept of it, and what becomes of that."""
+
+    name: str
+    enabled: bool = _setting(True, 'Log this sensor.', live=True)
+    topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
+    types: tuple[str, ...] = _setting(
+        (), 'Message type of each topic; other types on it are not logged. Where empty, the first that is published.'
+    )
+    rate_hz: float = _setting(
+        1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
+    )
+    on_change: bool = _setting(False, 'Keep a message only when its content, apart from its stamp, differs from the last one.')
+    batch_s: float = _setting(0.0, 'Seconds of messages in one object; 0 makes an object of each message.', low=0.0, high=3600.0)
+    format: str = _setting('json', 'File format of an object; zip and tar hold several messages.', choices=FORMATS)
+    quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
+    bucket: str = _setting('sensor-data', 'Bucket of its objects.')
+    key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
+    dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalogue.')
+    priority: int = _setting(
+        5, '0 is uploaded first and dropped or evicted last; 9 is uploaded last and evicted first.', low=0, high=9, live=True
+    )
+    expected_hz: float = _setting(
+        0.0, 'Rate at which it is published, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
+    )
+    ship: str = _setting(
+        ALWAYS, 'Upload its objects always, or keep them on the robot and upload those that are asked for.', choices=SHIPS
+    )
+    counter: str = _setting(
+        '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
+    )
+
+    statistics: tuple[str, ...] = _setting(
+        ('',), 'Fields whose statistics go to the catalogue, such as bms_state.soc; none named: the first 64; "none": none.'
+    )
+
+    @property
+    def period_ns(self) -> int:
+        """The time between two objects as far as their names go, ns; 0 where they can follow each other at any distance."""
+        if self.batch_s:
+            return round(self.batch_s * 1e9)
+        if self.on_change:
+            return SECOND
+        return round(1e9 / self.rate_hz) if self.rate_hz else 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaptureSettings:
+    """How the node takes part in ROS."""
+
+    rmw: str = _setting(
+        RMW_AUTO,
+        "RMW to listen with: the robot's own, fastrtps, or auto (fastrtps where that hears as much as Cyclone DDS).",
+        choices=(RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueueSettings:
+    """The bounded queue between intake and the encode pool."""
+
+    max_bytes: int = _setting(
+        64 * MEBI, 'Memory for messages that wait for an encoder; beyond it those of the lowest priority are dropped.', low=MEBI
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpoolSettings:
+    """The durable spool."""
+
+    max_bytes: int = _setting(
+        20 * GIBI, 'Most bytes of objects in the spool; beyond it the least important are evicted.', low=MEBI
+    )
+    min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
+    remember_days: float = _setting(
+        3.0, 'Days for which the keys of delivered objects are remembered, for ledger --verify.', low=1.0, high=3650.0
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeepSettings:
+    """What stays on the robot until somebody asks for it (``ship: on_request``)."""
+
+    max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
+    days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
+    thin_to_hz: float = _setting(
+        1.0, 'Once room runs short, old pictures and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
+        high=1000.0
+    )  # fmt: skip
+    missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
+    preview_s: float = _setting(
+        1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0
+    )
+    poll_s: float = _setting(10.0, 'Seconds between two looks at what is asked for.', low=0.5, high=3600.0)
+    when: str = _setting('', 'Upload what is asked for only while this rule holds; empty: always.')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UploadSettings:
+    """Delivery."""
+
+    threads: int = _setting(4, 'Objects uploaded at a time.', low=1, high=64)
+    connect_timeout_s: float = 5.0
+    """Not a parameter: of the doctor and of tests."""
+    read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
+    backoff_s: float = _setting(
+        60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
+    )
+    max_mbps: float = _setting(0.0, 'Most megabits a second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
+    when: str = _setting(
+        '', 'Upload only while this rule holds: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShutdownSettings:
+    """What a SIGINT or SIGTERM may take."""
+
+    drain_s: float = _setting(3.0, 'Seconds to continue uploading when the node is stopped.', low=0.0, high=600.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockSettings:
+    """Which times are trusted, and what becomes of objects that are taken before the clock of this machine was set."""
+
+    max_offset_s: float = _setting(
+        86_400.0,
+        'Seconds that a stamp may be before or after the arrival of its message; a message outside this is dated by its arrival.',
+        low=1.0,
+        high=1e9,
+    )
+
+    hold_s: float = _setting(
+        600.0,
+        'Seconds to wait for the clock to be set; then objects are uploaded without a date, under _unsynced.',
+        low=0.0,
+        high=1e6,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionSettings:
+    """What the node does while a mission of its robot is active."""
+
+    capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
+    join: bool = _setting(True, "Log the robot's state to the mission's run beside the agent.")
+    period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
+    battery: str = _setting('lowstate:bms_state.soc', 'Topic and field of battery_pct; empty for none.')
+    temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
+    odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
+    frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')
+    frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CatalogueSettings:
+    """The catalogue of what the store holds, written after delivery."""
+
+    enabled: bool = _setting(True, 'Write a row for each delivered object to the catalogue.')
+    period_s: float = _setting(60.0, 'Seconds between two files of the catalogue.', low=1.0, high=86_400.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BagSettings:
+    """Recording at full rate, whatever the sensors keep."""
+
+    record: str = _setting(
+        'service', 'When: service (from bag start to bag stop), mission (in every mission as well) or always.', choices=RECORDS
+    )
+    topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
+    regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
+    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    slice_s: float = _setting(
+        60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
+    )
+    slice_bytes: int = _setting(256 * MEBI, 'Most bytes in one file of a bag.', low=MEBI)
+    compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
+    priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
+    ship: str = _setting(
+        ALWAYS, 'Upload bags always, or keep them on the robot and upload the slices that are asked for.', choices=SHIPS
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSettings:
+    """The last seconds of some topics, in memory, of which an event makes a bag; off while no topic is named."""
+
+    topics: tuple[str, ...] = _setting(('',), 'Topics to keep; with neither topics nor a regex, there are no events.')
+    regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
+    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    pre_s: float = _setting(30.0, 'Seconds to keep from before a trigger.', low=0.0, high=3600.0, live=True)
+    post_s: float = _setting(
+        10.0, 'Seconds to keep after it; another trigger in that time prolongs the event.', low=0.0, high=3600.0, live=True
+    )
+    max_s: float = _setting(
+        120.0,
+        'Most seconds from the first trigger to the end of an event; then another event begins.',
+        low=1.0,
+        high=1e5,
+        live=True,
+    )
+    max_bytes: int = _setting(
+        64 * MEBI, 'Memory for what is kept; beyond it the oldest messages go, whatever pre_s is.', low=MEBI, live=True
+    )
+    log_event: str = _setting(
+        '.*', "An agent's log_event triggers an event where its name matches this regular expression; empty for none.", live=True
+    )
+    conditions: tuple[str, ...] = _setting(
+        ('',),
+        'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
+    )
+    when: str = _setting('', 'Upload the bags of events only while this rule holds; empty: always, whatever upload.when says.')
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is kept."""
+        return bool(self.regex or any(self.topics))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoreSettings:
+    """Where objects go: an S3 server, or without an endpoint a folder of the same layout."""
+
+    endpoint_url: str | None = None
+    access_key_id: str | None = field(default=None, repr=False)
+    secret_access_key: str | None = field(default=None, repr=False)
+    session_token: str | None = field(default=None, repr=False)
+    region: str = 'us-east-1'
+    directory: Path = Path('store')
+
+
+GROUPS: Final[dict[str, type]] = {
+    'capture': CaptureSettings,
+    'queue': QueueSettings,
+    'spool': SpoolSettings,
+    'keep': KeepSettings,
+    'upload': UploadSettings,
+    'shutdown': ShutdownSettings,
+    'clock': ClockSettings,
+    'mission': MissionSettings,
+    'bag': BagSettings,
+    'events': EventSettings,
+    'catalogue': CatalogueSettings,
+}
+DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
+    'camera': {
+        'topics': ('camera/compressed', 'camera/image_raw'), 'types': (COMPRESSED_IMAGE, IMAGE), 'format': 'jpeg',
+        'key': '{robot}/camera/{date}/{time}_front.{ext}', 'priority': 6,
+    },
+    'camera_info': {
+        'topics': ('camera/camera_info',), 'types': ('sensor_msgs/msg/CameraInfo',), 'rate_hz': 0.0, 'on_change': True,
+        'key': '{robot}/camera_info/{date}/{time}_front.{ext}', 'priority': 2,
+    },
+    'lidar': {
+        'topics': ('point_cloud2',), 'types': (POINT_CLOUD,), 'format': 'pcd',
+        'key': '{robot}/lidar/{date}/{time}_scan.{ext}', 'priority': 7,
+    },
+    'imu': {'topics': ('imu',), 'types': ('go2_interfaces/msg/IMU',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4},
+    'odom': {'topics': ('odom',), 'types': ('nav_msgs/msg/Odometry',), 'priority': 3},
+    'states': {
+        'topics': ('go2_states',), 'types': ('go2_interfaces/msg/Go2State',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 3,
+    },
+    'joints': {
+        'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
+    },
+    'lowstate': {
+        'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3,
+        'statistics': ('imu_state', 'bms_state.soc', 'bms_state.current', 'foot_force', 'power_v', 'power_a', 'temperature_ntc1'),
+    },
+    'cmd_vel': {
+        'enabled': False, 'topics': ('cmd_vel',), 'types': ('geometry_msgs/msg/Twist',), 'rate_hz': 0.0, 'batch_s': 1.0,
+        'priority': 3,
+    },
+    'voxel_map': {
+        'enabled': False, 'topics': ('utlidar/voxel_map_compressed',), 'types': ('go2_interfaces/msg/VoxelMapCompressed',),
+        'format': 'cdr', 'priority': 8,
+    },
+}  # fmt: skip

@@ -1,0 +1,288 @@
+"""Checks names and files that a robot wrote: nothing in them is trusted before it was checked.
+
+Whoever has a robot's keys can put anything below its prefix. So a key becomes a path, a text is printed, and a file takes
+memory only as far as this module allows. What it refuses is a NameRefused or a ValueError that says why; the caller adds whose.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import unicodedata
+import warnings
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Any, Final
+
+from shadowhound_data_logger.core.errors import NameRefused
+from shadowhound_data_logger.core.keys import MAX_KEY_BYTES, UNSEEN
+
+MAX_FILE_NAME_BYTES: Final = 255
+"""Of Linux' file systems."""
+MOST_DOCUMENT_BYTES: Final = 16 << 20
+"""Of JSON that is read whole: a manifest of a day in slices of a minute has 2 MB. Python needs up to 24 times as much for it."""
+MOST_JSON_DEPTH: Final = 64
+"""Of JSON. Whoever reads a document may go into it by recursion, which Python ends at a depth of 1,000 or less."""
+MOST_SUMMARY_BYTES: Final = 1 << 20
+"""Of a mission's ``summary.json``."""
+MOST_YAML_BYTES: Final = 4 << 20
+"""Of a ``metadata.yaml``: that of some 15,000 slices."""
+MOST_YAML_NODES: Final = 250_000
+"""Each takes 50 us."""
+MOST_YAML_DEPTH: Final = 32
+MOST_OBJECT_BYTES: Final = 64 << 20
+"""Of an object that is decoded in memory: an archive is closed after 16 MiB of messages."""
+MOST_CHUNK_BYTES: Final = 128 << 20
+"""Of a bag's chunk, packed and unpacked: rosbag2 makes them of 768 KB, or as large as their largest message."""
+PIECE_BYTES: Final = 4096
+"""Of damaged content: so much is lost where it cannot be unpacked."""
+MOST_PIXELS: Final = 1 << 25
+"""Of a picture: 8K."""
+MOST_MEMBERS: Final = 20_000
+"""Files in an archive, two a message: it is closed after 10,000 of them."""
+_TOO_DEEP: Final = f'it is deeper than {MOST_JSON_DEPTH} lists and objects in one another'
+_FORMULA: Final = frozenset('=+-@＝＋－＠')
+_NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
+
+
+# -- names ---------------------------------------------------------------------------------------------------------------------
+
+
+def path_below(folder: Path, key: str) -> Path:
+    """Where the file of a key lies below a folder. Raises NameRefused for a key that is not a path below it."""
+    if not is_path(key):
+        raise NameRefused(f'the key {key[:200]!r} is not a path below a folder', name=key)
+    return folder / key
+
+
+def is_path(key: str) -> bool:
+    """Whether a key can be a file below any folder: parts with names of their own, no control characters, not too long."""
+    parts = key.split('/')
+    try:
+        sizes = [len(part.encode()) for part in parts]
+    except UnicodeEncodeError:  # half a surrogate pair
+        return False
+    if '' in parts or '.' in parts or '..' in parts or sum(sizes) + len(parts) > MAX_KEY_BYTES + 1:
+        return False
+    return max(sizes) <= MAX_FILE_NAME_BYTES and (key.isprintable() or not any(unicodedata.category(one) == 'Cc' for one in key))
+
+
+# -- what is printed -----------------------------------------------------------------------------------------------------------
+
+
+def visible(text: str) -> str:
+    """The text on one line and without power over a terminal: a control character becomes its escape, as in ``repr``."""
+    if text.isprintable():
+        return text
+    return ''.join(_escape(letter) if unicodedata.category(letter) in UNSEEN else letter for letter in text)
+
+
+def csv_encoding(head: bytes) -> str:
+    """The encoding of a CSV file that starts with these bytes: UTF-8, or what Excel writes, with a byte order mark of either."""
+    return 'utf-16' if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else 'utf-8-sig'
+
+
+def csv_rows(body: bytes) -> csv.DictReader[str]:
+    """The rows of a CSV file with a line of names; more cells than names are under ``''``. Raises ValueError, csv.Error."""
+    text = body.decode(csv_encoding(body))
+    names = text.partition('\n')[0]
+    for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if mark in names and ',' not in names:
+            raise ValueError(f'its columns are separated by {name}: save it with commas')
+    rows = csv.DictReader(StringIO(text, newline=''), strict=True, restkey='')
+    rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
+    return rows
+
+
+def csv_cell(value: object) -> object:
+    """A value for a CSV file: numbers as they are, text on one line, and no text that a spreadsheet takes for a formula."""
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    text = visible(str(value))
+    return f"'{text}" if text.lstrip()[:1] in _FORMULA and not _NUMBER.fullmatch(text) else text
+
+
+def _escape(letter: str) -> str:
+    return letter.encode('unicode_escape').decode('ascii')
+
+
+# -- documents -----------------------------------------------------------------------------------------------------------------
+
+
+def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
+    """Raises ValueError, also for a document that is too large or too deep."""
+    check_size(len(content), most)
+    try:
+        return shallow(json.loads(content))
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+
+
+def from_strict_json(content: bytes, most: int) -> Any:
+    """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for NaN."""
+    check_size(len(content), most)
+    try:
+        return shallow(json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number))
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+
+
+def shallow(document: Any) -> Any:
+    """The same value of JSON. Raises ValueError for one whose lists and objects lie in one another more than 64 times."""
+    level, depth = [document], 0
+    while level:
+        if depth >= MOST_JSON_DEPTH:
+            raise ValueError(_TOO_DEEP)
+        depth += 1
+        level = [
+            each for one in level if isinstance(one, (dict, list)) for each in (one.values() if isinstance(one, dict) else one)
+            if isinstance(each, (dict, list))
+        ]  # fmt: skip
+    return document
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError('it has a name twice in one object')
+    return found
+
+
+def _no_number(word: str) -> Any:
+    raise ValueError(f'{word} is no number of JSON')
+
+
+def from_yaml(content: str) -> Any:
+    """Mappings, sequences and scalars, without aliases: a few bytes of those can stand for any size. Raises ValueError."""
+    from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not
+    from ruamel.yaml.composer import Composer  # noqa: PLC0415
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+    from ruamel.yaml.events import AliasEvent  # noqa: PLC0415
+
+    class Plain(Composer):
+        """Counts what it makes."""
+
+        nodes = depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.nodes += 1
+            self.depth += 1
+            if self.parser.check_event(AliasEvent):
+                raise ValueError('it has aliases')
+            if self.nodes > MOST_YAML_NODES or self.depth > MOST_YAML_DEPTH:
+                raise ValueError(f'it is deeper than {MOST_YAML_DEPTH}, or has more than {MOST_YAML_NODES:,} values')
+            made = super().compose_node(parent, index)
+            self.depth -= 1
+            return made
+
+    check_size(len(content), MOST_YAML_BYTES)
+    yaml = YAML(typ='safe', pure=True)  # the parser in C neither counts nor ends at a depth
+    yaml.Composer = Plain
+    try:
+        return yaml.load(content)
+    except (YAMLError, RecursionError, TypeError, AttributeError, LookupError) as error:
+        raise ValueError(' '.join(str(error).split())) from error
+
+
+def check_size(size: int, most: int) -> None:
+    """Raises ValueError for what is larger."""
+    if size > most:
+        raise ValueError(f'it has {size:,} bytes; more than {most:,} are not read')
+
+
+# -- content -------------------------------------------------------------------------------------------------------------------
+
+
+def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes:
+    """What was packed by ``zstd`` or ``lz4``: of this size (None: of any that is allowed), and not a byte more in memory.
+
+    It ends at the size: a frame that holds more is wrong, and its rest is never unpacked. Raises ValueError.
+    """
+    most = MOST_CHUNK_BYTES if size is None else size
+    check_size(most, MOST_CHUNK_BYTES)
+    if compression not in {'zstd', 'lz4'}:
+        raise ValueError(f'it is compressed with {compression!r}, which is not supported')
+    try:
+        found, is_whole = _zstd(content, most) if compression == 'zstd' else _lz4(content, most)
+    except (RuntimeError, EOFError) as error:  # lz4 raises the former
+        raise ValueError(str(error)) from error
+    if not is_whole or len(found) > most or size not in {None, len(found)}:
+        raise ValueError(f'it does not unpack to {"at most " * (size is None)}{most:,} bytes, as it should')
+    return found
+
+
+def partly_unpacked(compression: str, content: bytes, size: int) -> bytearray:
+    """What can still be unpacked of content that is torn or damaged: its beginning, of at most this size. Raises ValueError."""
+    check_size(size, MOST_CHUNK_BYTES)
+    if compression == 'zstd':
+        from shadowhound_data_logger.core.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
+
+        reader: Any = ZstdDecompressor()
+        broken: tuple[type[Exception], ...] = (ZstdError, EOFError)
+    elif compression == 'lz4':
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped] # noqa: PLC0415
+
+        reader, broken = LZ4FrameDecompressor(), (RuntimeError, EOFError)
+    else:
+        raise ValueError(f'it is compressed with {compression!r}, which is not supported')
+    found = bytearray()
+    try:
+        for at in range(0, len(content), PIECE_BYTES):
+            piece = content[at : at + PIECE_BYTES]
+            while len(found) < size and not reader.eof:
+                more = reader.decompress(piece, min(size - len(found), MOST_SUMMARY_BYTES))
+                found += more
+                piece = b''
+                if reader.needs_input or not more:
+                    break
+    except broken:
+        pass
+    return found
+
+
+def _zstd(content: bytes, size: int) -> tuple[bytes, bool]:
+    from shadowhound_data_logger.core.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
+
+    found, left, is_whole = b'', content, False
+    try:
+        while left and len(found) <= size:  # frames may follow each other
+            reader = ZstdDecompressor()
+            found += reader.decompress(left, size + 1 - len(found))
+            left, is_whole = reader.unused_data, reader.eof
+    except ZstdError as error:
+        raise ValueError(str(error)) from error
+    return found, is_whole
+
+
+def _lz4(content: bytes, size: int) -> tuple[bytes, bool]:
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
+
+    reader = LZ4FrameDecompressor()
+    return bytes(reader.decompress(content, size + 1)), bool(reader.eof)
+
+
+def open_image(content: bytes | Path) -> Any:
+    """A picture of Pillow's, not decoded yet: JPEG, PNG or TIFF, of at most ``MOST_PIXELS``. Raises OSError or ValueError."""
+    from PIL import Image  # noqa: PLC0415 - 0.1 s, and most readers see none
+
+    source = content if isinstance(content, Path) else BytesIO(content)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')  # of what is refused below
+            opened = Image.open(source, formats=('JPEG', 'PNG', 'TIFF'))
+    except (Image.DecompressionBombError, SyntaxError) as error:  # which are nobody's ValueError
+        raise ValueError(str(error)) from None
+    try:
+        check_pixels(opened.width, opened.height)
+    except ValueError:
+        opened.close()
+        raise
+    return opened
+
+
+def check_pixels(width: int, height: int) -> None:
+    """Raises ValueError for more than ``MOST_PIXELS``."""
+    if width * height > MOST_PIXELS:
+        raise ValueError(f'it claims {width:,} x {height:,} pixels')

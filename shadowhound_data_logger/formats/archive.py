@@ -1,0 +1,139 @@
+"""All messages of a batch in one zip or tar: a file for each message, and beside it a JSON with what is known of it.
+
+With ``dedup`` a file equal to the one before it is left out: its JSON stays, and ``repeat_of`` in it names the file.
+
+The names are WebDataset's: files of one sample share their name up to the first dot and follow each other
+(https://github.com/webdataset/webdataset). Here that name is the message's time in ns since 1970: samples are in the order of
+time, and unlike those of other objects, unless two publishers share a stamp. The same batch gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import BytesIO
+from itertools import pairwise
+from typing import Final, NamedTuple
+from zipfile import ZIP_STORED, ZipFile, ZipInfo
+
+import orjson
+
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import Sample
+from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from shadowhound_data_logger.formats.image import encode_jpeg
+from shadowhound_data_logger.formats.payload import Encoder, Job, OneMessage, Payload, Rejections, encode_cdr
+from shadowhound_data_logger.formats.pointcloud import encode_cloud
+from shadowhound_data_logger.formats.types import header_frame_id
+
+_ENCODE: Final[Mapping[str, OneMessage]] = {COMPRESSED_IMAGE: encode_jpeg, IMAGE: encode_jpeg, POINT_CLOUD: encode_cloud}
+"""Type -> what makes its file; every other type is stored as CDR."""
+_MODE: Final = 0o644
+_DOS_YEARS: Final = (315_532_800, 4_354_819_198)
+"""Seconds since 1970 that a zip can express: 1980 to 2107."""
+_USTAR_SECONDS: Final = 8**11 - 1
+"""Eleven octal digits."""
+
+
+def _empty_header() -> bytes:
+    entry = tarfile.TarInfo()
+    entry.mode = _MODE
+    return entry.tobuf(tarfile.USTAR_FORMAT)
+
+
+_EMPTY_HEADER: Final = _empty_header()
+
+
+class ArchiveFile(NamedTuple):
+    """One file of an archive."""
+
+    name: str
+    stamp_ns: int
+    body: bytes
+
+
+def archive(pack: Callable[[Iterable[ArchiveFile]], bytes], ext: str, content_type: str) -> Encoder:
+    """An encoder that packs all messages of a batch; those that cannot be encoded are rejected, the rest goes on."""
+
+    def encoder(job: Job, rejections: Rejections) -> Payload | None:
+        encode = _ENCODE.get(job.batch.type, encode_cdr)
+        files: list[Payload] = []
+        for sample in job.batch.samples:
+            try:
+                files.append(encode(job, sample))
+                rejections.add_corrected(files[-1])
+            except Rejected as error:
+                rejections.add(error, sample)
+        if not files:
+            return None
+        kept = tuple(sample for file in files for sample in file.kept)
+        repeats = _repeats(files) if job.sensor.dedup else 0
+        return Payload(pack(_members(job, files)), kept, ext, content_type, {'repeats': repeats} if repeats else {})
+
+    return encoder
+
+
+def _members(job: Job, files: Sequence[Payload]) -> Iterator[ArchiveFile]:
+    """Each file and its JSON, in the order of time; a second message of the same time is numbered."""
+    same: Counter[int] = Counter()
+    has_header = job.types.has_header(job.batch.type)
+    last, last_name = b'', ''
+    for file in _in_order(files):
+        sample = file.kept[0]
+        stamp_ns = sample.stamp_ns
+        name = f'{stamp_ns:019d}' + (f'_{same[stamp_ns]}' if same[stamp_ns] else '')
+        same[stamp_ns] += 1
+        described = _description(job, sample, file, has_header=has_header)
+        if job.sensor.dedup and last_name and file.body == last:
+            described |= {'repeat_of': last_name}
+        else:
+            last, last_name = file.body, f'{name}.{file.ext}'
+            yield ArchiveFile(last_name, stamp_ns, file.body)
+        yield ArchiveFile(f'{name}.json', stamp_ns, orjson.dumps(described))
+
+
+def _in_order(files: Sequence[Payload]) -> list[Payload]:
+    return sorted(files, key=lambda file: file.kept[0].stamp_ns)
+
+
+def _repeats(files: Sequence[Payload]) -> int:
+    """How many files are equal to the one before."""
+    return sum(one.body == next_one.body for one, next_one in pairwise(_in_order(files)))
+
+
+def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -> dict[str, object]:
+    frame = {'frame_id': header_frame_id(sample.cdr)} if has_header else {}
+    return {'stamp_ns': sample.stamp_ns, **frame, 'topic': job.batch.topic, 'type': job.batch.type, **file.facts}
+
+
+def pack_tar(members: Iterable[ArchiveFile]) -> bytes:
+    """An uncompressed POSIX tar (ustar), which every reader knows; a file's time is its message's."""
+    parts: list[bytes] = []
+    for member in members:
+        seconds = min(max(member.stamp_ns // SECOND, 0), _USTAR_SECONDS)
+        parts += (_header(member.name, len(member.body), seconds), member.body, bytes(-len(member.body) % tarfile.BLOCKSIZE))
+    return b''.join((*parts, bytes(2 * tarfile.BLOCKSIZE)))
+
+
+def _header(name: str, size: int, seconds: int) -> bytes:
+    """As ``tarfile`` makes it, in a quarter of the time: name, size, time and checksum are written into one that is known."""
+    block = bytearray(_EMPTY_HEADER)
+    block[: len(name)] = name.encode('ascii')
+    block[124:148] = b'%011o\0%011o\0' % (size, seconds)
+    block[148:156] = b'%06o\0 ' % (sum(block) - sum(block[148:156]) + 8 * ord(' '))
+    return bytes(block)
+
+
+def pack_zip(members: Iterable[ArchiveFile]) -> bytes:
+    """A zip without compression, which images and clouds would hardly gain by; a file's time is its message's, in UTC."""
+    file = BytesIO()
+    with ZipFile(file, 'w', ZIP_STORED, allowZip64=True) as packed:
+        for member in members:
+            first, last = _DOS_YEARS
+            when = utc(min(max(member.stamp_ns // SECOND, first), last) * SECOND)
+            entry = ZipInfo(member.name, (when.year, when.month, when.day, when.hour, when.minute, when.second))
+            entry.external_attr = _MODE << 16
+            packed.writestr(entry, member.body)
+    return file.getvalue()

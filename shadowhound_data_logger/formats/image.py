@@ -1,0 +1,353 @@
+"""Camera messages to image files: compressed ones pass through byte for byte, raw ones are encoded.
+
+``jpeg`` makes JPEGs of 8-bit colors, grays and YUV, ``png`` PNGs without loss. What is more than a picture is never compressed
+with loss: 16-bit images, ``8UC1`` (labels, masks) and Bayer mosaics become PNGs, float32 images become TIFFs with every value as
+it was, NaN included. Images of other encodings are stored as they were serialized. The sizes of JPEG and PNG files are read from
+their headers, without decoding them.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import zlib
+from collections.abc import Mapping
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import simplejpeg
+
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import Sample
+from shadowhound_data_logger.core.options import ARCHIVES, COMPRESSED_IMAGE, IMAGE
+from shadowhound_data_logger.core.untrusted import check_pixels
+from shadowhound_data_logger.formats.payload import Fact, Job, Payload, verbatim
+from shadowhound_data_logger.formats.rvl import decode_rvl
+from shadowhound_data_logger.formats.statistics import ALL, NONE, Statistic, of_number, of_whole, packed
+from shadowhound_data_logger.formats.yuv import Planes, at_full_resolution, is_yuv, planes_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+log = logging.getLogger(__name__)
+
+JPEG_MAGIC: Final = b'\xff\xd8\xff'
+PNG_MAGIC: Final = b'\x89PNG\r\n\x1a\n'
+TIFF_MAGICS: Final = b'II*\0', b'MM\0*'
+_SOF: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers that begin a frame header; C4, C8 and CC in their midst are something else (ITU-T T.81, table B.1)."""
+_SOS: Final = 0xDA
+_CHUNK: Final = struct.Struct('>I4s')
+_IHDR: Final = struct.Struct('>I4sII')
+_PNG_SIDE: Final = (1 << 31) - 1
+
+
+DEEP: Final = 'deep'
+"""A mode that Pillow does not have: colors of 16 bits."""
+
+
+class _Pixel(NamedTuple):
+    """How a ROS encoding is said to the libraries."""
+
+    size: int
+    """Bytes a pixel."""
+    word: int
+    """Bytes a value, which big-endian machines have in the other order."""
+    mode: str
+    """Pillow's mode: https://pillow.readthedocs.io/en/stable/handbook/concepts.html#modes"""
+    raw: str
+    """The layout that Pillow's ``raw`` decoder reads."""
+    colorspace: str = ''
+    """simplejpeg's name for it; empty where no JPEG can hold it."""
+
+
+_DEPTH16: Final = _Pixel(2, 2, 'I;16', 'I;16')
+_GRAY: Final = _Pixel(1, 1, 'L', 'L')
+_BGR: Final = _Pixel(3, 1, 'RGB', 'BGR', 'BGR')
+_BGRA: Final = _Pixel(4, 1, 'RGBA', 'BGRA', 'BGRA')
+_PIXELS: Final = {
+    'bgr8': _BGR,
+    'rgb8': _Pixel(3, 1, 'RGB', 'RGB', 'RGB'),
+    'bgra8': _BGRA,
+    'rgba8': _Pixel(4, 1, 'RGBA', 'RGBA', 'RGBA'),
+    'mono8': _Pixel(1, 1, 'L', 'L', 'GRAY'),
+    '8UC1': _GRAY,
+    '8UC3': _BGR,  # the order of OpenCV, which RViz assumes too
+    '8UC4': _BGRA,
+    'mono16': _DEPTH16,
+    '16UC1': _DEPTH16,
+    'rgb16': _Pixel(6, 2, DEEP, 'RGB'),
+    'bgr16': _Pixel(6, 2, DEEP, 'BGR'),
+    '16UC3': _Pixel(6, 2, DEEP, 'BGR'),
+    'rgba16': _Pixel(8, 2, DEEP, 'RGBA'),
+    'bgra16': _Pixel(8, 2, DEEP, 'BGRA'),
+    '16UC4': _Pixel(8, 2, DEEP, 'BGRA'),
+    '32FC1': _Pixel(4, 4, 'F', 'F;32F'),
+    **{f'bayer_{order}8': _GRAY for order in ('rggb', 'bggr', 'gbrg', 'grbg')},
+    **{f'bayer_{order}16': _DEPTH16 for order in ('rggb', 'bggr', 'gbrg', 'grbg')},
+}
+"""By ROS encoding (sensor_msgs/image_encodings.hpp)."""
+_MAX_SIDE: Final = 65_500
+"""libjpeg's limit (JPEG_MAX_DIMENSION)."""
+_PNG_LEVEL: Final = 1
+"""zlib's fastest: the default 6 takes five times as long to save a tenth of a depth image, and 30 a second have to be made."""
+_DEPTH: Final = 'compressedDepth'
+"""In the ``format`` of what compressed_depth_image_transport publishes, such as ``16UC1; compressedDepth png``; old versions have
+no ``png`` there, or the encoding alone."""
+_RVL: Final = 'rvl'
+_CONFIG_HEADER: Final = struct.Struct('<iff')
+"""Its struct before the PNG: a format number without meaning, and the two parameters of the inverse depth
+(compressed_depth_image_transport/compression_common.hpp, codec.cpp)."""
+
+
+def encode_jpeg(job: Job, sample: Sample) -> Payload:
+    """The image of one CompressedImage or Image, JPEG where it can be.
+
+    Raises Rejected: ``wrong_type``, ``unknown_type``, ``malformed``, ``empty``, ``size_mismatch`` (width, height, step and data
+    contradict each other), ``too_large`` (for a JPEG).
+    """
+    return _encode(job, sample, lossless=False)
+
+
+def encode_png(job: Job, sample: Sample) -> Payload:
+    """The image of one CompressedImage (as it is) or Image (without loss). Raises Rejected as ``encode_jpeg`` does."""
+    return _encode(job, sample, lossless=True)
+
+
+def _encode(job: Job, sample: Sample, *, lossless: bool) -> Payload:
+    if job.batch.type not in (COMPRESSED_IMAGE, IMAGE):
+        raise Rejected('wrong_type', f'{job.batch.type} is not an image')
+    message = job.types.deserialize(job.batch.type, memoryview(sample.cdr))
+    if job.batch.type == COMPRESSED_IMAGE:
+        return _published(job, sample, message)
+    facts: dict[str, Fact] = {'width': message.width, 'height': message.height, 'encoding': printable_ascii(message.encoding)}
+    if is_yuv(message.encoding):
+        return _yuv(job, sample, message, facts, lossless=lossless)
+    pixel = _PIXELS.get(message.encoding)
+    if pixel is None:
+        return verbatim(sample, 'unsupported_encoding', facts)
+    _check_size(message, pixel)
+    if pixel.colorspace and not lossless:
+        body = _jpeg(message, pixel, job.sensor.quality)
+        return Payload(body, (sample,), 'jpg', 'image/jpeg', facts, _statistics(job, body))
+    if pixel.mode == 'F':
+        return Payload(_pillow(message, pixel, 'TIFF'), (sample,), 'tiff', 'image/tiff', facts)
+    body = _deep_png(message, pixel) if pixel.mode == DEEP else _pillow(message, pixel, 'PNG', compress_level=_PNG_LEVEL)
+    return Payload(body, (sample,), 'png', 'image/png', facts)
+
+
+def _yuv(job: Job, sample: Sample, message: Any, facts: Mapping[str, Fact], *, lossless: bool) -> Payload:
+    """The camera's own planes as a JPEG; a PNG has the colors that these are."""
+    _check_not_empty(message)
+    planes = planes_of(message)
+    if planes is None:
+        return verbatim(sample, 'unknown_layout', facts)
+    if lossless:
+        return Payload(_png_of_planes(planes), (sample,), 'png', 'image/png', facts)
+    _check_sides(message)
+    if message.width % 2 or message.height % 2:  # libjpeg-turbo would read past the end of a plane
+        planes = at_full_resolution(planes)
+    body = bytes(simplejpeg.encode_jpeg_yuv_planes(*map(np.ascontiguousarray, planes), quality=job.sensor.quality))
+    return Payload(body, (sample,), 'jpg', 'image/jpeg', facts, _statistics(job, body))
+
+
+def _published(job: Job, sample: Sample, message: Any) -> Payload:
+    """A CompressedImage's own bytes, if they are a JPEG, a PNG or a TIFF, and depth that was compressed otherwise as a PNG."""
+    data: Any = message.data
+    facts: dict[str, Fact] = {}
+    if not data.size:
+        raise Rejected('empty', 'no image data')
+    if _DEPTH in message.format or _has_png(data, _CONFIG_HEADER.size):
+        data, facts = _depth(message)
+    if data is None:
+        return verbatim(sample, 'unsupported_encoding', facts)
+    body = data.tobytes()
+    if body.startswith(JPEG_MAGIC):
+        (width, height), ext, content_type = jpeg_size(body), 'jpg', 'image/jpeg'
+    elif body.startswith(PNG_MAGIC):
+        (width, height), ext, content_type = png_size(body), 'png', 'image/png'
+    elif body.startswith(TIFF_MAGICS):
+        return Payload(body, (sample,), 'tiff', 'image/tiff', facts)
+    else:
+        return verbatim(sample, 'unsupported_encoding', {'encoding': printable_ascii(message.format)})
+    found = _statistics(job, body) if ext == 'jpg' else b''
+    return Payload(body, (sample,), ext, content_type, {'width': width, 'height': height, **facts}, found)
+
+
+def printable_ascii(text: str) -> str:
+    """Text of a message as object metadata take it."""
+    return ascii(text[:40])[1:-1]
+
+
+def _statistics(job: Job, body: bytes) -> bytes:
+    """Of a picture that is an object of its own."""
+    return packed(of_jpeg(body)) if job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES else b''
+
+
+def _depth(message: Any) -> tuple[Any, dict[str, Fact]]:
+    """The PNG of a compressed depth image, and what its header says; None for the PNG if it is neither a PNG nor RVL.
+
+    With encoding 32FC1 the PNG holds the inverse depth: meters are ``depth_quant_a / (pixel - depth_quant_b)``, 0 is NaN. Some
+    publishers leave out the header.
+    """
+    encoding, _, compression = message.format.partition(';')
+    facts: dict[str, Fact] = {'encoding': printable_ascii(encoding)}
+    if _has_png(message.data, 0):
+        return message.data, facts
+    if message.data.size <= _CONFIG_HEADER.size:
+        raise Rejected('malformed', f'{message.data.size} bytes of {message.format[:40]!r}')
+    _, quant_a, quant_b = _CONFIG_HEADER.unpack_from(message.data)
+    facts |= {'depth_quant_a': quant_a, 'depth_quant_b': quant_b}
+    body = message.data[_CONFIG_HEADER.size :]
+    if _RVL in compression:
+        try:
+            return np.frombuffer(_png_of_depth(decode_rvl(body.tobytes())), np.uint8), facts
+        except ValueError as error:
+            log.debug('%s', error)
+            return None, facts
+    if not _has_png(body, 0):
+        raise Rejected('malformed', f'no PNG behind the header of {message.format[:40]!r}')
+    return body, facts
+
+
+def _has_png(data: Any, at: int) -> bool:
+    return bool(data[at : at + len(PNG_MAGIC)].tobytes() == PNG_MAGIC)
+
+
+def _check_size(message: Any, pixel: _Pixel) -> None:
+    """Raises Rejected unless all pixels are there."""
+    _check_not_empty(message)
+    width, height, step = message.width, message.height, message.step
+    if step < width * pixel.size or message.data.size != step * height:
+        raise Rejected('size_mismatch', f'{width} x {height} {message.encoding}, step {step}, {message.data.size} bytes of data')
+
+
+def _check_not_empty(message: Any) -> None:
+    if not message.width or not message.height:
+        raise Rejected('empty', f'{message.width} x {message.height} pixels')
+
+
+def _check_sides(message: Any) -> None:
+    if max(message.width, message.height) > _MAX_SIDE:
+        raise Rejected('too_large', f'{message.width} x {message.height} pixels, a JPEG has at most {_MAX_SIDE} a side')
+
+
+def _rows(message: Any, pixel: _Pixel) -> NDArray[Any]:
+    """The pixels without padding, little-endian, a row a line; not copied where they are so already."""
+    rows = np.ascontiguousarray(message.data.reshape(message.height, message.step)[:, : message.width * pixel.size])
+    # Not left to Pillow: that of Ubuntu 22.04 (9.0) reads big-endian 16 bits wrongly.
+    return rows.view(f'u{pixel.word}').byteswap() if message.is_bigendian and pixel.word > 1 else rows
+
+
+def _jpeg(message: Any, pixel: _Pixel, quality: int) -> bytes:
+    _check_sides(message)
+    pixels = _rows(message, pixel).reshape(message.height, message.width, pixel.size)
+    # Half-resolution colour is what OpenCV and libjpeg write by default, and takes half the time of full.
+    subsampling = 'Gray' if pixel.size == 1 else '420'
+    return bytes(simplejpeg.encode_jpeg(pixels, quality=quality, colorspace=pixel.colorspace, colorsubsampling=subsampling))
+
+
+def _pillow(message: Any, pixel: _Pixel, kind: str, **options: int) -> bytes:
+    # Loaded when the first such image comes: most robots have none, and it takes 0.1 s and 9 MB.
+    from PIL import Image  # noqa: PLC0415
+
+    size = message.width, message.height
+    image = Image.frombuffer(pixel.mode, size, _rows(message, pixel), 'raw', pixel.raw, 0, 1)
+    return _saved(image, kind, **options)
+
+
+def _deep_png(message: Any, pixel: _Pixel) -> bytes:
+    """Colors of 16 bits, which Pillow does not write: https://www.w3.org/TR/png-3/."""
+    height, width = message.height, message.width
+    colors = _rows(message, pixel).view(np.uint16).reshape(height, width, -1)
+    order = [pixel.raw.index(channel) for channel in 'RGBA' if channel in pixel.raw]
+    lines = np.zeros((height, 1 + width * pixel.size), np.uint8)  # the first byte of a line: no filter
+    lines[:, 1:] = colors[:, :, order].astype('>u2').reshape(height, -1).view(np.uint8)
+    kind = 6 if len(order) == 4 else 2
+    header = struct.pack('>IIBBBBB', width, height, 16, kind, 0, 0, 0)
+    chunks = ((b'IHDR', header), (b'IDAT', zlib.compress(lines.tobytes(), _PNG_LEVEL)), (b'IEND', b''))
+    return PNG_MAGIC + b''.join(
+        _CHUNK.pack(len(body), name) + body + struct.pack('>I', zlib.crc32(name + body)) for name, body in chunks
+    )
+
+
+def _png_of_planes(planes: Planes) -> bytes:
+    from PIL import Image  # noqa: PLC0415 - see _pillow
+
+    image = Image.merge('YCbCr', [Image.fromarray(np.ascontiguousarray(part)) for part in at_full_resolution(planes)])
+    return _saved(image.convert('RGB'), 'PNG', compress_level=_PNG_LEVEL)
+
+
+def _png_of_depth(pixels: NDArray[np.uint16]) -> bytes:
+    from PIL import Image  # noqa: PLC0415 - see _pillow
+
+    height, width = pixels.shape
+    image = Image.frombuffer('I;16', (width, height), pixels.astype('<u2', copy=False), 'raw', 'I;16', 0, 1)
+    return _saved(image, 'PNG', compress_level=_PNG_LEVEL)
+
+
+def _saved(image: Any, kind: str, **options: int) -> bytes:
+    file = BytesIO()
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+def of_jpeg(body: bytes) -> dict[str, Statistic]:
+    """Brightness, 0 to 255, and sharpness, the variance of the Laplacian, both of its grey at an eighth of the size.
+
+    Empty where it cannot be decoded.
+    """
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(body)
+        check_pixels(width, height)
+        grey = simplejpeg.decode_jpeg(body, 'GRAY', fastdct=True, fastupsample=True, min_height=1, min_width=1)
+        grey = grey[:, :, 0].astype(np.float32)
+    except (ValueError, MemoryError):
+        return {}
+    found = {'brightness': float(grey.mean(dtype=np.float64))}
+    if min(grey.shape) > 2:
+        edges = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+        found['sharpness'] = float(edges.var(dtype=np.float64))
+    return {ALL: of_whole(1), **{name: of_number(value) for name, value in found.items()}}
+
+
+def jpeg_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a JPEG whose headers are whole, in pixels; raises Rejected ``malformed`` for anything else.
+
+    Walks the marker segments up to the scan (ITU-T T.81, annex B). The scan itself is not judged: cameras do leave out
+    the EOI marker, and a decoder shows what there is.
+    """
+    size = None
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte; any number may precede a marker
+            at += 1
+            continue
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], 'big')
+        if marker in _SOF and at + 9 <= end <= len(data):
+            size = int.from_bytes(data[at + 7 : at + 9], 'big'), int.from_bytes(data[at + 5 : at + 7], 'big')
+        elif marker == _SOS and size is not None and all(size) and end < len(data):
+            return size
+        at = end
+    raise Rejected('malformed', f'broken JPEG header at byte {at} of {len(data)}')
+
+
+def png_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a PNG whose header is whole and whose image data has begun; raises Rejected ``malformed``.
+
+    Walks the chunks up to the first IDAT (https://www.w3.org/TR/png-3/#5Chunk-layout); the image data is not judged.
+    """
+    at = len(PNG_MAGIC)
+    if len(data) < at + _IHDR.size:
+        raise Rejected('malformed', f'a PNG of {len(data)} bytes')
+    length, kind, width, height = _IHDR.unpack_from(data, at)
+    if (length, kind) != (13, b'IHDR') or not 0 < width <= _PNG_SIDE or not 0 < height <= _PNG_SIDE:
+        raise Rejected('malformed', f'broken PNG header, {width} x {height} pixels')
+    while at + _CHUNK.size < len(data):
+        length, kind = _CHUNK.unpack_from(data, at)
+        if kind == b'IDAT':
+            return width, height
+        at += _CHUNK.size + length + 4  # the checksum
+    raise Rejected('malformed', f'a PNG of {len(data)} bytes without image data')

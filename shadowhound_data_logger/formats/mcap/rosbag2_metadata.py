@@ -1,0 +1,192 @@
+"""``metadata.yaml`` as rosbag2 writes it: what ``ros2 bag info`` and ``ros2 bag play`` read before any slice.
+
+Version 8 of the format, QoS in numbers: the newest that Humble reads too (9 made QoS a sequence, on which Humble's reader
+fails); Jazzy and Kilted tell the two forms apart. Source: rosbag2_storage, metadata_io.cpp of Humble, yaml.hpp of Jazzy.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from shadowhound_data_logger.core.untrusted import from_yaml
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
+
+VERSION: Final = 8
+STORAGE: Final = 'mcap'
+_INFINITE_NS: Final = (1 << 63) - 1
+_PLAIN: Final = re.compile(r'(?!(true|false|null|yes|no|on|off|y|n)$)[a-z_]+')
+"""Keys that need no quotes: YAML 1.1 reads the others as something else, or may."""
+
+_POLICIES: Final = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown', 'best_available'),
+}
+"""The words of version 9, each in the place of its number (rmw/types.h)."""
+_IN_WORDS: Final = re.compile(rf'\b({"|".join(_POLICIES)})\W{{0,4}}:\W{{0,4}}[a-z]')
+MOST_CACHED_BYTES: Final = 4096
+
+
+def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None) -> bytes:
+    """The whole file for a bag of these slices, in their order; ``ros_distro`` is empty where it is not known."""
+    said = bagfile_information(slices, ros_distro=ros_distro, custom_data=custom_data)
+    return to_yaml({'rosbag2_bagfile_information': said}).encode()
+
+
+def bagfile_information(
+    slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """What rosbag2 calls BagMetadata. A topic with messages of two types appears once with each.
+
+    Of several channels with one topic and type, as merged files have them, the QoS profiles are listed one after the other.
+    """
+    start = min((one.t_start_ns for one in slices if one.messages), default=0)
+    end = max((one.t_end_ns for one in slices if one.messages), default=0)
+    return {
+        'version': VERSION,
+        'storage_identifier': STORAGE,
+        'duration': {'nanoseconds': end - start},
+        'starting_time': {'nanoseconds_since_epoch': start},
+        'message_count': sum(one.messages for one in slices),
+        'topics_with_message_count': _topics(slices),
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [one.path.name for one in slices],
+        'files': [
+            {
+                'path': one.path.name,
+                'starting_time': {'nanoseconds_since_epoch': one.t_start_ns},
+                'duration': {'nanoseconds': one.t_end_ns - one.t_start_ns},
+                'message_count': one.messages,
+            }
+            for one in slices
+        ],
+        'custom_data': dict(custom_data or {}),
+        'ros_distro': ros_distro,
+    }
+
+
+def offered_qos(profiles: Iterable[Any]) -> str:
+    """The QoS of a topic's publishers (rclpy's QoSProfile, or what looks like one) as rosbag2 keeps it with the topic."""
+    described = [_profile(profile) for profile in profiles]
+    return '\n'.join(_sequence(described)) if described else ''
+
+
+def in_numbers(qos: str) -> str:
+    """A topic's offered QoS profiles, which bags of Jazzy and Kilted keep in words, as version 8 does; all else stays."""
+    if not _IN_WORDS.search(qos):  # as we write them, and Humble
+        return qos
+    return _in_numbers(qos) if len(qos) > MOST_CACHED_BYTES else _cached_in_numbers(qos)
+
+
+def _in_numbers(qos: str) -> str:
+    try:
+        profiles = from_yaml(qos)
+    except ValueError:
+        return qos
+    if not isinstance(profiles, list) or not all(isinstance(profile, dict) for profile in profiles):
+        return qos
+    numbered = [{str(name): _number(name, value) for name, value in profile.items()} for profile in profiles]
+    try:
+        return '\n'.join(_sequence(numbered))
+    except TypeError:  # a date, say, which no profile has
+        return qos
+
+
+_cached_in_numbers = functools.lru_cache(256)(_in_numbers)
+"""Parsing takes 3 ms, and the topics of a bag have few profiles that differ."""
+
+
+def _number(policy: object, value: Any) -> Any:
+    words = _POLICIES.get(str(policy), ())
+    return words.index(value) if value in words else value
+
+
+def to_yaml(value: Mapping[str, Any]) -> str:
+    """Mappings, sequences, strings and integers as block YAML; strings in double quotes, so that none is misread."""
+    return ''.join(f'{line}\n' for line in _mapping(value))
+
+
+def _topics(slices: Sequence[SliceInfo]) -> list[dict[str, Any]]:
+    topics: dict[tuple[str, str, str], dict[Channel, int]] = {}
+    for one in slices:
+        for channel, count in one.channels.items():
+            of = topics.setdefault((channel.topic, channel.type, channel.message_encoding), {})
+            of[channel] = of.get(channel, 0) + count
+    return [
+        {
+            'topic_metadata': {
+                'name': name,
+                'type': kind,
+                'serialization_format': encoding,
+                'offered_qos_profiles': _merged(channel.qos for channel in counts),
+                'type_description_hash': next(iter(counts)).type_hash,
+            },
+            'message_count': sum(counts.values()),
+        }
+        for (name, kind, encoding), counts in topics.items()
+    ]
+
+
+def _merged(profiles: Iterable[str]) -> str:
+    """Those of each channel once; block sequences of YAML follow one another as one."""
+    found = list(dict.fromkeys(qos for qos in profiles if qos))
+    if len(found) > 1 and all(qos.startswith('- ') for qos in found):
+        return '\n'.join(qos.rstrip('\n') for qos in found)
+    return found[0] if found else ''
+
+
+def _profile(profile: Any) -> dict[str, Any]:
+    return {
+        'history': int(profile.history),
+        'depth': int(profile.depth),
+        'reliability': int(profile.reliability),
+        'durability': int(profile.durability),
+        'deadline': _duration(profile.deadline.nanoseconds),
+        'lifespan': _duration(profile.lifespan.nanoseconds),
+        'liveliness': int(profile.liveliness),
+        'liveliness_lease_duration': _duration(profile.liveliness_lease_duration.nanoseconds),
+        'avoid_ros_namespace_conventions': bool(profile.avoid_ros_namespace_conventions),
+    }
+
+
+def _duration(nanoseconds: int) -> dict[str, int]:
+    """A duration of 0 means that none was set, which rosbag2 writes as rmw's infinity: both mean the default."""
+    seconds, rest = divmod(nanoseconds or _INFINITE_NS, 10**9)
+    return {'sec': seconds, 'nsec': rest}
+
+
+def _mapping(value: Mapping[str, Any]) -> Iterator[str]:
+    for key, inner in value.items():
+        yield from _entry(f'{key if _PLAIN.fullmatch(key) else _scalar(key)}:', inner)
+
+
+def _sequence(value: Sequence[Any]) -> Iterator[str]:
+    for inner in value:
+        if isinstance(inner, Mapping) and inner:
+            lines = _mapping(inner)
+            yield f'- {next(lines)}'
+            yield from (f'  {line}' for line in lines)
+        else:
+            yield from _entry('-', inner)
+
+
+def _entry(head: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping) and value:
+        yield head
+        yield from (f'  {line}' for line in _mapping(value))
+    elif isinstance(value, list) and value:
+        yield head
+        yield from (f'  {line}' for line in _sequence(value))
+    else:
+        yield f'{head} {_scalar(value)}'
+
+
+def _scalar(value: Any) -> str:
+    """JSON's scalars and its empty mapping and sequence are YAML's. Outside ASCII no escapes: YAML's differ from JSON's."""
+    return json.dumps(value, ensure_ascii=False)

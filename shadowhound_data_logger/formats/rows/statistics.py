@@ -1,0 +1,54 @@
+"""Statistics of the numbers in each object, in Parquet parts of their own: whoever asks for no value reads none of them.
+
+A row is one field of one object (formats/statistics.py). Parts lie at
+``<robot>/_stats/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC, as in the
+catalogue. A row may be in two parts: a robot whose power failed tells the last ones again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
+from shadowhound_data_logger.formats.rows.schema import STATISTICS_FOLDER, Row, TableSchema
+from shadowhound_data_logger.formats.statistics import NUMBERS, Statistic, numbers_of
+
+FORMAT_VERSION: Final = 1
+"""Of the rows. Columns are only ever added, at the end."""
+STATISTICS: Final = TableSchema(
+    folder=STATISTICS_FOLDER,
+    columns={
+        'robot': STRING,
+        'sensor': STRING,
+        'bucket': STRING,
+        'key': STRING,
+        't_start': TIME,
+        't_start_ns': INT64,
+        'field': STRING,
+        'first': DOUBLE,
+        'last': DOUBLE,
+        'min': DOUBLE,
+        'max': DOUBLE,
+        'mean': DOUBLE,
+        'count': INT64,
+        'nan_count': INT64,
+        'format_version': INT32,
+    },
+    required=('bucket', 'key', 'field', 'count', 'nan_count', 'format_version'),
+    about={'shadowhound.statistics': str(FORMAT_VERSION)},
+)
+"""``robot sensor bucket key t_start t_start_ns`` are those of the object's row in the catalogue.
+
+``first last min max mean`` are of the ``count`` finite numbers of a ``field``; ``nan_count`` were NaN or infinite. The row whose
+``field`` is empty is of the object as a whole: ``count`` messages, and ``nan_count`` fields without statistics.
+"""
+_OF_OBJECT: Final = ('robot', 'sensor', 'bucket', 'key', 't_start', 't_start_ns')
+
+
+def statistic_rows(of: Row, found: Mapping[str, Statistic]) -> Iterator[Row]:
+    """The rows of an object by its row in the catalogue."""
+    common = {name: of[name] for name in _OF_OBJECT}
+    for field, each in found.items():
+        numbers = dict(zip(NUMBERS, numbers_of(each), strict=True))
+        yield {**common, 'field': field, **numbers, 'format_version': FORMAT_VERSION}

@@ -1,0 +1,1 @@
+"""From batches of messages to the objects that the spool stores."""

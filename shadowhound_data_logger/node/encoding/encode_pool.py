@@ -1,0 +1,232 @@
+"""From the intake to the spool: batches wait in a bounded queue, and the threads of the pool turn them into objects.
+
+The queue never blocks the intake: when it is full, the least important batch is dropped. Every sample that the pool takes from it
+comes out as stored or as rejected with a reason, also when an encoder has a fault of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
+from shadowhound_data_logger.core.model import Batch, DataObject
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.encoding.rejections import ENCODER_FAILED, RejectionLog
+from shadowhound_data_logger.spool.writer import SpoolWriter
+
+log = logging.getLogger(__name__)
+
+WAIT_S: Final = 0.5
+THREADS: Final = min(max(2, len(os.sched_getaffinity(0)) // 2), 4)
+"""Encoder threads: half the cores that this process may use, at least two, at most four."""
+MAX_MESSAGES: Final = 50_000
+"""Messages that wait for an encoder at most, however small they are."""
+PATIENCE_S: Final = 60.0
+"""A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
+Marking = Callable[[DataObject], DataObject]
+"""Gives an object more metadata, or another name; from any thread."""
+Preview = Callable[[DataObject], 'DataObject | None']
+Observe = Callable[[Batch, 'DataObject | None'], None]
+
+
+@dataclass(frozen=True, slots=True)
+class QueueStatus:
+    """How full the queue is."""
+
+    batches: int
+    messages: int
+    bytes: int
+    finished: int = 0
+    """Batches that were taken from it and are done."""
+    max_messages: int = MAX_MESSAGES
+
+
+class BatchQueue:
+    """Batches by priority, first in first out within one. Thread-safe; ``_lock`` guards all of it.
+
+    Whoever takes a batch says ``done`` when it has left for good, so that one can wait for those before a moment.
+    """
+
+    def __init__(self, settings: QueueSettings, max_messages: int = MAX_MESSAGES) -> None:
+        self._max_bytes, self._max_messages = settings.max_bytes, max_messages
+        self._lock = threading.Lock()
+        self._ready = threading.Condition(self._lock)
+        self._left = threading.Condition(self._lock)
+        self._unfinished: dict[int, tuple[int, Batch]] = {}  # id of a batch -> its number, rising
+        self._put = self._finished = 0
+        self._lanes: dict[int, deque[Batch]] = {}
+        self._messages = 0
+        self._bytes = 0
+        self._closed = False
+
+    def put(self, batch: Batch, priority: int) -> list[Batch]:
+        """Add a batch, at once. Returns what had to be dropped for it: the least important, oldest first; maybe itself."""
+        dropped: list[Batch] = []
+        with self._lock:
+            lane = self._lanes.get(priority)
+            if lane is None:
+                self._lanes[priority] = lane = deque()
+                self._lanes = dict(sorted(self._lanes.items()))
+            lane.append(batch)
+            self._put += 1
+            self._unfinished[id(batch)] = self._put, batch
+            self._messages += len(batch.samples)
+            self._bytes += batch.size
+            while self._messages > self._max_messages or self._bytes > self._max_bytes:
+                dropped.append(self._remove(next(lane for lane in reversed(self._lanes.values()) if lane)))
+                self._finish(dropped[-1])
+            self._ready.notify()
+        return dropped
+
+    def get(self, timeout_s: float) -> Batch | None:
+        """The most important batch, or None after the timeout or once the queue is closed and empty."""
+        with self._lock:
+            if not self._messages and not self._closed:
+                self._ready.wait(timeout_s)
+            for lane in self._lanes.values():
+                if lane:
+                    return self._remove(lane)
+        return None
+
+    def done(self, batch: Batch) -> None:
+        """The batch that ``get`` gave out has been handed on, or rejected."""
+        with self._lock:
+            self._finished += 1
+            self._finish(batch)
+
+    def finished(self, deadline_s: float) -> bool:
+        """Whether every batch that was put before this call is done, or dropped, in time."""
+        with self._lock:
+            last = self._put
+            return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
+
+    def is_busy(self) -> bool:
+        """Whether a batch waits or is with an encoder; reads without the lock, so it may be a moment old."""
+        return bool(self._unfinished)
+
+    def oldest(self) -> dict[str, int]:
+        """Topic -> the first stamp of its batches that are not done."""
+        with self._lock:
+            found: dict[str, int] = {}
+            for _, batch in self._unfinished.values():
+                first_ns = batch.samples[0].stamp_ns
+                found[batch.topic] = min(first_ns, found.get(batch.topic, first_ns))
+            return found
+
+    def close(self) -> None:
+        """Wake all who wait; what is inside can still be taken."""
+        with self._lock:
+            self._closed = True
+            self._ready.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        with self._lock:
+            return self._closed
+
+    def status(self) -> QueueStatus:
+        with self._lock:
+            batches = sum(len(lane) for lane in self._lanes.values())
+            return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages)
+
+    def _first(self) -> int:
+        """The number of the oldest batch that is not done, or of the next one."""
+        return next((number for number, _ in self._unfinished.values()), self._put + 1)
+
+    def _remove(self, lane: deque[Batch]) -> Batch:
+        batch = lane.popleft()
+        self._messages -= len(batch.samples)
+        self._bytes -= batch.size
+        return batch
+
+    def _finish(self, batch: Batch) -> None:
+        self._unfinished.pop(id(batch), None)
+        self._left.notify_all()
+
+
+class EncodePool:
+    """The threads that encode batches and hand the objects to the spool.
+
+    New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake.
+    """
+
+    def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
+                 writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *,
+                 preview: Preview = lambda _: None, reports: RejectionLog | None = None,
+                 threads: int = THREADS) -> None:  # fmt: skip
+        """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
+
+        ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
+        ``preview`` may make a small one of an object, which goes the same way before it. ``reports`` says what was rejected.
+        """
+        self._queue = queue
+        self._sensors = sensors
+        self._robot = robot
+        self._types = types
+        self._writer = writer
+        self._accounts = writer.spool.accounts
+        self._marks = marks
+        self._observe = observe
+        self._preview = preview
+        self._reports = RejectionLog() if reports is None else reports
+        self.workers = [Worker(f'encode-{number}', self._step, patience_s=PATIENCE_S) for number in range(threads)]
+
+    def open(self) -> None:
+        for worker in self.workers:
+            worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        """Encode what is queued, then end; False if that took longer than the deadline. Idempotent."""
+        end = time.monotonic() + deadline_s
+        self._queue.close()
+        done = [worker.join(end - time.monotonic()) for worker in self.workers]
+        for worker in self.workers:
+            worker.stop()
+        return all(done)
+
+    def _step(self) -> None:
+        self._reports.look()
+        batch = self._queue.get(WAIT_S)
+        if batch is not None:
+            try:
+                self._encode(batch)
+            finally:
+                self._queue.done(batch)
+        elif self._queue.closed:
+            for worker in self.workers:
+                worker.stop()
+
+    def _encode(self, batch: Batch) -> None:
+        first_ns, last_ns = batch.samples[0].received_ns, batch.samples[-1].received_ns  # what is wrong may have any stamp
+        try:
+            encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
+        except BaseException:
+            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)}, first_ns, last_ns)
+            raise
+        if encoding.rejected:
+            self._accounts.reject(batch.topic, encoding.rejected, first_ns, last_ns)
+            self._reports.add(batch.topic, batch.sensor, encoding.rejections)
+        if encoding.object is not None:
+            try:
+                self._spool(encoding.object)
+            except BaseException:
+                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples}, first_ns, last_ns)
+                raise
+            if encoding.corrected:
+                self._accounts.correct(batch.topic, encoding.corrected)
+        self._observe(batch, encoding.object)
+
+    def _spool(self, item: DataObject) -> None:
+        for mark in self._marks:
+            item = mark(item)
+        preview = self._preview(item)
+        self._writer.put(*([preview] if preview is not None else []), item)

@@ -1,0 +1,133 @@
+"""The subscriptions to topics that a consumer wants and no sensor has. Owned by the intake thread."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Final
+
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.node.intake.consumers import Consumer
+from shadowhound_data_logger.node.intake.subscriber import Subscriber, Surroundings
+
+log = logging.getLogger(__name__)
+
+MAX_FOUND: Final = 200
+"""Topics that only an expression names and that are listened to at once: a subscription takes some 100 KB of memory, and who
+publishes decides how many topics there are. Topics that the settings name have no limit."""
+MAX_EVER: Final = 1000
+"""The same over the life of the node, whose middleware and accounts keep a little of each name."""
+GONE_S: Final = 30.0
+"""How long such a topic must be without a publisher before its subscription goes."""
+STANDARD: Final = {
+    '/rosout': 'rcl_interfaces/msg/Log',
+    '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
+    '/clock': 'rosgraph_msgs/msg/Clock',
+    '/tf': 'tf2_msgs/msg/TFMessage',
+    '/tf_static': 'tf2_msgs/msg/TFMessage',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+"""Types of topics that ROS itself defines, some of which this node publishes: whoever publishes another type there is wrong."""
+
+
+class ExtraTopics:
+    """Subscribes to the topics that one consumer wants and no sensor takes.
+
+    New; ``refresh`` while it listens, ``end`` when it does no more.
+    """
+
+    def __init__(self, around: Surroundings, consumers: Sequence[Consumer], types: Mapping[str, str]) -> None:
+        """The first of ``consumers`` is the one; what has a subscription of its own here goes to the others as well.
+
+        ``types`` are those that sensors name for topics, also for such as they do not take now.
+        """
+        assert consumers[0].wanted_topics is not None
+        self.consumer, self._choice = consumers[0], consumers[0].wanted_topics
+        self._consumers = consumers
+        self._around = around
+        self._node = around.node
+        self._types = {**STANDARD, **types}
+        self._own: dict[str, Subscriber] = {}
+        self._free: frozenset[str] = frozenset()
+        self._ever: set[str] = set()
+        self._alone_since_s: dict[str, float] = {}
+        self.left_out = 0
+        """Topics that an expression names and that are not listened to, because there are too many of them."""
+
+    @property
+    def own(self) -> Collection[Subscriber]:
+        """Those of topics that no sensor takes."""
+        return self._own.values()
+
+    def refresh(self, taken: Mapping[str, bool], sensors: Collection[str], now_s: float, *, paused: bool) -> None:
+        """Follow the graph, and the topics that have a subscription elsewhere now (True: latched): none is lost on the way.
+
+        ``sensors`` are those among them that the consumer has unless its settings name some. One that wants what is latched has
+        subscriptions of its own for that.
+        """
+        graph = [name for name, _ in self._node.get_topic_names_and_types()] if self._choice.asks_graph else []
+        wanted = self._choice.wanted(sensors, graph)
+        latched = {topic for topic, is_latched in taken.items() if is_latched and self.consumer.wants_latched}
+        shared = taken.keys() - latched
+        self._free = frozenset(sensors)
+        for topic in self._admitted(wanted.difference(shared, self._own)):
+            sensor = SensorSettings(name='bag', topics=(topic,), types=(self._types.get(topic, ''),))
+            self._own[topic] = Subscriber(self._around, sensor, self._consumers)
+            self._own[topic].paused = paused
+        for subscriber in self._own.values():
+            subscriber.refresh(now_s)
+        self._drop_abandoned(now_s)
+        self.consumer.topics = frozenset(self._own).union(wanted & taken.keys()) - latched
+        for topic in shared & self._own.keys():
+            self._own.pop(topic).close(now_s)
+
+    def _is_named(self, topic: str) -> bool:
+        """By the settings: the consumer's, or a sensor's."""
+        return self._choice.names(topic) or topic in self._free
+
+    def _admitted(self, wanted: frozenset[str]) -> Iterator[str]:
+        """Those to listen to: all that are named, of the others those that somebody publishes, as far as there is room."""
+        named = [topic for topic in wanted if self._is_named(topic)]
+        yield from named
+        found = sorted(topic for topic in wanted.difference(named) if self._node.count_publishers(topic))
+        room = MAX_FOUND - sum(not self._is_named(topic) for topic in self._own)
+        new = MAX_EVER - len(self._ever)
+        left_out = 0
+        for topic in found:
+            if room > 0 and (topic in self._ever or new > 0):
+                room, new = room - 1, new - (topic not in self._ever)
+                self._ever.add(topic)
+                yield topic
+            else:
+                left_out += 1
+        if left_out and not self.left_out:
+            text = '%d topics (%s, ...) are not recorded: besides those that the settings name, at most %d are, and %d in total'
+            log.warning(text, left_out, printable(found[-1]), MAX_FOUND, MAX_EVER)
+        self.left_out = left_out
+
+    def _drop_abandoned(self, now_s: float) -> None:
+        """End the subscriptions of topics that nobody has published for a while, unless the settings name them."""
+        for topic, subscriber in tuple(self._own.items()):
+            if subscriber.status().publishers or self._is_named(topic):
+                self._alone_since_s.pop(topic, None)
+            elif now_s - self._alone_since_s.setdefault(topic, now_s) > GONE_S:
+                del self._alone_since_s[topic]
+                self._own.pop(topic).close(now_s)
+
+    def renew(self, now_s: float) -> None:
+        """Before a ``refresh``: something new begins for the consumer, with what is latched as well."""
+        for topic in [topic for topic, subscriber in self._own.items() if subscriber.has_latched]:
+            self._own.pop(topic).close(now_s)
+        self.consumer.topics = frozenset()
+
+    def end(self, now_s: float) -> None:
+        """Take what still waits; of what comes from now on the consumer gets nothing."""
+        own, self._own = self._own, {}
+        self._alone_since_s.clear()
+        self.left_out = 0
+        with ExitStack() as ending:
+            for subscriber in own.values():
+                ending.callback(subscriber.close, now_s)
+        self.consumer.topics = frozenset()

@@ -1,0 +1,235 @@
+"""The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (docs/decisions/0010).
+
+What it takes of a topic goes to its consumers (``consumers.Consumer``), in order; it knows none of them. Nothing here
+touches disk or network or parses a message.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from typing import Final
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.consumers import Consumer
+from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
+from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
+from shadowhound_data_logger.ros.endpoints import POLL_S
+from shadowhound_data_logger.ros.reader import PolledGroup
+from shadowhound_data_logger.spool.accounts import Accounts
+
+REFRESH_S: Final = 0.5
+"""How often the graph is looked at: some 80 us a topic."""
+PATIENCE_S: Final = 5.0
+"""A round that lasts longer is stuck: a drain takes milliseconds, a first subscription a tenth of a second."""
+
+
+class Intake:
+    """Takes all messages, on one thread, and hands them to the consumers.
+
+    New; open once; close once. The thread does what is asked of it between two drains.
+
+    ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
+    """
+
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes, stamps: StampRule,
+                 consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
+        """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
+
+        ``first`` are topics to be drained before all others.
+        """
+        self._sensors = sensors
+        self._consumers = consumers
+        around = Surroundings(node, PolledGroup(), accounts, types, stamps)
+        self._others = OtherTypes(node, accounts)
+        self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
+        self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)
+        named = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
+                 for topic, type_name in zip(sensor.topics, sensor.types, strict=False) if type_name}  # fmt: skip
+        self._extra = [ExtraTopics(around, consumers[place:], named)
+                       for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
+        self._listening = [extra for extra in self._extra if extra.consumer.from_start]
+        self._requests: deque[Callable[[], None]] = deque()
+        self._wake = threading.Event()
+        self._next_poll_s = self._next_refresh_s = 0.0
+        self.paused = False
+        """Whether messages are counted only; set by the thread."""
+        self.worker = Worker('intake', self._step, patience_s=PATIENCE_S)
+
+    @property
+    def topics(self) -> Sequence[str]:
+        """The resolved topics of sensors that it listens to, or would."""
+        return [subscriber.topic for subscriber in self._subscribers if subscriber.sensor.enabled]
+
+    @property
+    def wanted(self) -> Mapping[str, str]:
+        """All resolved topics of the sensors that are enabled, with the type that the settings name for each, or nothing."""
+        return {topic: name for one in self._subscribers if one.sensor.enabled for topic, name in one.wanted.items()}
+
+    @property
+    def _unsampled(self) -> Sequence[Subscriber]:
+        """Of topics that no sensor has."""
+        return [subscriber for extra in self._extra for subscriber in extra.own]
+
+    def consumer_failures(self) -> Mapping[str, tuple[int, str]]:
+        """Of each consumer that failed to take messages: how often, and the newest error."""
+        return {type(each).__name__: (each.failures, each.last_error) for each in self._consumers if each.failures}
+
+    def left_out(self, consumer: Consumer) -> int:
+        """Topics that a consumer would have by an expression, and does not: there are too many."""
+        return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)
+
+    def status(self) -> list[SubscriberStatus]:
+        return [subscriber.status() for subscriber in self._subscribers]
+
+    def open(self) -> None:
+        for consumer in self._consumers:
+            if consumer.from_start:
+                consumer.begin()
+        self.worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        """Take what waits, have it all handed on, end the subscriptions and the thread; False if that failed or took too long."""
+        if self.worker.stopping:
+            return True
+        finished = self._ask(self._finish, deadline_s)
+        self.worker.stop()
+        self._wake.set()
+        return self.worker.join(deadline_s) and finished
+
+    def flush(self, deadline_s: float, then: Callable[[], None] | None = None) -> bool:
+        """Take what waits, and have the consumers hand on what they gathered; False if that failed or took too long.
+
+        ``then`` is called by the thread: what comes after it is of another time.
+        """
+        return self._ask(partial(self._flush, then), deadline_s)
+
+    def pause(self, deadline_s: float, *, paused: bool) -> bool:
+        """From now on count and drop what comes, or store it again; False if that failed or took too long."""
+        return self.flush(deadline_s, partial(self._set_paused, paused=paused))
+
+    def listen(self, consumer: Consumer, on: bool, deadline_s: float) -> bool:
+        """From now on a consumer with a choice gets its topics, or nothing more; False if that failed or took too long.
+
+        ``on`` while it is on already: something new begins for it here. What came before is taken before.
+        """
+        extra = next(extra for extra in self._extra if extra.consumer is consumer)
+        return self._ask(partial(self._listen, extra, on), deadline_s)
+
+    def update(self, sensors: Iterable[SensorSettings]) -> None:
+        """Go on by these settings soon; sensors that are not among them stay as they are."""
+        self._post(partial(self._update, tuple(sensors)))
+
+    # -- what the thread does --------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        """One round: wait for the next poll, follow the graph, drain every topic, do what was asked for."""
+        self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
+        self._wake.clear()
+        now_s = time.monotonic()
+        self._next_poll_s = now_s + until_poll(time.time())
+        todo: list[Callable[[], None]] = []
+        if refreshes := now_s >= self._next_refresh_s:
+            self._next_refresh_s = now_s + REFRESH_S
+            todo += [partial(subscriber.refresh, now_s) for subscriber in self._by_turn]
+        todo += [partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)]
+        todo.append(self._others.drain)
+        if refreshes and self._listening:
+            todo.append(partial(self._follow, now_s))
+        todo += [partial(consumer.tick, now_s) for consumer in self._consumers]
+        _each([*todo, self._obey])
+
+    def _obey(self) -> None:
+        while self._requests:
+            self._requests.popleft()()
+
+    def _drain(self, now_s: float) -> None:
+        _each([partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)])
+
+    def _flush(self, then: Callable[[], None] | None = None) -> None:
+        steps: list[Callable[[], None]] = [partial(self._drain, time.monotonic())]
+        _each([*steps, *(consumer.flush for consumer in self._consumers), *([then] if then is not None else [])])
+
+    def _set_paused(self, *, paused: bool) -> None:
+        self.paused = paused
+        for subscriber in (*self._subscribers, *self._unsampled):
+            subscriber.paused = paused
+
+    def _update(self, sensors: Sequence[SensorSettings]) -> None:
+        now_s = time.monotonic()
+        self._sensors.update((sensor.name, sensor) for sensor in sensors)
+        _each([partial(subscriber.update, self._sensors[subscriber.sensor.name], now_s) for subscriber in self._subscribers])
+        self._next_refresh_s = now_s
+
+    def _listen(self, extra: ExtraTopics, on: bool) -> None:
+        """What came before is drained first: it is not of what begins, or the last of what ends."""
+        now_s = time.monotonic()
+        self._drain(now_s)
+        is_on = extra in self._listening
+        self._listening = [each for each in self._extra if (on if each is extra else each in self._listening)]
+        if on:
+            if is_on:
+                extra.renew(now_s)
+            extra.consumer.begin()
+            self._follow(now_s)
+        else:
+            extra.end(now_s)
+
+    def _follow(self, now_s: float) -> None:
+        sensors = {each.topic: each.has_latched for each in self._subscribers if each.sensor.enabled}
+        taken = dict(sensors)
+        for extra in self._listening:
+            extra.refresh(taken, sensors, now_s, paused=self.paused)
+            taken |= {each.topic: each.has_latched for each in extra.own}
+
+    def _finish(self) -> None:
+        now_s = time.monotonic()
+        ends = [partial(subscriber.close, now_s) for subscriber in self._subscribers]
+        ends += [partial(extra.end, now_s) for extra in self._extra]
+        _each([*ends, *(consumer.flush for consumer in self._consumers), self._others.close, self.worker.stop])
+
+    # -- between the threads ---------------------------------------------------------------------------------------
+
+    def _post(self, request: Callable[[], None]) -> None:
+        self._requests.append(request)
+        self._wake.set()
+
+    def _ask(self, request: Callable[[], None], deadline_s: float) -> bool:
+        """Whether the thread did it in time and without a failure; it still does it when that takes longer."""
+        done = threading.Event()
+        succeeded: list[bool] = []
+
+        def answer() -> None:
+            try:
+                request()
+                succeeded.append(True)
+            finally:
+                done.set()
+
+        self._post(answer)
+        return done.wait(max(0.0, deadline_s)) and bool(succeeded)
+
+
+def until_poll(wall_s: float) -> float:
+    """Seconds from a poll to the next one, which is halfway between two multiples of ``POLL_S``: a quarter of that at least.
+
+    What the sensors keep once a second then comes with one poll, 0.1 s after the second begins, and is one burst for the spool:
+    by then every topic of 10 Hz or more has sent its first message.
+    """
+    return POLL_S - ((wall_s - POLL_S / 4) % POLL_S - POLL_S / 4)
+
+
+def _each(steps: Sequence[Callable[[], None]]) -> None:
+    """Do all of them in this order, whatever happens to one; what one raised is raised in the end."""
+    with ExitStack() as stack:
+        for step in reversed(steps):
+            stack.callback(step)

@@ -1,0 +1,254 @@
+"""The messages of one topic and type on their way from the take to its consumers. Plain Python, owned by the intake thread.
+
+A stream names who sent each message, leaves out what came twice, and estimates what was lost between messages without numbers.
+What is left goes to the consumers of the topic (``consumers.py``).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from math import inf
+from typing import Final
+from zlib import crc32
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.stamps import Dated, StampRule
+from shadowhound_data_logger.formats.types import CounterField, MessageTypes
+from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, hand_on
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+from shadowhound_data_logger.spool.gaps import EXACT
+
+log = logging.getLogger(__name__)
+
+MAX_RECENT: Final = 10_000
+"""Messages without a sender's gid that are remembered, to know what a second subscription delivers again."""
+DEAD_S: Final = 15.0
+"""A publisher that was killed stays in the graph for less: Cyclone DDS gives it up after ten seconds."""
+NEW_S: Final = 2.0
+"""The graph may know a publisher so long before its first message is taken, and its predecessor's last one."""
+
+
+class Senders:
+    """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
+
+    With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
+    numbers start again while the time of sending goes on. When the old numbers go on as well, there are two of them.
+    """
+
+    def __init__(self) -> None:
+        self.gids: list[str] = []
+        self.changed_s = -inf
+        """When one came that was not there before, by the monotonic clock; the first ones are not counted."""
+        self.several_s: float | None = None
+        """Since when there are several."""
+        self._successors = 0
+        self._number = 0
+        self._number_before = 0
+        self._sent_ns = 0
+
+    def look(self, gids: list[str], now_s: float = 0.0) -> None:
+        """What the graph says now."""
+        self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
+        if gids and gids != self.gids:
+            if self.gids and not set(gids) <= set(self.gids):
+                self.changed_s = now_s
+            self.gids = gids
+            self._successors = 0
+
+    def name(self, number: int | None, sent_ns: int) -> str | None:
+        """A name for the sender of this message; None where there is more than one, or no number."""
+        if number is None or len(self.gids) != 1:
+            return None
+        if self._successors and self._number < self._number_before < number:
+            return None
+        if number <= self._number and sent_ns > self._sent_ns:
+            self._successors += 1
+            self._number_before = self._number
+        if sent_ns >= self._sent_ns:
+            self._number, self._sent_ns = number, sent_ns
+        return f'{self.gids[0]}.{self._successors}'
+
+
+class RecentMessages:
+    """What came lately without a sender's gid, to know what a second of our subscriptions delivers again."""
+
+    def __init__(self) -> None:
+        self._recent: dict[tuple[int, int], None] = {}
+
+    def has(self, message: Taken) -> bool:
+        """Whether it came already: sent at the same time, same number or content.
+
+        Asked also while the graph knows one sender, whose name the middleware does not give: a second one may appear.
+        """
+        mark = (message.source_ns, crc32(message.cdr) if message.number is None else message.number)
+        if mark in self._recent:
+            return True
+        self._recent[mark] = None
+        if len(self._recent) > MAX_RECENT:
+            del self._recent[next(iter(self._recent))]
+        return False
+
+
+class Arrivals:
+    """When messages without numbers came, as an estimate of what is lost between them wants to know it."""
+
+    def __init__(self) -> None:
+        self._heard_s: float | None = None
+        self._looked_s: float | None = None
+
+    def look(self, now_s: float) -> None:
+        """All that waited was taken."""
+        self._looked_s = now_s
+
+    def hear(self, senders: Senders, now_s: float) -> Hearing:
+        """Some came."""
+        looked_s = now_s if self._looked_s is None else self._looked_s
+        since_s = now_s if self._heard_s is None else self._heard_s
+        self._heard_s = now_s
+        alone = len(senders.gids) == 1
+        return Hearing(
+            now_s=now_s, quiet_s=max(0.0, looked_s - since_s), alone=alone,
+            gid=senders.gids[0] if alone else '',
+            crowded=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
+            new=senders.changed_s > since_s - NEW_S,
+        )  # fmt: skip
+
+
+class TopicStream:
+    """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
+
+    def __init__(self, topic: str, type_name: str, stamps: StampRule, consumers: Sequence[Consumer]) -> None:
+        """The first of ``consumers`` gets all of it, the others as far as the topic is one of theirs."""
+        self._topic = topic
+        self._type = type_name
+        self._owner, self._others = consumers[0], consumers[1:]
+        self._stamps = stamps
+        self._recent = RecentMessages()
+        self._arrivals = Arrivals()
+        self._estimate = TopicEstimate()
+
+    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
+        """Hand on messages, in the order in which they came."""
+        fresh: list[Taken] = []
+        sent: dict[str, list[int]] = {}
+        for message in taken:
+            _, source_ns, gid, number, received_ns = message
+            publisher = gid or senders.name(number, source_ns)
+            if (gid is None or number is None) and self._recent.has(message):
+                continue
+            fresh.append(_known(message, publisher, self._stamps.date(0, source_ns, received_ns)))
+            if publisher is None or number is None:
+                sent.setdefault(gid or '', []).append(source_ns)
+        lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
+        if fresh:
+            drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
+            hand_on(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
+
+    def look(self, now_s: float) -> None:
+        """All that waited was taken."""
+        self._arrivals.look(now_s)
+
+    def close(self) -> None:
+        """No more of it comes."""
+        self._owner.leave(self._topic)
+        for consumer in self._others:
+            if self._topic in consumer.topics:
+                consumer.leave(self._topic)
+
+
+class SensorStream:
+    """A topic of a sensor: each message is counted once, in the topic's account. New for each topic and type."""
+
+    def __init__(self, sensor: SensorSettings, topic: str, type_name: str, accounts: Accounts, types: MessageTypes,
+                 stamps: StampRule, consumers: Sequence[Consumer]) -> None:  # fmt: skip
+        self._stamps = stamps
+        self._sensor = sensor.name
+        self._topic = topic
+        self._type = type_name
+        self._entry = accounts.entry(topic)
+        self._consumers = consumers
+        self._of_sensors = [consumer for consumer in consumers if consumer.wanted_topics is None]
+        self._of_own_topics = [consumer for consumer in consumers if consumer.wanted_topics is not None]
+        self._recent = RecentMessages()
+        self._arrivals = Arrivals()
+        self._counter: CounterField | None = None
+        self._is_refuted = False
+        with self._entry as account:
+            account.type = type_name
+            account.expect(self._expected(sensor, types))
+        for consumer in self._of_sensors:
+            consumer.enter(topic, type_name, sensor.name)
+
+    def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
+        """What is declared of the sensor's messages: a counter in them, else how often they come."""
+        if sensor.counter:
+            try:
+                self._counter = types.counter(self._type, sensor.counter)
+                return Expectation(f'counter:{sensor.counter}', wrap=self._counter.wrap)
+            except Rejected as error:
+                log.warning('%s.counter cannot be used, using stamps instead: %s', sensor.name, error)
+        return Expectation(period=SECOND / sensor.expected_hz if sensor.expected_hz else 0.0)
+
+    def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
+        """Count messages, in the order in which they came, and hand on those that are not repeats."""
+        fresh: list[Taken] = []
+        sent: dict[str, list[int]] = {}
+        counter, date = self._counter, self._stamps.date
+        failed: dict[Consumer, Exception] = {}
+        with self._entry as account:
+            for message in taken:
+                cdr, source_ns, gid, number, received_ns = message
+                publisher = gid or senders.name(number, source_ns)
+                if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
+                    continue
+                dated = date(0, source_ns, received_ns)
+                known = _known(message, publisher, dated)
+                if not account.receive(publisher, number, known.source_ns):
+                    continue
+                if dated.refused:
+                    account.by_arrival[dated.refused] += 1
+                fresh.append(known)
+                if publisher is None or number is None:
+                    sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
+            newest_ns = fresh[-1].source_ns if fresh else 0
+            lost = account.observe(sent, self._arrivals.hear(senders, now_s), newest_ns) if sent else None
+            is_refuted = bool(sent) and account.estimate.refuted
+            if fresh:
+                drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
+                for consumer in self._of_sensors:
+                    try:
+                        consumer.choose(drained, account)
+                    except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
+                        failed[consumer] = error
+                account.gaps.heard_ns = newest_ns
+        if is_refuted and not self._is_refuted:
+            self._is_refuted = True
+            text = '%s: messages come more often than expected_hz says: their rate is learned instead'
+            log.warning(text, self._topic)
+        for consumer, defect in failed.items():
+            count_failure(consumer, self._topic, defect)
+        if fresh:
+            hand_on(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
+            hand_on(drained, [each for each in self._of_own_topics if self._topic in each.topics])
+
+    def look(self, now_s: float) -> None:
+        """All that waited was taken."""
+        self._arrivals.look(now_s)
+
+    def close(self) -> None:
+        """No more of it comes."""
+        for consumer in self._consumers:
+            if consumer.wanted_topics is None or self._topic in consumer.topics:
+                consumer.leave(self._topic)
+
+
+def _known(message: Taken, publisher: str | None, sent: Dated) -> Taken:
+    """The message with its sender, and with its arrival for a time of sending that is not trusted."""
+    if sent.refused:
+        return message._replace(publisher=publisher, source_ns=sent.ns)
+    return message if publisher is message.publisher else message._replace(publisher=publisher)

@@ -1,0 +1,151 @@
+"""Judges the rules that uploads wait for (``upload.when`` and its like) by messages, network, time and mission."""
+
+from __future__ import annotations
+
+import array
+import fcntl
+import logging
+import socket
+import struct
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, Taken
+from shadowhound_data_logger.core.options import EventSettings
+from shadowhound_data_logger.core.rules import Rule, read_rule
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, TopicChoice
+from shadowhound_data_logger.node.recording.bags import profiles_offered
+from shadowhound_data_logger.node.recording.mission_observer import number_at
+
+log = logging.getLogger(__name__)
+
+STALE_S: Final = 60.0
+"""A number is unknown again where no newer message came for so long, unless its publisher is latched and there."""
+KEEP_WHEN: Final = 'keep.when'
+INTERFACES: Final = Path('/sys/class/net')
+SSID_BYTES: Final = 32
+"""IEEE 802.11-2020, 9.4.2.2."""
+_SIOCGIWESSID: Final = 0x8B1B
+"""linux/wireless.h: the name of the network of an interface, which anybody may ask for."""
+
+
+class NewestMessages(Consumer):
+    """Keeps the newest message of each topic that rules ask. ``take`` by the intake, the rest by any thread."""
+
+    def __init__(self, topics: Collection[str]) -> None:
+        """Full names, one at least."""
+        self.wanted_topics = TopicChoice(EventSettings(), topics)
+        self.newest: dict[str, tuple[str, Taken, float]] = {}
+        """Topic -> type, message, and when it was drained by the monotonic clock."""
+
+    def take(self, drained: Drained) -> None:
+        self.newest[drained.topic] = drained.type, drained.messages[-1], drained.now_s
+
+
+class UploadRules:
+    """Says once a second which rules do not hold, and why.
+
+    New; ``look`` on the main thread.
+    """
+
+    def __init__(self, node: Node, settings: Settings, types: MessageTypes, clock: ClockWatch,
+                 mission: Callable[[], Mapping[str, Any]]) -> None:  # fmt: skip
+        """``mission`` tells what is active (``MissionWatch.status``)."""
+        texts = {UPLOAD_WHEN: settings.upload.when, EVENTS_WHEN: settings.events.when, KEEP_WHEN: settings.keep.when}
+        read = {name: read_rule(text, name) for name, text in texts.items()}
+        self._rules: dict[str, Rule] = {name: rule for name, rule in read.items() if rule is not None}
+        self._node = node
+        self._types = types
+        self._clock = clock
+        self._mission = mission
+        topics = {node.resolve_topic_name(topic) for rule in self._rules.values() for topic in rule.topics()}
+        self._messages = NewestMessages(topics) if topics else None
+        self._closed: Mapping[str, str] = dict.fromkeys(self._rules, 'it has not been judged yet')
+
+    @property
+    def consumers(self) -> Sequence[Consumer]:
+        """That the intake serves: none where no rule asks a topic."""
+        return () if self._messages is None else (self._messages,)
+
+    @property
+    def closed(self) -> Mapping[str, str]:
+        """The rules that do not hold: why. At first none does, because nothing is known."""
+        return self._closed
+
+    def look(self) -> Mapping[str, str]:
+        """Judge them; returns ``closed``."""
+        now_s, closed = time.monotonic(), {}
+        for name, rule in self._rules.items():
+            holds, why = rule.judge(self, now_s)
+            if not holds:
+                closed[name] = why
+            if holds is (name in self._closed):
+                log.info('%s %s: %s', name, 'holds' if holds else 'does not hold', why)
+        self._closed = closed
+        return closed
+
+    # -- what rules ask ----------------------------------------------------------------------------------------------
+
+    def number(self, topic: str, path: Sequence[str]) -> float | str:
+        full = self._node.resolve_topic_name(topic)
+        found = self._messages.newest.get(full) if self._messages is not None else None
+        if found is None:
+            return f'no message of {full} came yet'
+        type_name, message, heard_s = found
+        offered = profiles_offered(self._node, full, type_name)
+        age_s = time.monotonic() - heard_s
+        if not offered:
+            return f'nobody publishes {full} any more'
+        if age_s > STALE_S and not any(int(each.durability) == int(DurabilityPolicy.TRANSIENT_LOCAL) for each in offered):
+            return f'no message of {full} came for {age_s:.0f} s'
+        try:
+            value = number_at(self._types.deserialize(type_name, message.cdr), list(path))
+        except Rejected as error:
+            return f'{full} cannot be read: {error}'
+        return value if value is not None else f'{type_name} has no number {".".join(path)}'
+
+    def networks(self) -> Collection[str] | str:
+        return wifi_networks()
+
+    def minute(self) -> int | str:
+        if not self._clock.is_set:
+            return 'the clock of this machine is not set'
+        local = time.localtime(self._clock.wall_ns() // SECOND)
+        return 60 * local.tm_hour + local.tm_min
+
+    def mission(self) -> str | None:
+        active = self._mission()
+        return str(active.get('type', '')) if active else None
+
+
+def wifi_networks(interfaces: Path = INTERFACES, ask: Callable[..., Any] = fcntl.ioctl) -> Collection[str] | str:
+    """Names of the WiFi networks that this machine is in; a text says why they are not known.
+
+    By wireless extensions, which the kernel offers for cfg80211 as well (CONFIG_CFG80211_WEXT); no rights are needed.
+    """
+    try:
+        names = sorted(path.name for path in interfaces.iterdir() if (path / 'wireless').is_dir() or (path / 'phy80211').exists())
+    except OSError as error:
+        return f'{interfaces} cannot be read: {error.strerror}'
+    found, failed = set(), ''
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as asked:
+        for name in names:
+            essid = array.array('B', bytes(SSID_BYTES + 1))
+            request = array.array('B', struct.pack('16sPHH', name.encode()[:15], essid.buffer_info()[0], len(essid), 0))
+            try:
+                ask(asked.fileno(), _SIOCGIWESSID, request, True)
+            except OSError as error:
+                failed = f'the system does not tell the network of {name}: {error.strerror}'
+            else:
+                found.add(essid.tobytes()[:SSID_BYTES].rstrip(b'\0').decode('utf-8', 'replace'))
+    return failed if failed and not found else found - {''}

@@ -1,0 +1,388 @@
+"""The stages of the node, put together: opened from the store back to the robot, closed the other way round."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sqlite3
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.bags.kept import KeptCut, sweep
+from shadowhound_data_logger.bags.naming import BAGS
+from shadowhound_data_logger.bags.place import BagPlace
+from shadowhound_data_logger.bags.queue import BagQueue
+from shadowhound_data_logger.bags.recorder import Recorder
+from shadowhound_data_logger.bags.recovery import BagRecovery
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
+from shadowhound_data_logger.core.errors import DataLoggerError, SpoolError
+from shadowhound_data_logger.core.keys import dated
+from shadowhound_data_logger.core.model import DataObject
+from shadowhound_data_logger.core.options import ON_REQUEST
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, EncodePool
+from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
+from shadowhound_data_logger.node.encoding.rejections import RejectionLog
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.intake.middleware import Middleware
+from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.node.intake.unheard import Unheard
+from shadowhound_data_logger.node.keeping.keeping import Keeping, keeps_bag
+from shadowhound_data_logger.node.keeping.link_track import LinkTrack
+from shadowhound_data_logger.node.keeping.upload_rules import KEEP_WHEN, UploadRules
+from shadowhound_data_logger.node.parameters import Parameters, live
+from shadowhound_data_logger.node.recording.bags import BagConsumer
+from shadowhound_data_logger.node.recording.events import EventBuffer
+from shadowhound_data_logger.node.recording.mission import MissionWatch
+from shadowhound_data_logger.node.recording.mission_observer import MissionObserver
+from shadowhound_data_logger.node.reporting.commands import Commands
+from shadowhound_data_logger.node.reporting.control import ControlSocket
+from shadowhound_data_logger.node.reporting.front import Front
+from shadowhound_data_logger.node.reporting.interface import Interface
+from shadowhound_data_logger.node.reporting.status import PERIOD_S, Stages, Status
+from shadowhound_data_logger.ros.reader import endpoints, node_of
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.requests import RequestServer
+from shadowhound_data_logger.shipping.thinning import Thinner
+from shadowhound_data_logger.shipping.uploader import Uploader
+from shadowhound_data_logger.spool import ledger
+from shadowhound_data_logger.spool.accounts import SINKS
+from shadowhound_data_logger.spool.act_record import ActRecord
+from shadowhound_data_logger.spool.clock_record import ClockRecord
+from shadowhound_data_logger.spool.redating import Redating
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
+
+log = logging.getLogger(__name__)
+
+CLOSE_S = 5.0
+"""Time for what is in memory to become durable at a stop; it takes a fraction of that unless the disk hangs."""
+DAMAGED_S = 0.5
+"""The same where the spool takes nothing any more."""
+LEDGER_BUCKET = 'sensor-data'
+
+
+@dataclass(frozen=True, slots=True)
+class Ros:
+    """How the logger takes part in ROS."""
+
+    node: Node
+    """That listens."""
+    name: str
+    """The full name under which ROS knows the logger."""
+    middleware: Middleware
+    front: Front | None
+    """Offers all else in the robot's RMW; None where the node itself does, or nobody can."""
+
+
+class Pipeline:
+    """Puts the stages of the node together, and starts and stops them in order.
+
+    New; open once; close once.
+    """
+
+    def __init__(self, ros: Ros, settings: Settings, parameters: Parameters) -> None:
+        self._settings = settings
+        self._parameters = parameters
+        self._ros = ros
+        self._record = record = ClockRecord(settings.spool_path, settings.robot)
+        self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
+        self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot, settings.keep)
+        self._redating = Redating(self.spool, self._clock, record, settings.robot)
+        self._node = ros.node
+        self._day = self._today()
+        self._due_s = 0.0
+        self._failures = 0
+        self._opened = ExitStack()
+
+    def open(self) -> None:
+        """Raises SpoolError or SettingError; nothing is left open then."""
+        with ExitStack() as opened:
+            self._open_disk(opened)
+            self._make_stages()
+            self._open_stages(opened)
+            self._opened = opened.pop_all()
+
+    def _open_disk(self, opened: ExitStack) -> None:
+        """The store and the spool, which nobody else may be filling; ``opened`` closes them."""
+        settings = self._settings
+        self._store = open_store(settings.store, settings.upload)
+        opened.callback(self._store.close)
+        self.spool.open()
+        opened.callback(self.spool.close)
+        if not opened.enter_context(self.spool.node_lock()):
+            raise SpoolError(f'another sensor_logger_node logs {settings.robot} to {self.spool.root} already',
+                             remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
+        for sink in SINKS:
+            self.spool.carry(sink)
+
+    def _make_stages(self) -> None:
+        """Each with what it hands its work to; none runs yet."""
+        settings = self._settings
+        queue = BatchQueue(settings.queue)
+        self.writer = SpoolWriter(self.spool, expects=queue.is_busy)
+        self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
+        accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+        place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+                         self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
+        recovery = BagRecovery(place, settings.bag.priority)
+        self.event_buffer = EventBuffer(node, settings, place, recovery, types)
+        # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
+        bag_queue = BagQueue()
+        sensors = {sensor.name: sensor for sensor in settings.sensors}
+        stamps = StampRule(self._clock, round(settings.clock.max_offset_s * SECOND))
+        track = RobotTrack(settings.mission, types, stamps, node.resolve_topic_name)
+        self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)
+        self.uploader.wait_for(self._rules.closed)
+        self._make_request_server(track)
+        keeps = self._requests is not None
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
+        self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
+        sampler = Sampler(sensors, accounts, types, stamps, queue)
+        accounts.oldest_open = sampler.oldest_open
+        bags = BagConsumer(node, settings.bag, accounts, bag_queue)
+        consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=[track.odometry])
+        self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
+        observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
+        self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
+        keeping = Keeping(settings.keep, sensors, settings.robot)
+        marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
+        self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
+                               preview=keeping.preview, reports=RejectionLog(partial(node_of, node)))  # fmt: skip
+        self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
+        self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
+                                       self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
+                                       self._ros.front, self._make_unheard(), self._requests)  # fmt: skip
+        self._status = Status(stages, settings, self._clock, self._store.describe())
+        acts = ActRecord(settings.spool_path, settings.robot, self._clock.wall_ns)
+        self._commands = Commands(stages, self._parameters, self._status, acts, settings.robot, self._ros.name)
+        self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
+
+    def _open_stages(self, opened: ExitStack) -> None:
+        """Start them, who is handed work before who hands it on; ``opened`` closes them in the opposite order, come what may."""
+        front = self._ros.front
+        if front is not None:
+            opened.callback(front.close)
+        opened.callback(self._tell, ended=True)
+        self.writer.open()
+        opened.callback(self.writer.close, 1.0)
+        self.pool.open()
+        self.uploader.open()
+        opened.callback(self.uploader.close, 0.5)
+        opened.callback(self.mission.close)
+        opened.callback(self._finish)
+        if self._requests is not None:
+            self._requests.open()
+            opened.callback(self._requests.close, 1.0)
+        if self._interface is not None:
+            self._interface.open()
+            opened.callback(self._interface.close)
+        self.mission.open()
+        opened.callback(self.mission.stop)
+        self.intake.open()
+        self.recorder.open()
+        self.event_buffer.open()
+        self._control.open()
+        opened.callback(self._control.close)
+        if front is not None:
+            front.open(self._control.path)
+            opened.callback(front.stop)
+        log.info(self.describe())
+
+    def describe(self) -> str:
+        """What goes where, in one line."""
+        listed = {sensor.name for sensor in self._settings.sensors}
+        others = [name for name, own in DEFAULT_SENSORS.items() if name not in listed and own.get('enabled', True)]
+        left_out = f'; not logged, because sensors does not list them: {", ".join(others)}' if others else ''
+        return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}{left_out}'
+
+    def close(self) -> None:
+        """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""
+        self._opened.close()
+
+    def _finish(self) -> None:
+        """Everything that is in memory to the spool, and from there what can be delivered in time."""
+        close_s = DAMAGED_S if self.writer.damaged else CLOSE_S
+        end_s = time.monotonic() + close_s
+        finished = {
+            'bag recorder': self.recorder.close(close_s),
+            'intake': self.intake.close(close_s),
+            'event writer': self.event_buffer.close(end_s - time.monotonic()),
+            'encode pool': self.pool.close(end_s - time.monotonic()),
+            'spool writer': self.writer.flush(end_s - time.monotonic()),
+        }
+        for name in (name for name, done in finished.items() if not done):
+            log.error('the %s did not finish its work in %g s', name, close_s)
+        if not all(finished.values()):
+            return
+        self._ship_ledger()
+        self._look_at_link(is_last=True)
+        self.writer.prompt = True
+        self.writer.flush(1.0)
+        end_s = time.monotonic() + self._settings.shutdown.drain_s
+        self.uploader.drain(end_s - time.monotonic())
+        self.writer.flush(1.0)
+        self._spool_parts(self._catalogue.parts)
+        self.writer.flush(1.0)
+        if self._settings.shutdown.drain_s and not self.uploader.drain(end_s - time.monotonic()):
+            log.warning(
+                '%d objects stay in the spool %s and will be delivered later', self.spool.pending_count(), self.spool.root
+            )
+
+    def tick(self) -> None:
+        """Called several times a second: starts threads again that died, and once a second tells what goes on.
+
+        A failure of a thread is reported at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
+        spool cannot be repaired while it is in use.
+        """
+        if self.writer.damaged:
+            text = f'the index of the spool {self.spool.root} is damaged'
+            raise SpoolError(text, remedy='start the node again: it is rebuilt then')
+        self._obey()  # whoever woke the executor just as it went to sleep is not heard (rmw_fastrtps clears the condition unseen)
+        now_s = time.monotonic()
+        if not self._supervise() and now_s < self._due_s:
+            return
+        self._due_s = now_s + PERIOD_S
+        self._name_held()
+        self.uploader.wait_for(self._rules.look())
+        self.recorder.look()
+        self._spool_parts(self._catalogue.due)
+        self._look_at_link()
+        self._tell()
+        day = self._today()
+        if day != self._day:
+            self._day = day
+            self._ship_ledger()
+
+    def _obey(self) -> None:
+        """Called by the executor when somebody asks for something at the control socket."""
+        self._control.obey(self._commands.answer)
+
+    def _supervise(self) -> bool:
+        """Start threads again that died; whether any thread failed since the last time."""
+        for worker in self._stages.workers:
+            worker.look()
+        before, self._failures = self._failures, sum(worker.failures for worker in self._stages.workers)
+        return self._failures != before
+
+    def apply(self, settings: Settings) -> None:
+        """Go on by other settings, as far as they are live."""
+        before, self._settings = live(self._settings), settings
+        for name, value in live(settings).items():
+            if value != before[name]:
+                log.info('%s = %s from now on', name, value)
+        self.intake.update(settings.sensors)
+        self.uploader.set_max_mbps(settings.upload.max_mbps)
+        self.event_buffer.update(settings.events)
+
+    def _active_mission(self) -> Mapping[str, Any]:
+        return self.mission.status()
+
+    def _make_request_server(self, track: RobotTrack) -> None:
+        """Only where something is kept until somebody asks for it."""
+        self._requests: RequestServer | None = None
+        self._link: LinkTrack | None = None
+        settings = self._settings
+        ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
+        if ON_REQUEST not in ships and not self.spool.has_kept():
+            return
+        sweep(settings.home, settings.robot)
+        self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
+        least_hz = settings.keep.thin_to_hz
+        thinner = Thinner(self.spool, least_hz, Halving(settings.home, settings.robot, least_hz))
+        self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
+                                       put=partial(self.writer.put, wait=False), released=self.uploader.wake,
+                                       cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
+                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._hasten,
+                                       thin=thinner.step)  # fmt: skip
+
+    def _hasten(self) -> None:
+        """Somebody waits for what was asked for."""
+        self._catalogue.hasten()
+
+    def _settled(self, ids: Collection[int]) -> None:
+        self.uploader.settled(ids)
+        if self._requests is not None:
+            self._requests.wake()
+
+    def _make_unheard(self) -> Unheard | None:
+        """None where nobody listens through another RMW beside the node."""
+        middleware, node = self._ros.middleware, self._node
+        if self._ros.front is None:
+            return None
+        return Unheard(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
+                       lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
+
+    def _tell_mission(self, mission: Mapping[str, Any]) -> None:
+        self.spool.accounts.set_mission(str(mission.get('mission_id', '')))
+        if self._interface is not None:
+            self._interface.tell_mission(mission)
+        self.recorder.on_mission(mission)
+        self.event_buffer.on_mission(mission)
+        if not mission:
+            self._catalogue.hasten()
+
+    def _tell(self, *, ended: bool = False) -> None:
+        status = self._status.look(ended=ended)
+        if status is not None:
+            self._status.write(status)
+            if self._interface is not None:
+                self._interface.publish_diagnostics()
+
+    def _today(self) -> str:
+        return f'{utc(self._clock.wall_ns()):%Y%m%d}'
+
+    def _ship_ledger(self) -> None:
+        """A ledger that cannot be read now is not worth the node: the next one holds all that this one would."""
+        try:
+            self.writer.put(self._redating.mark(self._ledger()), wait=False)
+        except DataLoggerError as error:
+            log.warning('the ledger was not shipped: %s', error)
+
+    def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
+        """The catalogue's next parts; what keeps them back now keeps them until the next time."""
+        try:
+            for part in made():
+                self.writer.put(part, wait=False)
+        except (DataLoggerError, sqlite3.Error) as error:
+            log.warning('the catalogue is not written yet: %s', error)
+
+    def _look_at_link(self, *, is_last: bool = False) -> None:
+        """How fast uploads go where the robot is, where somebody may ask for more of them."""
+        found = self._link.look(is_last=is_last) if self._link is not None else None
+        if found is not None:
+            self.writer.put(found, wait=False)
+
+    def _name_held(self) -> None:
+        """What waited for the clock to be set may go now, or as soon as the disk lets it."""
+        try:
+            if named := self._redating.step():
+                self.uploader.wake(named)
+        except (OSError, sqlite3.Error) as error:
+            log.warning('objects that wait for the clock have no names yet: %s', error)
+
+    def _ledger(self) -> DataObject:
+        """The ledger as an object of its own, for the store."""
+        now_ns = self._clock.wall_ns() if self._clock.is_set else self._clock.boot_ns()
+        content: dict[str, Any] = ledger.read(self.spool.root, self._settings.robot)
+        robot = self._settings.robot
+        pattern = f'{robot}/_ledger/{{date}}/{{time}}_ledger.json'
+        return DataObject(
+            bucket=LEDGER_BUCKET, key=dated(pattern, now_ns), key_pattern=pattern,
+            body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
+            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={words.ROBOT: robot},
+        )  # fmt: skip

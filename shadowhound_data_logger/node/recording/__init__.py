@@ -1,0 +1,1 @@
+"""Bags, events and missions, recorded while the node runs."""

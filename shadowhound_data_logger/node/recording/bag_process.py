@@ -1,0 +1,304 @@
+"""Records one bag by hand, beside whatever else runs, and delivers it. A separate process.
+
+    python -m shadowhound_data_logger.node.recording.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
+
+Its last line on standard output is JSON: what became of the bag. ``bags.record`` starts it, for the command line and for agents.
+Recorded is as the node does it, slice by slice into the spool, with subscriptions of its own; SIGINT ends it early, and whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import get_default_context
+
+from shadowhound_data_logger.bags.local import RECORDS, local_files
+from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.naming import MANIFEST, unsynced_mark
+from shadowhound_data_logger.bags.place import BagPlace
+from shadowhound_data_logger.bags.queue import BagQueue
+from shadowhound_data_logger.bags.recorder import Recorder
+from shadowhound_data_logger.bags.recovery import BagRecovery
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.durable_files import flock
+from shadowhound_data_logger.core.errors import BagError, DataLoggerError, SpoolError
+from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.model import DataObject, RecordingRows
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.node import StopSignals
+from shadowhound_data_logger.node.recording.bags import BagConsumer
+from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
+from shadowhound_data_logger.shipping.uploader import Uploader
+from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.writer import SpoolWriter
+from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
+
+NODE: Final = 'shadowhound_bag_record'
+DISCOVERY_S: Final = 3.0
+"""Longest wait for the first publisher of anything wanted, and for the first message: the duration counts from there."""
+MORE_S: Final = 0.5
+"""For the others, once one is known."""
+STEP_S: Final = 0.1
+CLOSE_S: Final = 5.0
+DAMAGED_S: Final = 0.5
+"""For the same where the spool takes nothing any more."""
+RECOVERY_S: Final = 30.0
+
+log = logging.getLogger(__name__)
+
+
+class _IndexLostError(SpoolError):
+    """The spool's index was deleted, replaced or damaged while a bag was recorded."""
+
+    def __init__(self, bag: str, end_s: float) -> None:
+        super().__init__('the index of the spool was lost', remedy='it is rebuilt from the files when the spool is opened')
+        self.bag = bag
+        self.end_s = end_s
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What is to be recorded."""
+
+    name: str
+    duration_s: float
+    deadline_s: float
+    cut_off: str = ''
+    """The bag that was recorded when the index was lost; empty for the first."""
+    end_s: float = math.inf
+    """When the recording ends, once a message came."""
+
+
+class ManifestWriter(SpoolWriter):
+    """The spool's writer, which remembers the manifests of the bags that ended: not only ours, older ones are made whole too."""
+
+    def __init__(self, spool: Spool) -> None:
+        super().__init__(spool)
+        self._manifests: list[Manifest] = []
+
+    def put(self, *items: DataObject, rows: Sequence[RecordingRows] = (), wait: bool = True) -> None:
+        for item in items:
+            if item.key.endswith(f'/{MANIFEST}') and isinstance(item.body, bytes):
+                self._manifests.append(Manifest.from_json(item.body))
+        super().put(*items, rows=rows, wait=wait)
+
+    def manifest_of(self, began_as: str) -> Manifest | None:
+        """That of the bag which began under this name; it has another one where the clock was set meanwhile."""
+        for manifest in self._manifests:
+            clock = manifest.clock
+            if manifest.bag == began_as or (clock is not None and unsynced_mark(clock.boot_id, clock.boot_ns) in began_as):
+                return manifest
+        return None
+
+
+def main() -> int:
+    """The program; 0 when the store has the bag, 1 when the spool has it or nothing was recorded, 2 for bad settings."""
+    given = _arguments(sys.argv[1:])
+    logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    stop = StopSignals()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    with dead_ports_avoided(get_default_context().get_domain_id()):
+        node = Node(NODE)
+    guard = PortGuard()
+    try:
+        said = _record(node, given, stop)
+    except DataLoggerError as error:
+        said = {'error': str(error)}
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+        guard.close()
+    print(json.dumps(said), flush=True)  # noqa: T201
+    return 0 if said.get('delivered') else 1
+
+
+def _arguments(given: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument('name')
+    parser.add_argument('--robot', default='thor')
+    parser.add_argument('--duration', type=float, required=True)
+    parser.add_argument('--deadline', type=float, default=60.0)
+    parser.add_argument('--topic', action='append', default=[])
+    parser.add_argument('--regex', default='')
+    return parser.parse_args(given)
+
+
+def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[str, Any]:
+    name = check_name(given.name, 'the mission')
+    topics = given.topic or ([] if given.regex else _topics_there(node, given.robot, stop))
+    parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex}
+    settings = Settings.load(parameters, os.environ)
+    wanted = _Wanted(name, given.duration, given.deadline)
+    with _alone(settings), closing(open_store(settings.store, settings.upload)) as store:
+        while True:
+            try:
+                return _record_bag(node, settings, store, wanted, stop)
+            except _IndexLostError as lost:
+                wanted = replace(wanted, cut_off=lost.bag, end_s=lost.end_s)
+                log.warning('%s: %s is made whole, and another bag follows it', lost, lost.bag)
+
+
+def _record_bag(node: Node, settings: Settings, store: ObjectStore, wanted: _Wanted, stop: StopSignals) -> dict[str, Any]:
+    """Raises _IndexLostError where the spool has to be opened anew."""
+    with ExitStack() as opened:
+        # An owner of its own: what a killed one left open is for the next one to settle, and none of the node's.
+        owner = f'{settings.robot} {RECORDS}'
+        spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
+        spool.open()
+        writer = ManifestWriter(spool)
+        opened.callback(_close, spool, writer)
+        uploader = Uploader(spool, store, settings.upload, writer.settle)
+        writer.on_commit(spooled=uploader.wake, settled=uploader.settled)
+        recorder = _open_recorder(opened, node, settings, writer)
+        uploader.open()
+        opened.callback(uploader.close, CLOSE_S)
+        workers = *uploader.workers, writer.worker
+        if wanted.cut_off and (stop.received or time.monotonic() > wanted.end_s):
+            bag, dropped = wanted.cut_off, 0
+            _wait_for_recovery(recorder, writer, workers, bag)
+        else:
+            bag, dropped = _until_over(recorder, writer, workers, wanted, stop)
+        manifest = writer.manifest_of(bag)
+        if manifest is None:
+            topics = [topic for topic in settings.bag.topics if topic]
+            raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
+                           remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or settings.bag.regex}')  # fmt: skip
+        waiting = _wait_for_delivery(settings, writer, workers, manifest.bag, wanted.deadline_s)
+        return _told(manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
+
+
+def _close(spool: Spool, writer: SpoolWriter) -> None:
+    """The accounts of a spool whose index is lost are lost as well: that was told."""
+    try:
+        spool.close()
+    except SpoolError:
+        if not writer.damaged:
+            raise
+
+
+def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
+    """Writer, intake and recorder, opened; they are closed in the opposite order."""
+    clock, accounts = SystemClock.of_this_machine(), writer.spool.accounts
+    queue = BagQueue()
+    bags = BagConsumer(node, settings.bag, accounts, queue)
+    stamps = StampRule(clock, round(settings.clock.max_offset_s * SECOND))
+    intake = Intake(node, {}, accounts, MessageTypes(), stamps, [bags])
+    place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
+    recovery = BagRecovery(place, settings.bag.priority)
+    recorder = Recorder(settings.bag, place, queue, recovery, partial(intake.listen, bags))
+    writer.open()
+    opened.callback(writer.close, CLOSE_S)
+    intake.open()
+    opened.callback(intake.close, CLOSE_S)
+    recorder.open()
+    opened.callback(lambda: recorder.close(DAMAGED_S if writer.damaged else CLOSE_S))
+    return recorder
+
+
+def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
+    """Of each sensor the first topic that somebody publishes, else its first: what the node takes."""
+    sensors = [sensor.topics for sensor in Settings.load({'robot': robot}, {}).sensors if sensor.enabled]
+    end_s = time.monotonic() + DISCOVERY_S
+    while time.monotonic() < end_s and not stop.received:
+        if any(node.count_publishers(topic) for topics in sensors for topic in topics):
+            time.sleep(MORE_S)
+            break
+        time.sleep(STEP_S)
+    return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
+
+
+def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worker], wanted: _Wanted,
+                stop: StopSignals) -> tuple[str, int]:  # fmt: skip
+    """Record; the name of the bag when it began, and how many messages were dropped meanwhile."""
+    recorder.on_mission({'type': wanted.name, 'mission_id': None})
+    done, bag = recorder.start()
+    if not done:
+        raise BagError(f'no bag was recorded: {bag}')
+    end_s, discovered_s = wanted.end_s, time.monotonic() + DISCOVERY_S
+    while time.monotonic() < end_s and not stop.received:
+        time.sleep(min(STEP_S, max(0.0, end_s - time.monotonic())))
+        if end_s == math.inf and (recorder.status().messages or time.monotonic() > discovered_s):
+            end_s = time.monotonic() + wanted.duration_s
+        _supervise((*recorder.workers, *workers))
+        if writer.damaged:
+            raise _IndexLostError(bag, end_s)
+    dropped = recorder.status().dropped
+    done, text = recorder.stop()
+    if not done and writer.damaged:
+        raise _IndexLostError(bag, end_s)
+    if not done:
+        raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
+    return bag, dropped
+
+
+def _wait_for_recovery(recorder: Recorder, writer: ManifestWriter, workers: Sequence[Worker], bag: str) -> None:
+    end_s = time.monotonic() + RECOVERY_S
+    while writer.manifest_of(bag) is None and time.monotonic() < end_s:
+        time.sleep(STEP_S)
+        _supervise((*recorder.workers, *workers))
+
+
+def _wait_for_delivery(settings: Settings, writer: SpoolWriter, workers: Sequence[Worker], bag: str,
+                       deadline_s: float) -> bool:  # fmt: skip
+    """Until nothing of the bag is in the spool any more; whether something still is."""
+    end_s = time.monotonic() + deadline_s
+    writer.prompt = True
+    writer.flush(CLOSE_S)
+    while (waiting := _waits(settings, bag)) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
+        time.sleep(STEP_S)
+        _supervise(workers)
+    return waiting
+
+
+def _told(manifest: Manifest, dropped: int, *, waiting: bool, last_error: str) -> dict[str, Any]:
+    """What became of the bag."""
+    return {
+        'robot': manifest.robot, 'bag': manifest.bag,
+        'messages': sum(sum(each.recorded.values()) for each in manifest.slices),
+        'slices': len(manifest.slices), 'bytes': sum(each.bytes for each in manifest.slices),
+        'topics': {each.topic: each.messages for each in manifest.topics}, 'delivered': not waiting,
+        'last_error': last_error if waiting else '', 'dropped': dropped,
+    }  # fmt: skip
+
+
+def _waits(settings: Settings, bag: str) -> bool:
+    return any(file.bag == bag for file in local_files(settings.home, settings.robot).values())
+
+
+def _supervise(workers: Iterable[Worker]) -> None:
+    for worker in workers:
+        worker.look()
+
+
+@contextmanager
+def _alone(settings: Settings) -> Iterator[None]:
+    """One at a time: another one's open slice would look like that of a dead process."""
+    folder = settings.home / RECORDS
+    folder.mkdir(parents=True, exist_ok=True)
+    with flock(folder / f'{settings.robot}.lock', wait=False) as is_mine:
+        if not is_mine:
+            raise BagError(f'another `bag record` records {settings.robot} already', remedy='wait for its end')
+        yield
+
+
+if __name__ == '__main__':
+    sys.exit(main())

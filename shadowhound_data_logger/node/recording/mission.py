@@ -1,0 +1,170 @@
+"""The node's part in a mission: finds the active one, logs the robot's state to it, and marks objects with it.
+
+It learns of missions from the disk alone. While none is active an encoder asks one attribute, and the thread one folder's time.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import SECOND, iso
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.model import Batch, DataObject
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, MissionFinder, ended
+from shadowhound_data_logger.missions.dating import now_ns
+from shadowhound_data_logger.missions.node_log import NodeLog
+from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.node.recording.mission_observer import MissionObserver
+from shadowhound_data_logger.policies.folder import PolicyFolder
+
+log = logging.getLogger(__name__)
+
+LOOK_S: Final = 0.25
+"""How late it notices a mission's start and end."""
+WRITE_S: Final = 1.0
+FLUSH_S: Final = 5.0
+"""What the robot said in the mission has that long to get through intake and encoders at its end."""
+PATIENCE_S: Final = 30.0
+CLOSE_S: Final = 2.0
+
+
+class MissionWatch:
+    """Joins the robot's active mission: marks objects with it, and logs to its run.
+
+    Life: New; open once; ``stop`` before the intake is closed, ``close`` after the encoders. Owns the thread ``mission``.
+
+    ``mark`` and ``observe`` are called by the encoders; they see the mission as a whole, as it is replaced.
+    """
+
+    def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, observer: MissionObserver,
+                 tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
+        """``tell`` is given what is active whenever that changes; empty when nothing is."""
+        self._settings = settings.mission
+        self._intake = intake
+        self._sampler = sampler
+        self._queue = queue
+        self._observer = observer
+        self._tell = tell
+        self._finder = MissionFinder(settings.home, settings.robot)
+        self._policies = PolicyFolder(settings.home)
+        self._mission: Active | None = None
+        self._marks: Mapping[str, str] = {}
+        self._last: tuple[Active, Mapping[str, str]] | None = None
+        self._log: NodeLog | None = None
+        self._due_s = 0.0
+        self._wake = threading.Event()
+        self.worker = Worker('mission', self._step, patience_s=PATIENCE_S)
+
+    def open(self) -> None:
+        """Before the intake is opened: with ``mission.capture: mission`` it stores nothing before it is told to."""
+        if self._settings.capture == 'mission':
+            self._sampler.set_idle(idle=True)
+        self.worker.start()
+
+    def stop(self) -> None:
+        """From now on what is active stays so."""
+        self.worker.stop()
+        self._wake.set()
+        self.worker.join(FLUSH_S)
+
+    def close(self) -> None:
+        """Write what is left; a mission that goes on is joined again by the next start."""
+        if self._log is not None:
+            self._log.close()
+            self._log = None
+
+    def status(self) -> dict[str, Any]:
+        """What is active, as ``~/mission`` says it; empty when nothing is."""
+        mission = self._mission
+        if mission is None:
+            return {}
+        return {'mission_id': mission.id, 'run_id': self._marks.get(words.RUN_ID), 'type': mission.mission_type,
+                'started': iso(mission.start_ns), 'policy': self._policies.current()}  # fmt: skip
+
+    # -- for the encoders ------------------------------------------------------------------------------------------
+
+    def mark(self, item: DataObject) -> DataObject:
+        """The object with the ids of the mission that it began in."""
+        mission, last = self._mission, self._last
+        if mission is not None and mission.has(item.t_start_ns):
+            return replace(item, metadata={**item.metadata, **self._marks})
+        if last is not None and last[0].has(item.t_start_ns):  # it was on its way to us when the mission ended
+            return replace(item, metadata={**item.metadata, **last[1]})
+        return item
+
+    def observe(self, batch: Batch, item: DataObject | None) -> None:
+        """Take from a batch what is logged; ``item`` is what it was encoded as."""
+        node_log = self._log
+        if node_log is not None:
+            for fact in self._observer.facts(batch, item):
+                node_log.add(fact)
+
+    # -- the thread ------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        found, before = self._finder.look(), self._mission
+        if (found and found.id) != (before and before.id):
+            if before is not None:
+                self._leave(before)
+            if found is not None:
+                self._join(found)
+        elif found is not None and words.RUN_ID not in self._marks and self._find_run(found):
+            self._tell(self.status())
+        if self._log is not None and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + WRITE_S
+            self._log.write()
+        self._wake.wait(LOOK_S)
+
+    def _join(self, mission: Active) -> None:
+        """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
+        self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: mission.mission_type}
+        self._find_run(mission)
+        if self._settings.join:
+            node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)))
+            try:
+                node_log.open()
+            except OSError as error:
+                log.warning('nothing is logged to mission %s: %s', mission.id, error)
+            else:
+                self._log = node_log
+        self._mission = mission
+        if not self._set_idle(idle=False):
+            log.warning('the intake did not begin mission %s within %.0f s; it will as soon as it can', mission.id, FLUSH_S)
+        log.info('mission %s is active', mission.id)
+        self._tell(self.status())
+
+    def _leave(self, mission: Active) -> None:
+        """Close what is open, so that all of the mission is encoded, and let go of its journal."""
+        noticed_ns = now_ns(THIS_MACHINE)
+        self._mission = over = ended(mission)
+        end_s = time.monotonic() + FLUSH_S
+        if not (self._set_idle(idle=True) and self._queue.finished(end_s - time.monotonic())):
+            log.warning('not all of mission %s was encoded within %.0f s of its end', mission.id, FLUSH_S)
+        node_log, self._log = self._log, None
+        if node_log is not None:
+            node_log.close(over)
+        self._last = replace(over, end_ns=noticed_ns if over.end_ns is None else over.end_ns), self._marks
+        self._mission, self._marks = None, {}
+        log.info('mission %s has ended', mission.id)
+        self._tell({})
+
+    def _set_idle(self, *, idle: bool) -> bool:
+        if self._settings.capture == 'mission':
+            return self._intake.flush(FLUSH_S, partial(self._sampler.set_idle, idle=idle))
+        return self._intake.flush(FLUSH_S)
+
+    def _find_run(self, mission: Active) -> bool:
+        run = mission.folder.run()
+        if run is not None:
+            self._marks = {**self._marks, words.RUN_ID: run.run_id}
+        return run is not None

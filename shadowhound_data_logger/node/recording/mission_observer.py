@@ -1,0 +1,160 @@
+"""What the node sees of the robot during a mission: read from batches that were just encoded, by the encoders' threads.
+
+It is not a listener: those get each message from the intake (``consumers.py``).
+Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import MissionSettings, SensorSettings
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import Batch, DataObject, Sample
+from shadowhound_data_logger.core.options import POINT_CLOUD
+from shadowhound_data_logger.formats.image import encode_jpeg
+from shadowhound_data_logger.formats.payload import Job
+from shadowhound_data_logger.formats.pointcloud import xyz_of
+from shadowhound_data_logger.formats.records import ODOMETRY
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.missions.node_log import Cloud, Frame, MissionFact, Reading
+from shadowhound_data_logger.missions.odometer import Pose
+from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
+
+log = logging.getLogger(__name__)
+
+JPEG: Final = 'image/jpeg'
+BATTERY_STATE: Final = 'sensor_msgs/msg/BatteryState'
+_ROUNDING: Final = 1e-6
+"""Of a full battery in float32."""
+
+
+class MissionObserver:
+    """Reads from batches what a mission logs: battery, temperature, poses, frames, floor.
+
+    New; ``facts`` of each batch, on any thread. A topic that cannot be read is logged once.
+
+    Two threads that have batches of one topic may both take a value of one period: there is one more then.
+    """
+
+    def __init__(self, settings: MissionSettings, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
+                 resolve: Callable[[str], str], marks: Callable[[int], Mapping[str, str]] = lambda _: {}) -> None:  # fmt: skip
+        """``resolve`` makes a topic's full name, as the node's namespace and remappings want it."""
+        self._sensors = sensors
+        self._robot = robot
+        self._types = types
+        self._period_ns = max(1, round(settings.period_s * SECOND))
+        self._marks = marks
+        self._frames = settings.frames
+        self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
+        self._odometry = resolve(settings.odometry) if settings.odometry else ''
+        self._fields: dict[str, dict[str, list[str]]] = {}
+        for key, given in ((BATTERY, settings.battery), (TEMPERATURE, settings.temperature)):
+            if given:
+                topic, _, field = given.partition(':')
+                self._fields.setdefault(resolve(topic), {})[key] = field.split('.')
+        self._periods: dict[tuple[str, int], int] = {}
+        self._told: set[str] = set()
+
+    def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[MissionFact]:
+        """What there is to log of a batch; ``item`` is the object that was made of it, None where there is none."""
+        try:
+            if batch.topic == self._odometry and batch.type == ODOMETRY:
+                yield from (self._pose(sample) for sample in batch.samples)
+            fields = self._fields.get(batch.topic)
+            if fields:
+                for sample in self._some(batch, self._period_ns):
+                    yield from self._readings(batch.type, sample, fields)
+            if batch.type == POINT_CLOUD:
+                yield from (cloud for sample in self._some(batch, SECOND) if (cloud := self._cloud(sample)))
+            if batch.sensor == self._frames:
+                for sample in self._some(batch, self._frame_ns):
+                    picture = self._jpeg(batch, sample, item)
+                    if picture is not None:
+                        yield Frame(sample.stamp_ns, picture, self._marks(sample.stamp_ns))
+        except Rejected as error:
+            self._tell(batch.topic, str(error))
+
+    def _jpeg(self, batch: Batch, sample: Sample, item: DataObject | None) -> bytes | None:
+        """The one that was just made of the message for the sensor's own object, else one of its own; None for no JPEG."""
+        if item is not None and len(batch.samples) == 1 and item.content_type == JPEG and isinstance(item.body, bytes):
+            return item.body
+        payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
+        return payload.body if payload.content_type == JPEG else None
+
+    def _some(self, batch: Batch, period_ns: int) -> Iterator[Sample]:
+        """The first message of each period."""
+        mark = batch.topic, period_ns
+        for sample in batch.samples:
+            period = sample.stamp_ns // period_ns
+            if period != self._periods.get(mark):
+                self._periods[mark] = period
+                yield sample
+
+    def _pose(self, sample: Sample) -> Pose:
+        message = self._types.deserialize(ODOMETRY, sample.cdr)
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        return Pose(sample.stamp_ns, at.x, at.y, yaw_of(turn), at.z, message.header.frame_id)
+
+    def _cloud(self, sample: Sample) -> Cloud | None:
+        """None for a cloud without x, y and z as float32."""
+        message = self._types.deserialize(POINT_CLOUD, sample.cdr)
+        xyz = xyz_of(message)
+        return None if xyz is None else Cloud(sample.stamp_ns, message.header.frame_id, xyz)
+
+    def _readings(self, type_name: str, sample: Sample, fields: Mapping[str, list[str]]) -> Iterator[Reading]:
+        message = self._types.deserialize(type_name, sample.cdr)
+        for key, path in fields.items():
+            raw = number_at(message, path)
+            value = battery_pct(message, path) if key == BATTERY else raw
+            if raw is None:
+                self._tell(key, f'{type_name} has no number {".".join(path)}')
+            elif value is not None and math.isfinite(value):
+                yield Reading(sample.stamp_ns, key, value)
+            elif math.isfinite(raw):
+                self._tell(key, f'{type_name} has {".".join(path)} = {raw:g}, which is not between 0 and 1')
+
+    def _tell(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            log.warning('%s is not logged to the mission: %s', what, text)
+
+
+def number_at(message: Any, path: list[str]) -> float | None:
+    """The number at the end of the path; None where there is none."""
+    found = message
+    try:
+        for name in path:
+            found = found[int(name)] if name.isdigit() else getattr(found, name)
+        return float(found)
+    except (AttributeError, IndexError, TypeError, ValueError):
+        return None
+
+
+def battery_pct(message: Any, path: list[str]) -> float | None:
+    """The number at the end of the path as the charge in percent; None for a charge that is unknown.
+
+    ``sensor_msgs/msg/BatteryState.percentage`` is 0 to 1, and NaN where it is not measured. A value beyond is not what the
+    message defines, so what its publisher means is unknown.
+    """
+    value = number_at(message, path)
+    if value is None or not _is_share(message, path):
+        return value if value is not None and math.isfinite(value) else None
+    return 100 * value if 0 <= value <= 1 + _ROUNDING else None
+
+
+def _is_share(message: Any, path: list[str]) -> bool:
+    """Whether the path ends at the charge of a BatteryState, which may be part of another message or of an array."""
+    found = message
+    for name in path[:-1]:
+        found = found[int(name)] if name.isdigit() else getattr(found, name)
+    return path[-1] == 'percentage' and getattr(found, '__msgtype__', '') == BATTERY_STATE
+
+
+def yaw_of(turn: Any) -> float:
+    """The angle about z of a quaternion, radians within [-pi, pi]."""
+    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))

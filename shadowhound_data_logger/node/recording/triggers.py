@@ -1,0 +1,220 @@
+"""Finds triggers of events: a number that crosses a threshold, or what the active mission's agent logs.
+
+Messages are deserialized here, off the intake, some of them only (``Inbox``). Of missions it reads the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from shadowhound_data_logger.bags.recorder import Answer
+from shadowhound_data_logger.core.clock import SECOND, Clock
+from shadowhound_data_logger.core.conditions import Condition
+from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.worker import Worker
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.missions import journal
+from shadowhound_data_logger.missions.dating import now_ns
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
+from shadowhound_data_logger.node.recording.mission_observer import number_at
+
+log = logging.getLogger(__name__)
+
+SEEN: Final = 10
+"""Messages of one drain that conditions look at, evenly chosen: 50 a second."""
+LARGE_BYTES: Final = 64 << 10
+"""Of a topic with larger messages they look at the newest alone."""
+REARM_S: Final = 1.0
+"""Shortest time in which a condition must not hold before it triggers again."""
+LATE_NS: Final = 10 * 10**9
+"""What an agent logged longer ago is not a trigger: the node has just been started, or the clock was set."""
+LOOK_S: Final = 0.2
+PATIENCE_S: Final = 30.0
+DETAIL_BYTES: Final = 1000
+"""Of what an agent logged with an event, in the manifest."""
+CONDITION, LOG_EVENT = 'condition', 'log_event'
+"""What triggered."""
+Trigger = Callable[[str, str, str, float], Answer]
+
+
+class Inbox:
+    """Messages that conditions are to look at. ``put`` by the intake, ``take`` by one other thread; the oldest fall out."""
+
+    def __init__(self, watched: Iterable[tuple[str, Condition]]) -> None:
+        """Conditions with the full names of their topics."""
+        self.conditions: dict[str, list[Condition]] = {}
+        for topic, condition in watched:
+            self.conditions.setdefault(topic, []).append(condition)
+        self._heard: dict[str, deque[tuple[float, str, Taken]]] = {topic: deque(maxlen=2 * SEEN) for topic in self.conditions}
+        self._fewest = {topic: all(each.hold_s for each in found) for topic, found in self.conditions.items()}
+
+    def put(self, topic: str, type_name: str, taken: Sequence[Taken], now_s: float) -> None:
+        """A condition that has to hold for a time is content with one message of a drain."""
+        few = self._fewest[topic] or len(taken[-1].cdr) > LARGE_BYTES
+        step = len(taken) if few else -(-len(taken) // SEEN)
+        heard = self._heard[topic]
+        if few:
+            heard.clear()
+        heard.extend((now_s, type_name, message) for message in taken[(len(taken) - 1) % step :: step])
+
+    def take(self, topic: str) -> Iterable[tuple[float, str, Taken]]:
+        """When it was drained, of which type, and the message; oldest first."""
+        heard = self._heard[topic]
+        while heard:
+            try:
+                yield heard.popleft()
+            except IndexError:  # the intake has just cleared it
+                return
+
+
+class Judge:
+    """Watches one condition. New; ``look`` at one number after the other. One thread.
+
+    It triggers once it has held for its time, and again only after it has not held for as long, a second at least: a number
+    that trembles about its threshold makes one event.
+    """
+
+    def __init__(self, condition: Condition) -> None:
+        self.condition = condition
+        self._armed = True
+        self._since_s: float | None = None
+        """Since when it is as it is now: true while armed, false else; None while it is the other way round."""
+
+    def look(self, value: float, now_s: float) -> bool:
+        """Whether this number, of that time by the monotonic clock, triggers. NaN triggers nothing."""
+        if not math.isfinite(value):
+            return False
+        if self.condition.holds(value) is not self._armed:
+            self._since_s = None
+            return False
+        if self._since_s is None:
+            self._since_s = now_s
+        hold_s = self.condition.hold_s if self._armed else max(self.condition.hold_s, REARM_S)
+        if now_s - self._since_s < hold_s:
+            return False
+        self._armed, self._since_s = not self._armed, None
+        return not self._armed
+
+
+class Logged(NamedTuple):
+    """What an agent said with ``log_event``."""
+
+    name: str
+    age_ns: int
+    """How long ago it was said."""
+    data: Any
+
+
+class JournalTail:
+    """Reads what is added to the journal of a mission. New; ``new`` again and again. One thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+
+    def new(self, now_ns: int) -> Iterator[Logged]:
+        """The events since the last call; what was logged long ago is left out. A journal that cannot be read has none."""
+        try:
+            if self._path.stat().st_size <= self._offset:
+                return
+            for line in journal.read(self._path, self._offset):
+                self._offset = line.end
+                record = line.record or {}
+                if record.get('k') == 'event':
+                    age_ns = now_ns - int(record['t'])
+                    if age_ns <= LATE_NS:
+                        yield Logged(str(record['name']), max(0, age_ns), record.get('data'))
+        except OSError:
+            return
+
+
+class EventWatch:
+    """Looks for triggers of events: conditions, and what agents log.
+
+    Life: New; open once; ``on_mission`` from any thread; close once. Owns the thread ``event-watch``.
+    """
+
+    def __init__(self, inbox: Inbox, types: MessageTypes, home: Path, clock: Clock, log_event: str, trigger: Trigger) -> None:
+        """``log_event`` is a regular expression for names of what an agent logs; empty for none."""
+        self._inbox = inbox
+        self._types = types
+        self._home = home
+        self._clock = clock
+        self._trigger = trigger
+        self._judges = {topic: [Judge(each) for each in found] for topic, found in inbox.conditions.items()}
+        self._wanted = _compiled(log_event)
+        self._missions: Sequence[str] = ()
+        self._tails: dict[str, JournalTail] = {}
+        self._told: set[str] = set()
+        self._wake = threading.Event()
+        self.worker = Worker('event-watch', self._step, patience_s=PATIENCE_S)
+
+    def open(self) -> None:
+        self.worker.start()
+
+    def close(self, deadline_s: float) -> bool:
+        self.worker.stop()
+        self._wake.set()
+        return self.worker.join(deadline_s)
+
+    def update(self, log_event: str) -> None:
+        """Go on by another expression."""
+        self._wanted = _compiled(log_event)
+
+    def on_mission(self, told: Mapping[str, Any]) -> None:
+        """Which mission is active now (``MissionWatch.status``); empty for none."""
+        self._missions = (str(told['mission_id']),) if told else ()
+
+    def _step(self) -> None:
+        self._wake.wait(LOOK_S)
+        for topic, judges in self._judges.items():
+            for now_s, type_name, message in self._inbox.take(topic):
+                self._judge(topic, type_name, message.cdr, judges, now_s)
+        self._follow()
+
+    def _judge(self, topic: str, type_name: str, cdr: bytes, judges: Sequence[Judge], now_s: float) -> None:
+        try:
+            message = self._types.deserialize(type_name, cdr)
+        except Rejected as error:
+            self._tell(topic, f'{topic} tells no condition anything: {error}')
+            return
+        for judge in judges:
+            condition = judge.condition
+            value = number_at(message, list(condition.field))
+            if value is None:
+                self._tell(condition.name, f'{type_name} has no number {".".join(condition.field)} ({condition.text})')
+            elif judge.look(value, now_s):
+                self._trigger(condition.name, CONDITION, f'{condition.text}: {value:g}', 0.0)
+
+    def _follow(self) -> None:
+        """Read what agents logged; the journal of a mission that is over once more."""
+        missions = self._missions
+        for name in missions:
+            if name not in self._tails:
+                self._tails[name] = JournalTail(MissionFolder(self._home / MISSIONS / name).journal)
+        for name in tuple(self._tails):
+            for logged in self._tails[name].new(now_ns(self._clock)):
+                if self._wanted is not None and self._wanted.search(logged.name):
+                    detail = json.dumps(logged.data, ensure_ascii=False)[:DETAIL_BYTES] if logged.data else ''
+                    self._trigger(logged.name, LOG_EVENT, detail, logged.age_ns / SECOND)
+            if name not in missions:
+                del self._tails[name]
+
+    def _tell(self, what: str, text: str) -> None:
+        """Once."""
+        if what not in self._told:
+            self._told.add(what)
+            log.warning('%s', text)
+
+
+def _compiled(expression: str) -> re.Pattern[str] | None:
+    return re.compile(expression) if expression else None

@@ -1,0 +1,1 @@
+"""The status, diagnostics, the watchdog and the control socket of the node."""

@@ -1,0 +1,111 @@
+"""Whether the clock is set, and when it steps, is seen by the boot clock and said once."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+from clocks import NOON_NS, Clocks
+
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
+from shadowhound_data_logger.core.clock_watch import ClockWatch
+
+
+@pytest.fixture
+def clocks() -> Clocks:
+    """They are not set."""
+    return Clocks()
+
+
+def test_a_clock_before_2024_is_not_set(clocks: Clocks) -> None:
+    """Its offset is not known, and how long it is so is."""
+    watch = ClockWatch(clocks, 600.0)
+    clocks.wait(5)
+    state = watch.state()
+    assert (state.is_set, state.gave_up, state.unset_s, state.steps, watch.offset_ns()) == (False, False, 5.0, 0, None)
+    clocks.set(EARLIEST_SANE_NS)
+    assert watch.state().is_set
+    assert watch.offset_ns() == EARLIEST_SANE_NS - clocks.boot_ns()
+
+
+def test_setting_it_is_a_step(clocks: Clocks) -> None:
+    """It is told without waiting for the next look, and counted by that; only once."""
+    watch = ClockWatch(clocks, 600.0)
+    clocks.set()
+    assert (watch.is_set, watch.state().unset_s, watch.state().steps) == (True, 0.0, 0)
+    assert [watch.look() for _ in range(3)] == [True, False, False]
+    assert watch.state().steps == 1
+
+
+@pytest.mark.parametrize(('step_s', 'steps'), [(3600.0, 1), (-3600.0, 1), (1.5, 1), (-1.5, 1), (0.9, 0), (-0.9, 0)])
+def test_a_step_is_more_than_a_second(clocks: Clocks, step_s: float, steps: int) -> None:
+    """In either direction; and it says by how much and when that was."""
+    clocks.set()
+    watch = ClockWatch(clocks, 600.0)
+    clocks.offset_ns += round(step_s * SECOND)
+    assert watch.look() is bool(steps)
+    clocks.wait(7)
+    state = watch.state()
+    assert (state.steps, state.last_step_s, state.last_step_age_s) == ((1, step_s, 7.0) if steps else (0, None, None))
+
+
+def test_a_clock_that_is_slewed_does_not_step(clocks: Clocks) -> None:
+    """Half a millisecond a second, for hours: each look compares with the last one."""
+    clocks.set()
+    watch = ClockWatch(clocks, 600.0)
+    for _ in range(4 * 3600):
+        clocks.wait(1)
+        clocks.offset_ns += 500_000
+        assert not watch.look()
+
+
+def test_it_is_not_waited_for_for_ever(clocks: Clocks) -> None:
+    """After the time that was set, and only while it is not set; a later setting counts as any."""
+    watch = ClockWatch(clocks, 600.0)
+    clocks.wait(600)
+    assert not watch.state().gave_up
+    clocks.wait(1)
+    assert watch.state().gave_up
+    clocks.set()
+    assert not watch.state().gave_up
+
+
+def test_a_clock_that_is_lost_is_waited_for_anew(clocks: Clocks) -> None:
+    """Back in 1970, the wait begins there."""
+    clocks.set()
+    watch = ClockWatch(clocks, 600.0)
+    clocks.wait(5000)
+    clocks.set(0)
+    watch.look()
+    clocks.wait(599)
+    state = watch.state()
+    assert (state.is_set, state.gave_up, state.unset_s) == (False, False, 599.0)
+
+
+def test_each_change_is_said_once(clocks: Clocks, caplog: pytest.LogCaptureFixture) -> None:
+    """That it is not set, that nothing waits for it any more, that it was set, and each step."""
+    caplog.set_level(logging.INFO)
+    watch = ClockWatch(clocks, 600.0, steps=4)
+
+    def said(seconds: float) -> list[str]:
+        caplog.clear()
+        clocks.wait(seconds)
+        for _ in range(3):
+            watch.look()
+        return [record.getMessage().split(';')[0].split(':')[0] for record in caplog.records]
+
+    assert said(0) == ['the clock of this machine is not set']
+    assert said(601) == ['the clock was not set for 601 s']
+    clocks.set()
+    assert said(0) == ['the clock was set']
+    clocks.offset_ns -= 5 * SECOND
+    assert said(0) == ['the clock stepped by -5.000 s']
+    assert said(10) == []
+    assert watch.state().steps == 6
+
+
+def test_it_is_a_clock(clocks: Clocks) -> None:
+    """Whoever asks for the time gets that of the machine."""
+    clocks.set()
+    watch = ClockWatch(clocks, 600.0)
+    assert (watch.wall_ns(), watch.boot_ns(), watch.boot_id) == (NOON_NS, 60 * SECOND, 'this-boot')

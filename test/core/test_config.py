@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.core.config import Settings, default_parameters
+from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.options import GIBI
+
+
+def load(environ: dict[str, str] | None = None, namespace: str = '/', **parameters: Any) -> Settings:
+    """Settings from parameters in Python's spelling: camera__rate_hz."""
+    return Settings.load({name.replace('__', '.'): value for name, value in parameters.items()}, environ or {}, namespace)
+
+
+def refused(**parameters: Any) -> SettingError:
+    """The error that these parameters stop the start with."""
+    with pytest.raises(SettingError) as caught:
+        load(**parameters)
+    return caught.value
+
+
+def test_nothing_has_to_be_set() -> None:
+    """With nothing set the robot is thor, the store a folder, and all sensors of the Go2 are logged."""
+    settings = load()
+    assert settings.robot == 'thor'
+    assert settings.home == Path('~/.shadowhound').expanduser()
+    assert settings.spool_path == settings.home / 'spool'
+    assert (settings.store.endpoint_url, settings.store.directory) == (None, settings.home / 'store')
+    assert [sensor.name for sensor in settings.sensors] == [
+        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'cmd_vel', 'voxel_map',
+    ]  # fmt: skip
+    assert (settings.spool.max_bytes, settings.spool.min_free_bytes) == (20 * GIBI, 2 * GIBI)
+    assert settings.shutdown.drain_s == 3.0
+
+
+def test_the_defaults_can_be_spelled_out() -> None:
+    """Giving every parameter its default changes nothing."""
+    assert Settings.load(default_parameters(), {}) == load()
+
+
+@pytest.mark.parametrize(('given', 'environ', 'namespace', 'robot'), [
+    ('odin', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'odin'), ('', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'loki'),
+    ('', {}, '/tachi', 'tachi'), ('', {'SHADOWHOUND_ROBOT': ''}, '/lab/robot0', 'lab_robot0'), ('', {}, '/', 'thor'),
+])  # fmt: skip
+def test_the_robot_name(given: str, environ: dict[str, str], namespace: str, robot: str) -> None:
+    """The parameter comes before the variable, that before the namespace, and thor is last."""
+    assert load(environ, namespace, robot=given).robot == robot
+
+
+@pytest.mark.parametrize('value', ['../thor', 'a b', 'x' * 65, 7])
+def test_a_robot_name_that_is_no_word(value: object) -> None:
+    """A robot name that could not lead a key is refused with itself."""
+    assert refused(robot=value).data['value'] == value
+
+
+def test_a_robot_name_of_the_shell_is_told_as_that() -> None:
+    """Who set SHADOWHOUND_ROBOT finds no parameter ``robot`` in the file."""
+    with pytest.raises(SettingError, match="SHADOWHOUND_ROBOT = 'Thor 1' is refused; allowed is a name: use letters"):
+        load({'SHADOWHOUND_ROBOT': 'Thor 1'})
+
+
+@pytest.mark.parametrize(('name', 'value', 'allowed'), [
+    ('camera.rate_hz', 'fast', 'a number'), ('camera.rate_hz', -1.0, '0 to'), ('camera.rate_hz', float('nan'), '0 to'),
+    ('camera.rate_hz', True, 'a number'), ('camera.quality', 101, '1 to 100'), ('camera.quality', 80.0, 'a whole number'),
+    ('camera.enabled', 1, 'true or false'), ('camera.format', 'gif', 'jpeg, png, pcd, json, cdr, zip, tar'),
+    ('camera.topics', 'a', 'a list of strings'),
+    ('camera.topics', [], 'at least one topic'), ('camera.topics', [''], 'at least one topic'), ('camera.topics', [5], 'a list'),
+    ('imu.types', ['a', 'b'], 'at most one type'), ('camera.batch_s', 1.0, '0 with format'),
+    ('voxel_map.batch_s', 1.0, '0 with format'),
+    ('camera.bucket', '../x', 'letters'),
+    ('camera.key', '{robot}/front.jpg', '{date} and {time}'), ('camera.priority', 10, '0 to 9'),
+    ('spool.max_bytes', 5, 'at least'),
+    ('spool.max_bytes', 1e10, 'a whole number'), ('upload.backoff_s', 0.0, '0.1 to 3600'), ('upload.threads', 0, '1 to 64'),
+    ('shutdown.drain_s', float('inf'), '0 to 600'), ('sensors', 'camera', 'a list of names'),
+    ('sensors', ['a', 'a'], 'each once'),
+])  # fmt: skip
+def test_a_wrong_value_stops_the_start(name: str, value: object, allowed: str) -> None:
+    """The error names the parameter, the value and what is allowed, in words and as data."""
+    error = refused(**{name: value})
+    assert error.data['name'] == name
+    assert repr(value) in str(error)
+    assert allowed in error.data['allowed']
+    assert name in str(error)
+
+
+@pytest.mark.parametrize(('name', 'near'), [
+    ('camera.rate', 'camera.rate_hz'), ('spool.max_byte', 'spool.max_bytes'), ('cammera.rate_hz', 'camera'), ('rate', 'sensors'),
+    ('camera.name', 'camera.topics'), ('camera', 'camera.rate_hz'), ('thermal.topics', "add it to 'sensors'"),
+])  # fmt: skip
+def test_an_unknown_parameter_stops_the_start(name: str, near: str) -> None:
+    """The error names the parameter, its value and those that could have been meant."""
+    error = refused(**{name: 4711})
+    assert error.data['name'] == name
+    assert '4711' in str(error)
+    assert near in error.data['allowed']
+
+
+@pytest.mark.parametrize('name', ['robot', 'spool', 'a/b', '', 'use_sim_time'])
+def test_a_sensor_needs_a_name_of_its_own(name: str) -> None:
+    """A sensor that would be mistaken for another parameter or a folder is refused."""
+    assert refused(sensors=[name]).data['name'] == 'sensors'
+
+
+def test_a_topic_has_one_sensor() -> None:
+    """Two sensors of one topic would count its messages twice."""
+    error = refused(sensors=['imu', 'second'], second__topics=['imu'])
+    assert error.data['name'] == 'second.topics'
+    assert 'imu.topics' in str(error)
+
+
+def test_a_sensor_of_ones_own() -> None:
+    """A sensor that is not a default takes any topic; whole numbers pass where fractions are allowed."""
+    (sensor,) = load(sensors=['thermal'], thermal__topics=['thermal/raw'], thermal__rate_hz=2).sensors
+    assert (sensor.name, sensor.topics, sensor.rate_hz, sensor.period_ns) == ('thermal', ('thermal/raw',), 2.0, 500_000_000)
+
+
+def test_an_archive_is_of_several_messages() -> None:
+    """A zip or tar of single messages is refused."""
+    error = refused(camera__format='zip')
+    assert (error.data['name'], error.data['value']) == ('camera.batch_s', 0.0)
+    assert load(camera__format='tar', camera__batch_s=1.0).sensors[0].batch_s == 1.0
+
+
+def test_the_least_time_between_two_objects() -> None:
+    """Names go by the batch, else by the rate."""
+    imu = {'imu__rate_hz': 0.0, 'imu__batch_s': 10.0}
+    assert load(**imu).sensors[3].period_ns == 10_000_000_000
+    assert load(imu__rate_hz=4.0, imu__batch_s=0.0).sensors[3].period_ns == 250_000_000
+    assert load(imu__rate_hz=0.0, imu__batch_s=0.0).sensors[3].period_ns == 0
+
+
+def test_parameters_of_ros_itself_are_not_ours() -> None:
+    """What rclpy declares for every node is passed over."""
+    assert load(use_sim_time=True, qos_overrides__imu__depth=5) == load()
+
+
+ENVIRON = {
+    'AWS_ENDPOINT_URL': 'http://tower:9000', 'AWS_ACCESS_KEY_ID': 'the-key-id', 'AWS_SECRET_ACCESS_KEY': 'the-secret',
+    'AWS_SESSION_TOKEN': 'the-token', 'SHADOWHOUND_HOME': '/data/hound',
+}  # fmt: skip
+
+
+def test_the_environment_names_the_store() -> None:
+    """Endpoint, credentials and folder come from the environment."""
+    settings = load(ENVIRON)
+    assert settings.store.endpoint_url == 'http://tower:9000'
+    assert (settings.store.access_key_id, settings.store.secret_access_key) == ('the-key-id', 'the-secret')
+    assert settings.spool_path == Path('/data/hound/spool')
+
+
+def test_secrets_are_not_shown() -> None:
+    """No secret stands in the text of the settings, which end up in logs."""
+    for text in (repr(load(ENVIRON)), str(load(ENVIRON))):
+        assert 'tower:9000' in text
+        assert not any(secret in text for secret in ('the-key-id', 'the-secret', 'the-token'))
+
+
+def test_an_endpoint_is_a_url() -> None:
+    """An endpoint without a scheme is refused with its name."""
+    with pytest.raises(SettingError, match=r"AWS_ENDPOINT_URL = 'tower:9000'.*http://TOWER_IP:9000"):
+        load({'AWS_ENDPOINT_URL': 'tower:9000'})
+
+
+@pytest.mark.parametrize(
+    'url',
+    ['http://tower:9000 ', ' http://tower:9000', 'http://tower:9000\n', 'http://tower:9000?x=1', 'http://tower:9000/#a',
+     'tower:9000', 'ftp://tower', 'http://', 'http://:9000', 'http://to wer', 'http://tower:99999', 'http://tower:1:2', 'http://[::1',
+     'http://me:hunter2@tower'],
+)  # fmt: skip
+@pytest.mark.parametrize('name', ['AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_S3'])
+def test_an_endpoint_that_some_client_cannot_use_is_refused(name: str, url: str) -> None:
+    """With the name of its variable, and without a password that is in it."""
+    with pytest.raises(SettingError) as caught:
+        load({name: url})
+    assert caught.value.data['name'] == name
+    assert 'hunter2' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('environ', 'expected'),
+    [({'AWS_ENDPOINT_URL': 'http://tower:9000/'}, 'http://tower:9000'),
+     ({'AWS_ENDPOINT_URL': 'HTTPS://tower/s3//'}, 'HTTPS://tower/s3'),
+     ({'AWS_ENDPOINT_URL': 'http://[fe80::1]:9000'}, 'http://[fe80::1]:9000'),
+     ({'AWS_ENDPOINT_URL_S3': 'http://s3:9000'}, 'http://s3:9000'),
+     ({'AWS_ENDPOINT_URL': 'http://all:1', 'AWS_ENDPOINT_URL_S3': 'http://s3:9000'}, 'http://s3:9000'),
+     ({'AWS_ENDPOINT_URL': 'http://all:1', 'AWS_ENDPOINT_URL_S3': ''}, 'http://all:1'),
+     ({'AWS_ENDPOINT_URL': '', 'AWS_ENDPOINT_URL_S3': ''}, None)],
+)  # fmt: skip
+def test_which_endpoint_is_used(environ: dict[str, str], expected: str | None) -> None:
+    """AWS_ENDPOINT_URL_S3 before AWS_ENDPOINT_URL, as in botocore; slashes at the end do not count, an empty value is none."""
+    assert load(environ).store.endpoint_url == expected
+
+
+@pytest.mark.parametrize('value', ['the-secret ', 'the-secret\n', 'a b', 'se\u00fcret', '\u200bkey'])
+@pytest.mark.parametrize('name', ['AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY', 'AWS_SESSION_TOKEN'])
+def test_a_key_with_a_blank_is_refused_and_not_shown(name: str, value: str) -> None:
+    """It would be refused as a wrong signature, or not be a header at all."""
+    with pytest.raises(SettingError, match='without blanks') as caught:
+        load({**ENVIRON, name: value})
+    assert caught.value.data['name'] == name
+    assert value.strip() not in str(caught.value)
+
+
+@pytest.mark.parametrize('name', ['AWS_REGION', 'AWS_DEFAULT_REGION'])
+def test_a_region_with_a_blank_is_refused(name: str) -> None:
+    """It is part of what is signed."""
+    with pytest.raises(SettingError, match=f"{name} = 'us-east-1 '"):
+        load({name: 'us-east-1 '})
+    assert load({name: 'eu-central-1'}).store.region == 'eu-central-1'
+
+
+@pytest.mark.parametrize('given', ['lowstate', 'lowstate:', ':soc', 'lowstate:bms_state..soc', 'a b:c', 'a:b:c'])
+def test_a_field_needs_a_topic_and_a_name(given: str) -> None:
+    """The node says at its start what it could never find in a message."""
+    error = refused(mission__battery=given)
+    assert (error.data['name'], error.data['value']) == ('mission.battery', given)
+    assert load(mission__battery='', mission__temperature='low/state:motor_state.0.temperature')

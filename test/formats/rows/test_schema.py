@@ -1,0 +1,90 @@
+"""What the catalogue says of an object is what the object says of itself."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.keys import check_key
+from shadowhound_data_logger.formats.rows import schema
+
+NOON_NS = 1_760_788_800 * SECOND
+CAMERA = 'thor/camera/20251018/120000_front.jpg'
+TOLD = {
+    'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': 'sensor_msgs/msg/CompressedImage', 'count': '1',
+    't_start_ns': str(NOON_NS + 7), 't_end_ns': str(NOON_NS + SECOND), 'sha256': 'ab' * 32, 'mission_id': 'patrol_1',
+    'run_id': 'r1', 'mission_type': 'patrol', 'pose': '1.500 -2.000 0.7854 odom', 'battery_pct': '78', 'clock': 'set_later',
+    'clock_offset_ns': '-5',
+}  # fmt: skip
+
+
+def row(metadata: dict[str, str], key: str = CAMERA, bucket: str = 'sensor-data') -> schema.Row:
+    return schema.row_of(bucket, key, 50_000, 'image/jpeg', metadata)
+
+
+def test_a_row_has_all_that_the_object_says() -> None:
+    """Each column has its value, in the order of the columns."""
+    found = row(TOLD)
+    assert list(found) == list(schema.COLUMNS)
+    assert found == {
+        'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': 'sensor_msgs/msg/CompressedImage',
+        'bucket': 'sensor-data', 'key': CAMERA, 'bytes': 50_000, 'sha256': 'ab' * 32, 't_start': NOON_NS // 1000,
+        't_end': (NOON_NS + SECOND) // 1000, 't_start_ns': NOON_NS + 7, 't_end_ns': NOON_NS + SECOND, 'count': 1,
+        'mission_id': 'patrol_1', 'run_id': 'r1', 'mission_type': 'patrol', 'x': 1.5, 'y': -2.0, 'yaw': 0.7854,
+        'pose_frame': 'odom', 'battery_pct': 78.0, 'clock': 'set_later', 'clock_offset_ns': -5, 'content_type': 'image/jpeg',
+        'format_version': 1,
+    }  # fmt: skip
+
+
+def test_what_is_not_said_is_null() -> None:
+    """A foreign object has robot and sensor by its key, its size, and nothing else."""
+    found = row({})
+    known = {name for name, value in found.items() if value is not None}
+    assert known == {'robot', 'sensor', 'bucket', 'key', 'bytes', 'content_type', 'format_version'}
+    assert (found['robot'], found['sensor']) == ('thor', 'camera')
+
+
+@pytest.mark.parametrize('pose', ['', '1 2', '1 2 3', '1 2 x odom', '1 2 nan odom', '1 2 inf odom', '1 2 3 a b'])
+def test_half_a_pose_is_none(pose: str) -> None:
+    """Where any of it is missing or no number, all of it is null."""
+    found = row({**TOLD, 'pose': pose})
+    assert [found[name] for name in ('x', 'y', 'yaw', 'pose_frame')] == [None] * 4
+
+
+def test_a_time_since_boot_is_no_date() -> None:
+    """An object of a clock that was never set has its times since boot, no date, and the folder of those."""
+    told = {'robot': 'thor', 'boot_start_ns': str(5 * SECOND), 'boot_end_ns': str(6 * SECOND), 'clock': 'unset'}
+    found = row(told, 'thor/_unsynced/b/camera/00000005_000_camera.jpg')
+    assert (found['t_start_ns'], found['t_end_ns']) == (5 * SECOND, 6 * SECOND)
+    assert (found['t_start'], found['t_end']) == (None, None)
+    assert schema.date_of(found) == '1970-01-01'
+    assert schema.date_of(row(TOLD)) == '2025-10-18'
+
+
+def test_a_slice_of_a_bag_counts_its_messages() -> None:
+    """``messages`` is the count where there is no other."""
+    assert row({'messages': '42'})['count'] == 42
+    assert row({'messages': '42', 'count': '7'})['count'] == 7
+
+
+@given(st.dictionaries(st.sampled_from(sorted(TOLD)), st.text()), st.text())
+def test_nothing_in_metadata_or_key_raises(metadata: dict[str, str], key: str) -> None:
+    """Whatever a foreign writer put there, there is a row with whole numbers of 64 bits, and a folder for it."""
+    found = row(metadata, key)
+    assert all(abs(value) < 1 << 63 for value in found.values() if isinstance(value, int))
+    assert re.fullmatch(r'\d{4}-\d\d-\d\d', schema.date_of(found))
+
+
+def test_the_catalogue_is_not_in_itself() -> None:
+    """Everything else is, also another bucket's folder of that name."""
+    key = schema.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
+    assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.parquet'
+    assert key.startswith(schema.OBJECTS.prefix('thor'))
+    assert not schema.is_row('sensor-data', key)
+    assert schema.is_row('trajectories', key)
+    assert schema.is_row('sensor-data', CAMERA)
+    assert schema.is_row('sensor-data', 'thor/_ledger/20251018/120000_ledger.json')

@@ -1,0 +1,395 @@
+"""What becomes of the messages of a topic between the take and the batch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
+from shadowhound_data_logger.core.model import Batch, Taken
+from shadowhound_data_logger.core.stamps import DAY_NS, StampRule
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
+from shadowhound_data_logger.node.intake import sampling
+from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
+from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
+from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
+
+TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
+NOON_NS = 1_760_788_800 * SECOND
+UNNUMBERED: dict[str, None] = {'publisher': None, 'number': None}
+
+
+class Batches(list[Batch]):
+    """The queue to the encoders, without end."""
+
+    def put(self, batch: Batch, _: int) -> list[Batch]:
+        self.append(batch)
+        return []
+
+
+class Talk:
+    """A stream of Strings that are sent every 100 ms, and the sampler that listens to it."""
+
+    def __init__(self, last_kept_ns: int = 0, **settings: float | str) -> None:
+        self.sensor = SensorSettings(name='talk', **{'rate_hz': 0.0, 'batch_s': 3600.0, **settings})  # type: ignore[arg-type]
+        self.accounts = Accounts()
+        self.batches = Batches()
+        self.senders = Senders()
+        self.numbers = count(1)
+        if last_kept_ns:
+            self.accounts.store({TOPIC: (0, last_kept_ns)})
+        self.sensors, types, self.stamps = {'talk': self.sensor}, MessageTypes(), StampRule(SystemClock.of_this_machine())
+        queue: Any = self.batches
+        self.sampler = Sampler(self.sensors, self.accounts, types, self.stamps, queue)
+        self.listen(self.sampler)
+
+    def listen(self, *consumers: Consumer) -> None:
+        """Begin a stream."""
+        self.stream = SensorStream(self.sensor, TOPIC, TYPE, self.accounts, MessageTypes(), self.stamps, consumers)
+
+    def messages(self, how_many: int, **fields: object) -> list[Taken]:
+        """The next ones, of a publisher that is known unless ``fields`` say otherwise."""
+        taken = [next(self.numbers) for _ in range(how_many)]
+        made = [Taken(b'%d' % number, sent_ns := NOON_NS + number * SECOND // 10, 'p', number, sent_ns) for number in taken]
+        return [one._replace(**fields) for one in made]  # type: ignore[arg-type]
+
+    def add(self, taken: list[Taken], now_s: float = 0.0, *, paused: bool = False, idle: bool = False) -> None:
+        self.sampler.set_idle(idle=idle)
+        self.stream.add(taken, self.senders, now_s, paused=paused)
+
+    def update(self, **settings: float) -> None:
+        self.sensor = replace(self.sensor, **settings)  # type: ignore[arg-type]
+        self.sensors[self.sensor.name] = self.sensor
+
+    def kept(self) -> list[int]:
+        """The numbers of what was kept, the open batch among it."""
+        self.sampler.flush()
+        return [int(sample.cdr) for batch in self.batches for sample in batch.samples]
+
+    @property
+    def account(self) -> TopicAccount:
+        with self.accounts.entry(TOPIC) as account:
+            return account
+
+
+def test_a_pause_counts_and_drops() -> None:
+    """What comes during a pause is received and dropped as paused; before and after it everything is kept."""
+    talk = Talk()
+    for paused in (False, True, False):
+        talk.add(talk.messages(3), paused=paused)
+    assert talk.kept() == [1, 2, 3, 7, 8, 9]
+    assert (talk.account.received, talk.account.dropped, talk.account.missed) == (9, {'paused': 3}, 0)
+
+
+class Commits(Consumer):
+    """Between the count of a drain's messages and what the others do with them: what a commit shows then as open."""
+
+    def __init__(self, accounts: Accounts) -> None:
+        self.accounts = accounts
+        self.open: list[int] = []
+
+    def take(self, drained: Drained) -> None:
+        self.open.append(self.accounts.totals()[drained.topic].open)
+
+
+@pytest.mark.parametrize(('given', 'settings', 'still_open'), [
+    ({'idle': True}, {}, 0), ({'paused': True}, {}, 0), ({}, {'rate_hz': 1.0}, 4), ({}, {}, 30),
+])  # fmt: skip
+def test_what_is_skipped_is_at_no_time_open(given: dict[str, bool], settings: dict[str, float], still_open: int) -> None:
+    """A commit at any moment and a kill right then: the next start counts nothing as lost that was to be left out."""
+    talk = Talk(**settings)
+    commits = Commits(talk.accounts)
+    talk.listen(commits, talk.sampler)
+    talk.add(talk.messages(30), **given)
+    assert commits.open == [still_open]
+
+
+def test_what_nobody_asked_for_is_skipped() -> None:
+    """Outside of a mission messages are counted as skipped, and those that a pause drops as dropped."""
+    talk = Talk()
+    for idle in (True, False, True):
+        talk.add(talk.messages(3), idle=idle)
+    talk.add(talk.messages(2), paused=True, idle=True)
+    assert talk.kept() == [4, 5, 6]
+    assert (talk.account.received, talk.account.skipped, talk.account.dropped) == (11, 6, {'paused': 2})
+
+
+def test_a_pause_wins_over_the_rate() -> None:
+    """During a pause nothing is skipped, and the first message after it is that of its period."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(9), paused=True)
+    talk.add(talk.messages(5))
+    assert (talk.account.dropped, talk.account.skipped) == ({'paused': 9}, 4)
+    assert talk.kept() == [10]
+
+
+def test_another_rate_leaves_the_open_batch() -> None:
+    """The rate changes from one message to the next, and what is in the open batch stays in it."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(15))
+    talk.update(rate_hz=0.0)
+    talk.add(talk.messages(3))
+    assert not talk.batches
+    assert talk.kept() == [1, 10, 16, 17, 18]
+
+
+@pytest.mark.parametrize(('rate_hz', 'kept'), [(5.0, [1, 4, 6, 8]), (0.5, [1]), (1.0, [1])])
+def test_another_rate_keeps_nothing_of_a_period_twice(rate_hz: float, kept: list[int]) -> None:
+    """A slower or faster rate goes on after the last message that was kept."""
+    talk = Talk(rate_hz=1.0)
+    talk.add(talk.messages(3))
+    talk.update(rate_hz=rate_hz, quality=50)
+    talk.add(talk.messages(6))
+    assert talk.kept() == kept
+
+
+def test_what_was_kept_before_the_stream_began_is_not_kept_again() -> None:
+    """A stream that begins anew within a period (a sensor that is switched off and on) waits for the next one."""
+    talk = Talk(rate_hz=1.0, last_kept_ns=NOON_NS + 1)
+    talk.add(talk.messages(12))
+    assert talk.kept() == [10]
+    talk.stream.close()
+    talk.listen(talk.sampler)
+    talk.add(talk.messages(8))
+    assert talk.kept() == [10, 20]
+
+
+def test_other_settings_do_not_repeat_what_has_not_changed() -> None:
+    """A sensor that keeps changes remembers the last one through a change of its settings."""
+    talk = Talk(on_change=True)
+    talk.add(talk.messages(2, cdr=b'0000same'))
+    talk.update(priority=1)
+    talk.add(talk.messages(2, cdr=b'0000same'))
+    assert (talk.account.received, talk.account.skipped) == (4, 3)
+
+
+# -- without numbers ---------------------------------------------------------------------------------------------------
+
+
+def spoken(talk: Talk, how_many: int, **fields: object) -> None:
+    """The next messages, taken as the intake does: once their time is over."""
+    for _ in range(how_many):
+        taken = talk.messages(1, **fields)
+        talk.add(taken, taken[0].source_ns / SECOND)
+        talk.stream.look(taken[0].source_ns / SECOND)
+
+
+def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
+    """What is not known is None, never 0."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    spoken(talk, 3, **UNNUMBERED)
+    account = talk.account
+    assert (account.accounting, account.missed, account.about_missed, account.unknown) == (RECEIVED_ONLY, None, None, 3)
+
+
+def test_a_rhythm_counts_what_is_lost() -> None:
+    """Once it is known, also what was lost before."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    for _ in range(3):
+        spoken(talk, 100, **UNNUMBERED)
+        talk.messages(7)  # which nobody takes
+    spoken(talk, 1, **UNNUMBERED)
+    account = talk.account
+    assert (account.accounting, account.missed, account.about_missed) == (ESTIMATED, None, 21)
+    assert (account.received, account.estimated, account.unknown) == (301, 301, 0)
+
+
+def test_a_declared_rate_needs_no_learning() -> None:
+    """With it even the first gap counts."""
+    talk = Talk(expected_hz=10.0)
+    talk.senders.look(['a'])
+    spoken(talk, 2, **UNNUMBERED)
+    talk.messages(5)
+    spoken(talk, 2, **UNNUMBERED)
+    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 5)
+
+
+def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Messages that come more often refute it: their rhythm is learned."""
+    talk = Talk(expected_hz=4.0)
+    talk.senders.look(['a'])
+    spoken(talk, 500, **UNNUMBERED)
+    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 0)
+    assert [record.getMessage().partition(':')[0] for record in caplog.records] == [TOPIC]
+
+
+def test_a_counter_that_cannot_be_read_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    """Stamps are used then."""
+    talk = Talk(counter='data')
+    talk.senders.look(['a'])
+    spoken(talk, 300, **UNNUMBERED)
+    assert talk.account.accounting == ESTIMATED
+    assert 'talk.counter cannot be used' in caplog.text
+
+
+def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
+    """Between one publisher and the next there is no loss; between one that went away and came back there is."""
+    for successor, lost in (('b', 0), ('a', 50)):
+        talk = Talk(expected_hz=10.0)
+        talk.senders.look(['a'])
+        spoken(talk, 10, **UNNUMBERED)
+        talk.messages(50)
+        now_s = talk.messages(1)[0].source_ns / SECOND
+        talk.senders.look([], now_s - 3.0)
+        talk.senders.look([successor], now_s)
+        next(talk.numbers)
+        spoken(talk, 10, **UNNUMBERED)
+        assert talk.account.about_missed == lost + bool(lost) * 2
+
+
+def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
+    """Messages whose sender nobody knows are received, and no gap in the numbers of the one that goes on."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None))
+    talk.senders.look(['a', 'b'])
+    talk.add(talk.messages(3, publisher=None))
+    assert (talk.account.accounting, talk.account.missed) == (RECEIVED_ONLY, None)
+    talk.senders.look(['a'])
+    talk.add(talk.messages(3, publisher=None))
+    account = talk.account
+    assert (account.accounting, account.received, account.unknown, account.missed) == (EXACT, 9, 3, None)
+    assert sum(span.published for span in account.publishers.values()) == 6
+
+
+def test_what_two_subscriptions_deliver_is_counted_once() -> None:
+    """A repeat is known by its number, or by time and content where it has none."""
+    for fields in ({}, UNNUMBERED):
+        talk = Talk()
+        taken = talk.messages(3, **fields)
+        for part in (taken[:2], taken):
+            talk.add(part)
+        assert talk.account.received == 3
+        assert talk.kept() == [1, 2, 3]
+
+
+def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
+    """What was taken while one sender was known is known again by its time and number, though nobody can say whose it is."""
+    talk = Talk()
+    talk.senders.look(['a'])
+    taken = talk.messages(3, publisher=None)
+    talk.add(taken)
+    talk.senders.look(['a', 'b'])
+    talk.add([*talk.messages(1, publisher=None), *taken])
+    assert talk.account.received == 4
+    assert talk.kept() == [1, 2, 3, 4]
+
+
+class Drains(Consumer):
+    """How many messages each had."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    def take(self, drained: Drained) -> None:
+        self.sizes.append(len(drained.messages))
+
+
+class Broken(Consumer):
+    """Raises where it is told to."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+
+    def choose(self, drained: Drained, account: TopicAccount) -> None:
+        if self._where == 'choose':
+            raise ValueError('a defect')
+
+    def take(self, drained: Drained) -> None:
+        assert self._where == 'take', 'it takes what it could not choose of'
+        raise KeyError(drained.topic)
+
+
+@pytest.mark.parametrize(('where', 'said'), [('choose', 'ValueError: a defect'), ('take', "KeyError: '/talk'")])
+def test_a_consumer_that_raises_keeps_no_other_from_its_messages(where: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Those before it and after it get every drain; it is counted, and named in the log, not each time."""
+    talk, broken, last = Talk(), Broken(where), Drains()
+    talk.listen(broken, talk.sampler, last)
+    for _ in range(3):
+        talk.add(talk.messages(2))
+    assert talk.kept() == [1, 2, 3, 4, 5, 6]
+    assert last.sizes == [2, 2, 2]
+    assert (broken.failures, broken.last_error) == (3, said)
+    assert (talk.sampler.failures, last.failures) == (0, 0)
+    (record,) = caplog.records
+    assert 'Broken failed to take messages of /talk (1 times so far)' in record.message
+
+
+def test_what_a_sampler_fails_to_choose_is_dropped_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its messages are not open until the node ends, with the journal complete beyond them."""
+    talk, last = Talk(), Drains()
+    talk.listen(talk.sampler, last)
+    talk.add(talk.messages(2))
+    with monkeypatch.context() as patched:
+        patched.setattr(sampling, 'Sample', lambda *_: 1 // 0)
+        talk.add(talk.messages(3))
+    talk.add(talk.messages(1))
+    assert talk.kept() == [1, 2, 6]
+    assert (talk.account.dropped, talk.account.open) == ({'sampler_failed': 3}, 3)
+    assert (last.sizes, talk.sampler.failures) == ([2, 3, 1], 1)
+
+
+def test_a_topic_of_no_sensor_goes_to_the_others_too() -> None:
+    """As above, where the consumers themselves asked for it."""
+    broken, other = Broken('take'), Drains()
+    other.topics = frozenset({TOPIC})
+    TopicStream(TOPIC, TYPE, Talk().stamps, (broken, other)).add(Talk().messages(4), Senders(), 0.0, paused=False)
+    assert (other.sizes, broken.failures) == ([4], 1)
+
+
+def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
+    """A message that is kept may still be lost while it is in the open batch, in the queue or in an encoder."""
+    talk = Talk(batch_s=1.0)
+    queue = talk.sampler._queue = BatchQueue(QueueSettings())
+    talk.accounts.oldest_open = talk.sampler.oldest_open
+
+    def complete() -> int:
+        """In messages, after two commits: what had its outcome at the first is durable with the second."""
+        for _ in range(2):
+            talk.accounts.reject(TOPIC, {})
+            taken = talk.accounts.snapshot({})
+            assert taken is not None
+        return max(0, taken.topics[0].complete_ns - NOON_NS) * 10 // SECOND
+
+    def finish() -> None:
+        batch = queue.get(0.0)
+        assert batch is not None
+        assert complete() in {0, 9}
+        talk.accounts.store({TOPIC: (len(batch.samples), 0)})
+        queue.done(batch)
+
+    talk.add(talk.messages(12))  # a batch of 9 in the queue, another one open
+    assert complete() == 0
+    finish()
+    assert complete() == 9
+    talk.sampler.flush()
+    finish()
+    assert complete() == 12
+
+
+@pytest.mark.parametrize(('sent_ns', 'dated_ns', 'why'), [
+    (NOON_NS - 2 * DAY_NS, NOON_NS, {'sent_too_old': 1}), (NOON_NS + 2 * DAY_NS, NOON_NS, {'sent_ahead': 1}),
+    (60 * SECOND, NOON_NS, {'sent_before_2024': 1}), (NOON_NS - DAY_NS // 2, NOON_NS - DAY_NS // 2, {}),
+])  # fmt: skip
+def test_nobody_in_the_network_dates_a_loss(sent_ns: int, dated_ns: int, why: dict[str, int]) -> None:
+    """A gap before a message with a forged time of sending is dated by its arrival, and the message is counted by reason."""
+    talk = Talk()
+    talk.add([Taken(b'1', NOON_NS - SECOND, 'p', 1, NOON_NS - SECOND), Taken(b'5', sent_ns, 'p', 5, NOON_NS)])
+    snapshot = talk.accounts.snapshot({})
+    assert snapshot is not None
+    (gap,) = snapshot.gaps
+    assert (gap.from_ns, gap.to_ns, gap.messages) == (*sorted((NOON_NS - SECOND, dated_ns)), 3)
+    assert snapshot.topics[0].by_arrival == talk.account.by_arrival == why
+    assert talk.accounts.totals()[TOPIC].by_arrival == why
+    talk.sampler.flush()
+    assert [(sample.stamp_ns, sample.received_ns) for batch in talk.batches for sample in batch.samples] == [
+        (NOON_NS - SECOND, NOON_NS - SECOND), (dated_ns, NOON_NS),
+    ]  # fmt: skip

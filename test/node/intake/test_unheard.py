@@ -1,0 +1,132 @@
+"""What the front finds and the node does not is said once it has lasted, as far as it is known, and no more when it ends."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.node.intake.unheard import MOST_PUBLISHERS, SETTLED_S, SILENT_S, Unheard
+
+IMU = 'sensor_msgs/msg/Imu'
+STEP_S = 2.0
+
+
+class Robot:
+    """A graph of each side; ``wait`` lets time go by while the front reports every other second."""
+
+    def __init__(self, **topics: str) -> None:
+        self.now_s = 100.0
+        self.theirs: dict[str, list[list[str]]] = {}
+        self.ours: dict[str, set[str]] = {}
+        self.topics = {f'/{name}': type_name for name, type_name in topics.items()}
+        self.unheard = Unheard('rmw_ours', 'rmw_theirs', lambda: self.topics, lambda topic: self.ours.get(topic, set()),
+                               monotonic=lambda: self.now_s)  # fmt: skip
+
+    def wait(self, seconds: float) -> None:
+        end_s = self.now_s + seconds
+        while self.now_s <= end_s:
+            self.unheard.compare(self.theirs)
+            self.now_s += STEP_S
+
+    @property
+    def texts(self) -> dict[str, str] | None:
+        rows = self.unheard.rows()
+        return None if rows is None else {topic: row['text'] for topic, row in rows.items()}
+
+
+def test_it_is_said_after_a_while_and_ends_when_it_is_heard(caplog: pytest.LogCaptureFixture) -> None:
+    """Once in the log, with topic, node, both RMWs and what to do; and that it is over."""
+    caplog.set_level(logging.INFO)
+    robot = Robot(imu=IMU)
+    robot.theirs = {'/imu': [['aa', IMU, '/go2_driver']]}
+    robot.wait(SETTLED_S - 2 * STEP_S)
+    assert robot.texts == {}
+    robot.wait(4 * STEP_S)
+    assert robot.texts == {
+        '/imu': '/imu is not all heard: rmw_theirs finds a publisher (of /go2_driver) that rmw_ours, by which the node listens, '
+        'has not found; what it sends is not logged'
+    }
+    (told,) = caplog.records
+    assert told.levelno == logging.ERROR
+    assert 'capture.rmw: robot' in told.message
+    robot.ours = {'/imu': {'aa'}}
+    robot.wait(STEP_S)
+    assert robot.texts == {}
+    assert caplog.records[-1].levelno == logging.INFO
+
+
+@pytest.mark.parametrize('of', ['their ghost', 'a stop of ours', 'restarts'])
+def test_what_does_not_last_is_not_said(of: str, caplog: pytest.LogCaptureFixture) -> None:
+    """A publisher that was killed lingers; while this process was stopped nobody compared; each publisher counts for itself."""
+    robot = Robot(imu=IMU)
+    robot.theirs = {'/imu': [['aa', IMU, '']]}
+    if of == 'their ghost':
+        robot.ours = {'/imu': {'aa'}}
+        robot.wait(SETTLED_S)
+        robot.ours = {}
+        robot.wait(20.0)
+        robot.theirs = {}
+    elif of == 'a stop of ours':
+        robot.wait(STEP_S)
+        robot.now_s += SILENT_S + SETTLED_S
+    else:
+        for number in range(10):
+            robot.theirs = {'/imu': [[f'{number}', IMU, '']]}
+            robot.wait(10.0)
+    robot.wait(STEP_S)
+    assert robot.texts == {}
+    assert not caplog.records
+
+
+def test_nothing_is_known_while_nobody_reports() -> None:
+    """Before the first report, and when the front has gone."""
+    robot = Robot(imu=IMU)
+    assert robot.texts is None
+    robot.theirs = {'/imu': [['aa', IMU, '']]}
+    robot.wait(SETTLED_S + STEP_S)
+    assert robot.texts
+    robot.now_s += SILENT_S + STEP_S
+    assert robot.texts is None
+
+
+def test_only_what_would_be_logged_counts() -> None:
+    """Of the topics of sensors that are enabled now, and of the type that is named for them; where none is, of any."""
+    robot = Robot(imu=IMU, odom='')
+    robot.theirs = {
+        '/imu': [['aa', 'std_msgs/msg/String', '']],
+        '/odom': [['bb', 'std_msgs/msg/String', '']],
+        '/other': [['cc', '', '']],
+    }
+    robot.wait(SETTLED_S + STEP_S)
+    assert list(robot.texts or ()) == ['/odom']
+    del robot.topics['/odom']
+    robot.wait(STEP_S)
+    assert robot.texts == {}
+
+
+@pytest.mark.parametrize('wrong', [7, {'a': 1}, [7], [['aa']], [['aa', 'b', 7]], [[['aa'], 'b', 'c']]])
+def test_a_report_that_is_none_is_no_error(wrong: Any) -> None:
+    """Whoever has the control socket may send what he likes."""
+    robot = Robot(imu=IMU)
+    assert robot.unheard.compare({'/imu': wrong}) == {'topics': ['/imu'], 'gids': []}
+
+
+def test_the_front_is_told_what_is_known_already() -> None:
+    """So that a report has only what is beyond that, and is short."""
+    robot = Robot(imu=IMU, odom='')
+    robot.ours = {'/imu': {'bb', 'aa'}, '/odom': {'cc'}}
+    assert robot.unheard.compare({}) == {'topics': ['/imu', '/odom'], 'gids': ['aa', 'bb', 'cc']}
+
+
+@pytest.mark.parametrize(('count', 'words'), [
+    (2, 'finds 2 publishers that'), (MOST_PUBLISHERS, f'finds {MOST_PUBLISHERS} or more publishers'),
+])  # fmt: skip
+def test_several_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
+    """A report has no more of them than a limit, so the words claim no number then."""
+    robot = Robot(imu=IMU)
+    robot.theirs = {'/imu': [[f'{number}', IMU, ''] for number in range(count)]}
+    robot.wait(SETTLED_S + STEP_S)
+    assert words in (robot.texts or {})['/imu']
+    assert len(caplog.records) == 1

@@ -1,0 +1,206 @@
+"""What the ring and the conditions get of what the intake took: the very messages, without a wait and without a copy."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from bags.recording import NOON_NS, lot, messages
+from clocks import Clocks
+from e2e.reading import STRING
+
+from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.core.conditions import conditions
+from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.options import EventSettings
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.node.intake.consumers import Drained
+from shadowhound_data_logger.node.recording.events import EventConsumer
+from shadowhound_data_logger.node.recording.triggers import LARGE_BYTES, SEEN, EventWatch, Inbox
+from shadowhound_data_logger.spool.accounts import PAUSED
+
+FLOAT = 'std_msgs/msg/Float64'
+
+
+class Graph:
+    """A node without a middleware: a namespace, and no publishers."""
+
+    asked = 0
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return topic if topic.startswith('/') else f'/r0/{topic}'
+
+    def get_publishers_info_by_topic(self, _: str) -> list[Any]:
+        self.asked += 1
+        return []
+
+
+class Losses:
+    """Claims of no event: it notes what could not be had."""
+
+    def __init__(self) -> None:
+        self.lost: list[tuple[str, list[int | None]]] = []
+
+    def lose(self, held: Sequence[Held], reason: str = 'ring_full') -> None:
+        self.lost += [(reason, [message.number for message in each.lot.messages]) for each in held]
+
+
+class Ear:
+    """The events' consumer over a ring, as the intake has it."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.graph: Any = Graph()
+        self.claims: Any = Losses()
+        self.ring = Ring(1 << 20, 60.0)
+        self.consumer = EventConsumer(self.graph, EventSettings(**settings), self.ring, self.claims)
+
+    def wanted(self, *graph: str) -> frozenset[str]:
+        return self.consumer.wanted_topics.wanted((), graph)
+
+    def take(self, topic: str, messages: Sequence[Taken], *, paused: bool = False) -> None:
+        self.consumer.take(Drained(topic, STRING, '', messages, None, 0.0, paused))
+
+
+def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
+    """Names as the node's namespace makes them; a topic that only a condition looks at is not kept."""
+    ear = Ear(topics=('imu',), regex='^/odom', conditions=('low: lowstate:bms_state.soc < 20', 'hot: imu:temperature > 80'))
+    assert ear.wanted('/odom', '/other') == {'/r0/imu', '/odom', '/r0/lowstate'}
+    for topic in ('/r0/imu', '/odom', '/r0/lowstate'):
+        ear.take(topic, messages(range(3)))
+    kept = [held.lot.topic for held in iter(lambda: ear.ring.next(float('inf')), None)]
+    assert kept == ['/r0/imu', '/odom']
+    assert [len(list(ear.consumer.inbox.take(topic))) for topic in ('/r0/imu', '/r0/lowstate')] == [3, 3]
+
+
+def test_the_graph_is_asked_once_for_each_publisher() -> None:
+    """A poll of the intake is not a place for questions."""
+    ear = Ear(topics=('/talk',))
+    for _ in range(5):
+        ear.take('/talk', messages(range(3)))
+    assert ear.graph.asked == 1
+    ear.take('/talk', [messages(range(1))[0]._replace(publisher='another')])
+    assert ear.graph.asked == 2
+
+
+def test_a_pause_keeps_nothing() -> None:
+    """What comes meanwhile is lost to an event that asks for it, by the pause; otherwise it is nobody's loss."""
+    ear = Ear(topics=('/talk',))
+    ear.take('/talk', messages(range(3)), paused=True)
+    assert (ear.ring.bytes, ear.claims.lost) == (0, [])
+    ear.ring.claim(0.0)
+    ear.take('/talk', messages(range(3, 5)), paused=True)
+    assert ear.claims.lost == [(PAUSED, [3, 4])]
+
+
+def test_what_an_event_asked_for_and_has_to_go_is_told() -> None:
+    """Only then: without an event the oldest go in silence."""
+    ear = Ear(topics=('/talk',))
+    for number in range(20):
+        ear.take('/talk', lot(range(number, number + 1), size=100_000).messages)
+    assert ear.claims.lost == []
+    ear.ring.claim(0.0)
+    ear.take('/talk', lot(range(20, 21), size=100_000).messages)
+    assert ear.claims.lost == [('ring_full', [10])]
+
+
+def seen(inbox: Inbox) -> list[int | None]:
+    return [message.number for _, _, message in inbox.take('/x')]
+
+
+def test_conditions_look_at_some_messages_only() -> None:
+    """Ten of a drain, evenly, the newest among them; one where a condition holds for a time, or messages are large."""
+    (now,), (later,) = conditions(['x: /x:data > 1']), conditions(['x: /x:data > 1 for 5'])
+    inbox = Inbox([('/x', now)])
+    inbox.put('/x', FLOAT, messages(range(100)), 0.0)
+    assert seen(inbox) == list(range(9, 100, 10))
+    inbox.put('/x', FLOAT, messages(range(3)), 0.0)
+    assert seen(inbox) == [0, 1, 2]
+    inbox.put('/x', FLOAT, messages(range(3), LARGE_BYTES), 0.0)
+    assert seen(inbox) == [2]
+    inbox = Inbox([('/x', later)])
+    for first in (0, 100):
+        inbox.put('/x', FLOAT, messages(range(first, first + 100)), 0.0)
+    assert seen(inbox) == [199]
+
+
+def test_the_inbox_is_bounded() -> None:
+    """Nobody may look for a while: the newest stay."""
+    inbox = Inbox([('/x', conditions(['x: /x:data > 1'])[0])])
+    for first in range(0, 1000, 10):
+        inbox.put('/x', FLOAT, messages(range(first, first + 10)), 0.0)
+    assert seen(inbox) == list(range(1000 - 2 * SEEN, 1000))
+
+
+class Watched:
+    """An event watch with what it triggers."""
+
+    def __init__(self, home: Path, *texts: str, log_event: str = '.*') -> None:
+        clock = Clocks()
+        clock.set(NOON_NS)
+        self.inbox = Inbox([(condition.topic, condition) for condition in conditions(texts)])
+        self.triggered: list[tuple[str, str, str]] = []
+        self.watch = EventWatch(self.inbox, MessageTypes(), home, clock, log_event, self._trigger)
+
+    def _trigger(self, name: str, by: str, detail: str | None = None, _: float = 0.0) -> tuple[bool, str]:
+        self.triggered.append((name, by, detail or ''))
+        return True, ''
+
+    def say(self, cdr: bytes, now_s: float = 0.0, type_name: str = FLOAT) -> None:
+        self.inbox.put('/x', type_name, [Taken(cdr, 0, 'p', 1)], now_s)
+        self.watch._step()
+
+
+def float64(value: float) -> bytes:
+    return b'\0\1\0\0' + struct.pack('<d', value)
+
+
+def test_a_condition_triggers(tmp_path: Path) -> None:
+    """With its name, and the number that it saw."""
+    watched = Watched(tmp_path, 'low: /x:data < 20')
+    for value in (30.0, 19.5, 18.0):
+        watched.say(float64(value))
+    assert watched.triggered == [('low', 'condition', 'low: /x:data < 20: 19.5')]
+
+
+@pytest.mark.parametrize(('text', 'cdr', 'said'), [
+    ('low: /x:nothing < 20', float64(1.0), 'has no number nothing'),
+    ('low: /x:data < 20', b'\0\1\0\0\0', 'tells no condition anything'),
+])  # fmt: skip
+def test_what_tells_nothing_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, cdr: bytes,
+                                         said: str) -> None:  # fmt: skip
+    """A field that is not there, a message that is none."""
+    watched = Watched(tmp_path, text)
+    for _ in range(3):
+        watched.say(cdr)
+    assert watched.triggered == []
+    assert [said in record.message for record in caplog.records] == [True]
+
+
+def test_what_an_agent_logs_triggers_as_it_is_wanted(tmp_path: Path) -> None:
+    """Names that match, of the mission that is active; also what was logged just before it was over."""
+    watched = Watched(tmp_path, log_event='^f')
+    folder = MissionFolder(tmp_path / 'missions' / 'patrol_1')
+    folder.path.mkdir(parents=True)
+    journal = Journal(folder.journal)
+    journal.create()
+    watched.watch.on_mission({'mission_id': 'patrol_1', 'type': 'patrol'})
+    journal.append({'k': 'event', 't': NOON_NS, 'name': 'way_point'})
+    journal.append({'k': 'event', 't': NOON_NS, 'name': 'fall', 'data': {'leg': 2}})
+    watched.watch._step()
+    assert watched.triggered == [('fall', 'log_event', '{"leg": 2}')]
+    journal.append({'k': 'event', 't': NOON_NS, 'name': 'failed'})
+    watched.watch.on_mission({})
+    watched.watch._step()
+    journal.append({'k': 'event', 't': NOON_NS, 'name': 'fifth'})
+    watched.watch._step()
+    assert [name for name, _, _ in watched.triggered] == ['fall', 'failed']
+    watched.watch.update('')
+    journal.close()

@@ -1,0 +1,71 @@
+"""What triggers by itself: a condition once for each time that it holds, and what an agent logs while it is news."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shadowhound_data_logger.core.conditions import conditions
+from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.node.recording.triggers import LATE_NS, JournalTail, Judge
+
+NOW_NS = 1_760_788_800 * 10**9
+
+
+def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
+    """The places of the values, a period apart, at which the condition triggered."""
+    (condition,) = conditions([text])
+    judge = Judge(condition)
+    return [place for place, value in enumerate(values) if judge.look(value, place * period_s)]
+
+
+@pytest.mark.parametrize(('text', 'values', 'places'), [
+    ('x: t:f < 20', [30, 19, 18, 17, 16, 15], [1]),
+    ('x: t:f < 20', [19, 18, 30, 30, 30, 19], [0, 5]),
+    ('x: t:f < 20 for 2', [19, 19, 30, 19, 19, 19, 19], [5]),
+    ('x: t:f < 20 for 2', [19, 19, 19, 30, 19, 19, 19], [2]),
+    ('x: t:f < 20 for 2', [19, 19, 19, 30, 30, 30, 19, 19, 19], [2, 8]),
+    ('x: t:f == 1', [0, 1, 1, 0, 0, 1], [1, 5]),
+], ids=['once', 'again', 'it has to hold', 'a flicker does not arm it', 'armed again', 'equal'])  # fmt: skip
+def test_a_condition_triggers_once_for_each_time_that_it_holds(text: str, values: list[float], places: list[int]) -> None:
+    """It has to hold for its time, and not to hold for as long, a second at least, before it triggers again."""
+    assert fired(text, values) == places
+
+
+def test_a_number_that_trembles_triggers_once() -> None:
+    """Without a hold time as well: it is armed again only after a second without it."""
+    assert fired('x: t:f < 20', [19, 21] * 50, period_s=0.1) == [0]
+
+
+def test_what_is_no_number_tells_nothing() -> None:
+    """Neither that the condition holds nor that it does not."""
+    assert fired('x: t:f < 20 for 3', [19, float('nan'), 19, 19]) == [3]
+
+
+def test_what_an_agent_logs_is_told_once(tmp_path: Path) -> None:
+    """Only what is new, with its age and data; other records, and what is half written, are not events."""
+    journal = Journal(tmp_path / 'journal')
+    tail = JournalTail(tmp_path / 'journal')
+    assert list(tail.new(NOW_NS)) == []
+    journal.create()
+    journal.append({'k': 'start', 't': NOW_NS})
+    journal.append({'k': 'event', 't': NOW_NS - 10**9, 'name': 'fall', 'data': {'leg': 2}})
+    (told,) = tail.new(NOW_NS)
+    assert (told.name, told.age_ns, told.data) == ('fall', 10**9, {'leg': 2})
+    assert list(tail.new(NOW_NS)) == []
+    journal.append({'k': 'event', 't': NOW_NS, 'name': 'second'})
+    with (tmp_path / 'journal').open('ab') as file:
+        file.write(b'0000')
+    assert [told.name for told in tail.new(NOW_NS)] == ['second']
+    journal.close()
+
+
+def test_what_an_agent_logged_long_ago_is_no_trigger(tmp_path: Path) -> None:
+    """A node that starts in the middle of a mission makes no events of its past."""
+    journal = Journal(tmp_path / 'journal')
+    journal.create()
+    for age_ns in (10 * LATE_NS, LATE_NS // 2):
+        journal.append({'k': 'event', 't': NOW_NS - age_ns, 'name': str(age_ns)})
+    assert [told.name for told in JournalTail(tmp_path / 'journal').new(NOW_NS)] == [str(LATE_NS // 2)]
+    journal.close()

@@ -1,0 +1,229 @@
+"""What stands still is told with its cause; what may be silent, or is told elsewhere, is not."""
+
+from __future__ import annotations
+
+import logging
+from copy import deepcopy
+from typing import Any
+
+import pytest
+
+from shadowhound_data_logger.bags import events, recorder
+from shadowhound_data_logger.node.reporting.watchdog import Watchdog
+
+REQUEST_S = 35.0
+WORKER = {'alive': True, 'failing': False, 'failures': 0, 'deaths': 0, 'last_error': '', 'busy_s': 0.0, 'patience_s': None}
+TOPIC = {'enabled': True, 'publishers': 1, 'matched': 1, 'may_be_silent': False, 'unavailable': '', 'received': 0,
+         'wrong_type': 0, 'age_s': None}  # fmt: skip
+STATUS: dict[str, Any] = {
+    'topics': {'/imu': TOPIC}, 'queue': {'batches': 0, 'finished': 0}, 'spool': {'pending': 0},
+    'store': {'state': 'idle', 'delivered': 0, 'quarantined': 0, 'mbps': 0.0, 'in_flight': 0, 'deferred': 0, 'last_error': ''},
+    'workers': {name: {**WORKER, 'patience_s': patience_s} for name, patience_s in
+                {'intake': 5.0, 'encode-0': 60.0, 'spool-writer': 12.0, 'mission': 30.0, 'event-writer': 30.0,
+                 'upload-lock': None, 'upload-0': None}.items()},
+}  # fmt: skip
+
+
+class Watch:
+    """A watchdog, the status it looks at, and the time."""
+
+    def __init__(self) -> None:
+        self.status = deepcopy(STATUS)
+        self.imu, self.queue, self.store = self.status['topics']['/imu'], self.status['queue'], self.status['store']
+        self.workers = self.status['workers']
+        self.dog = Watchdog(REQUEST_S)
+        self.now_s = 1000.0
+        self.heard_s: float | None = None
+
+    def look(self, seconds: float = 1.0) -> dict[str, str]:
+        """So much later."""
+        self.now_s += seconds
+        self.imu['age_s'] = None if self.heard_s is None else self.now_s - self.heard_s
+        return dict(self.dog.look(self.status, self.now_s))
+
+    def hear(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
+        """So many messages before each of so many looks."""
+        for _ in range(times):
+            self.imu['received'] += messages
+            self.heard_s = self.now_s + every_s
+            assert self.look(every_s) == {}
+
+    def wait(self, seconds: int) -> dict[str, str]:
+        """Look once a second; nothing may be found before the last look."""
+        for _ in range(seconds - 1):
+            assert self.look() == {}
+        return self.look()
+
+
+@pytest.fixture
+def watch() -> Watch:
+    made = Watch()
+    assert made.look() == {}
+    return made
+
+
+@pytest.fixture
+def stages(watch: Watch) -> Watch:
+    """Without a topic that could be missed."""
+    watch.imu['publishers'] = 0
+    return watch
+
+
+def test_a_topic_that_stops_while_its_publisher_lives(watch: Watch, caplog: pytest.LogCaptureFixture) -> None:
+    """Told after five seconds, with its rate and the cause, once; and when it goes on, that too."""
+    caplog.set_level(logging.INFO)
+    watch.hear(100, times=20)
+    found = watch.wait(6)
+    assert found == {'/imu': 'silent for 6 s after 100 Hz, though its publisher is there; look at the program that publishes it'}
+    assert '/imu' in watch.look()
+    watch.hear(100)
+    assert watch.wait(5) == {}
+    assert [record.getMessage() for record in caplog.records] == [f'/imu: {found["/imu"]}', '/imu: working again']
+
+
+def test_a_slow_topic_is_given_its_time(watch: Watch) -> None:
+    """Ten of its own periods: one that comes every three seconds is not missed for half a minute."""
+    watch.hear(times=12, every_s=3.0)
+    assert '/imu' in watch.wait(31)
+
+
+def test_a_connection_that_is_gone_is_another_cause(watch: Watch) -> None:
+    """The publisher is in the graph, the subscription is matched with none."""
+    watch.hear(times=20)
+    watch.imu['matched'] = 0
+    assert 'look at the network' in watch.wait(11)['/imu']
+
+
+def test_topics_without_a_rhythm_are_never_missed(watch: Watch) -> None:
+    """A latched map that came once, a button, a burst at the start: nobody knows when the next one is due."""
+    watch.hear()
+    assert watch.wait(600) == {}
+    watch.hear(7)
+    watch.hear(1, every_s=200.0)
+    watch.hear(3, times=8)
+    assert watch.wait(600) == {}
+
+
+def test_topics_that_may_be_silent_are_not_missed(watch: Watch) -> None:
+    """Those kept on change and those that are latched, whether they came evenly before or never came."""
+    watch.imu['may_be_silent'] = True
+    assert watch.wait(100) == {}
+    watch.hear(times=30)
+    assert watch.wait(100) == {}
+
+
+def test_a_publisher_that_left_is_not_missed(watch: Watch) -> None:
+    """That nobody publishes it any more is told as such; a new publisher begins a new rhythm."""
+    watch.hear(times=20)
+    watch.imu['publishers'] = watch.imu['matched'] = 0
+    assert watch.wait(60) == {}
+    watch.imu['publishers'] = watch.imu['matched'] = 1
+    assert 'connected for 31 s and not one message' in watch.wait(32)['/imu']
+    watch.hear()
+    assert watch.wait(100) == {}
+
+
+@pytest.mark.parametrize('may_be_silent', [True, False])
+def test_a_publisher_without_a_connection(watch: Watch, *, may_be_silent: bool) -> None:
+    """Type, QoS or firewall: that is told of every topic, for nothing can come."""
+    watch.imu |= {'matched': 0, 'may_be_silent': may_be_silent}
+    assert 'ros2 topic info -v /imu' in watch.wait(11)['/imu']
+
+
+def test_a_topic_that_nobody_can_listen_to_here(watch: Watch) -> None:
+    """Told at once, with the package that is missing."""
+    watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
+    assert watch.look() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
+
+
+def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
+    """Nor when it is switched on again: what it did before does not count."""
+    watch.hear(100, times=20)
+    watch.imu['enabled'] = False
+    assert watch.wait(60) == {}
+    watch.imu['enabled'] = True
+    assert watch.wait(20) == {}
+
+
+@pytest.mark.parametrize('trouble', [{'busy_s': 6.0}, {'failing': True}])
+def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: dict[str, Any]) -> None:
+    """Then all topics seem to be silent, and none of them is at fault."""
+    watch.hear(100, times=20)
+    watch.workers['intake'] |= trouble
+    for _ in range(20):
+        assert set(watch.look()) <= {'intake'}
+
+
+@pytest.mark.parametrize(
+    ('name', 'busy_s', 'words'),
+    [('intake', 5.1, 'takes no messages for 5 s'), ('spool-writer', 12.1, 'its disk does not answer'),
+     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions are not followed for 31 s'),
+     ('event-writer', 31.0, 'nothing more is written to its bag for 31 s')],
+)  # fmt: skip
+def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str) -> None:
+    """Each thread has its own patience; for the one that holds the drain lock any length is fine."""
+    stages.workers['upload-lock']['busy_s'] = 1e6
+    stages.workers[name]['busy_s'] = busy_s - 1.1
+    assert stages.look() == {}
+    stages.workers[name]['busy_s'] = busy_s
+    found = stages.look()
+    assert list(found) == [name]
+    assert words in found[name]
+
+
+def test_a_pool_that_encodes_nothing(stages: Watch) -> None:
+    """Batches wait and none is finished; a full queue that moves is none."""
+    stages.queue['batches'] = 7
+    for number in range(30):
+        stages.queue['finished'] = number
+        assert stages.look() == {}
+    assert 'no batch was encoded for 11 s and 7 wait: the encoders are busy' in stages.wait(11)['encode']
+    stages.workers['encode-0'] |= {'failing': True, 'last_error': 'KeyError: x'}
+    assert 'the encoders fail (KeyError: x)' in stages.look()['encode']
+    stages.queue['batches'] = 0
+    assert stages.look() == {}
+
+
+@pytest.mark.parametrize(
+    ('store', 'words'),
+    [
+        ({'state': 'shipping', 'in_flight': 4}, '4 uploads hang'),
+        ({'state': 'shipping', 'deferred': 2, 'last_error': 'broken'}, '2 objects fail again and again: broken'),
+        ({'state': 'idle'}, 'a defect of this program'),
+    ],
+)
+def test_a_drain_that_sends_nothing(stages: Watch, store: dict[str, Any], words: str) -> None:
+    """Objects wait, the store is not known to be away, and for longer than a request can take no byte is sent."""
+    stages.store |= store
+    stages.status['spool']['pending'] = 9
+    assert '9 objects wait and nothing was sent for 66 s: ' in (text := stages.wait(66)['delivery'])
+    assert words in text
+    stages.workers['upload-0'] |= {'failing': True, 'last_error': 'KeyError: x'}
+    assert 'the upload threads fail (KeyError: x)' in stages.look()['delivery']
+
+
+@pytest.mark.parametrize(
+    'store',
+    [{'state': 'store_down'}, {'state': 'paused'}, {'state': 'not_draining'}, {'state': 'shipping', 'mbps': 0.001}],
+)  # fmt: skip
+def test_a_drain_that_has_a_reason_or_moves(stages: Watch, store: dict[str, Any]) -> None:
+    """A store that is away tells so itself, and a slow one is none that stands still."""
+    stages.store |= store
+    stages.status['spool']['pending'] = 9
+    assert stages.wait(200) == {}
+
+
+@pytest.mark.parametrize('trouble', [{'failing': True}, {'busy_s': 100.0}])
+def test_a_disk_that_fails_is_the_one_cause(stages: Watch, trouble: dict[str, Any]) -> None:
+    """Encoders and delivery wait for the spool writer then; only the writer is told."""
+    stages.queue['batches'] = stages.status['spool']['pending'] = 9
+    stages.workers['encode-0']['busy_s'] = 100.0
+    stages.workers['spool-writer'] |= trouble
+    for _ in range(100):
+        assert set(stages.look()) <= {'spool-writer'}
+
+
+@pytest.mark.parametrize(('idle_s', 'patience_s'), [(events.IDLE_S, events.PATIENCE_S), (recorder.IDLE_S, recorder.PATIENCE_S)])
+def test_a_writer_without_anything_to_write_does_not_seem_to_hang(idle_s: float, patience_s: float) -> None:
+    """Its rounds are far shorter than what is held for a hang: a machine under load may wake it late."""
+    assert idle_s <= patience_s / 2

@@ -1,0 +1,258 @@
+"""Publishers of every kind, early and late, alone and together: all they send after the match is taken, and once.
+
+The intake is that of the node, in this process, over real DDS. That all of it is in the store is shown by test/e2e.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import Any, Final
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from domains import free_domain
+from node.intake.test_stream import Batches
+from node.participants import Participant
+from rclpy.serialization import deserialize_message
+from rclpy.utilities import get_rmw_implementation_identifier
+from std_msgs.msg import Int32, String
+
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.ros.reader import FAST_DDS
+from shadowhound_data_logger.ros.shared_memory import FOLDER
+from shadowhound_data_logger.spool.accounts import EXACT, Accounts
+
+pytestmark = pytest.mark.ros
+WAIT_S: Final = 60.0
+NUMBERED: Final = get_rmw_implementation_identifier() in FAST_DDS
+"""Whether the RMW numbers messages: what is missed is known then."""
+TYPES: Final = {f'std_msgs/msg/{kind.__name__}': kind for kind in (Int32, String)}
+WARM_UP: Final = String(data='warm-up')
+QUALITIES: Final = {
+    'best_effort': {'reliable': False, 'latched': False},
+    'reliable': {'reliable': True, 'latched': False},
+    'transient_local': {'reliable': True, 'latched': True},
+}
+EARLY: Final = [f'early_{name}' for name in QUALITIES]
+LATE: Final = [f'late_{name}' for name in QUALITIES]
+EXPECTED: Final = ['expected_first', *(f'expected_{name}' for name in QUALITIES)]
+OTHERS: Final = ['ended', 'two_best_effort', 'two_reliable', 'mixed', 'retyped', 'vanishing', 'both']
+COUNT: Final = 300
+HISTORY: Final = 20
+PERIOD_S: Final = 0.001
+
+
+class Listening:
+    """A running intake that keeps every message, a program with publishers that was there before it, and one that came after it.
+
+    Each sensor has the name of its topic.
+    """
+
+    def __init__(self, domain: int, stack: ExitStack) -> None:
+        self._domain, self._stack = domain, stack
+        self.early = self.join('early')
+        for topic, quality in zip(EARLY, QUALITIES.values(), strict=True):
+            self.early.create(String, f'/{topic}', **quality)
+            if quality['latched']:
+                self.early.publish(*texts(range(HISTORY)), topic=f'/{topic}')
+        sensors = {}
+        for name in (*EARLY, *LATE, *EXPECTED, *OTHERS):
+            types = ('std_msgs/msg/String',) if name in EXPECTED else ()
+            sensors[name] = SensorSettings(name=name, topics=(f'/{name}',), types=types, rate_hz=0.0, batch_s=3600.0)
+        self._accounts, self._batches = Accounts(), Batches()
+        installed, queue = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), self._batches
+        stamps = StampRule(SystemClock.of_this_machine())
+        sampler = Sampler(sensors, self._accounts, installed, stamps, queue)  # type: ignore[arg-type]
+        self.logger = self.join('logger')
+        self._intake = Intake(self.logger.node, sensors, self._accounts, installed, stamps, [sampler])
+        self._intake.open()
+        stack.callback(self._intake.close, WAIT_S)
+        self.late = self.join('late')
+
+    def join(self, name: str) -> Participant:
+        one = Participant(name, self._domain)
+        self._stack.callback(one.end)
+        return one
+
+    def _graphs(self) -> str:
+        """Whom each participant sees, and which ports of shared memory there are; killed processes leave theirs."""
+        seen = [f'{one.name} sees {sorted(one.node.get_node_names())}' for one in (self.early, self.logger, self.late)]
+        ports = range(*(7400 + 250 * number for number in (self._domain, self._domain + 1)))
+        left = [path.name for path in FOLDER.glob('fast*_port*') if int(''.join(filter(str.isdigit, path.name))) in ports]
+        return f'in domain {self._domain} {", ".join(seen)}; {sorted(left)}'
+
+    def received(self, topic: str, count: int) -> None:
+        """Wait until the intake took so many messages of the topic."""
+        until(
+            lambda: self._count(topic) >= count, lambda: f'{count} of {topic} are received: {self._accounts.totals().get(topic)}'
+        )
+
+    def heard(self, publisher: Participant, topic: str, message: Any = WARM_UP) -> None:
+        """Publish the message until the intake took it, so that whatever follows comes after the match."""
+        until(lambda: publisher.matched(topic), lambda: f'{topic} is matched: {self._graphs()}')
+        before = self._count(topic)
+
+        def is_heard() -> bool:
+            publisher.publish(message, topic=topic)
+            return self._count(topic) > before
+
+        until(is_heard, lambda: f'{topic} is heard')
+
+    def kept(self, sensor: str, least: int) -> dict[type, list[int]]:
+        """Type -> the numbers that were kept once so many messages of the sensor came, sorted; none were missed."""
+        topic = f'/{sensor}'
+        self.received(topic, least)
+        assert self._intake.flush(WAIT_S)
+        totals = self._accounts.totals()[topic]
+        assert (totals.rejected, totals.dropped, totals.skipped) == (0, 0, 0)
+        assert (totals.accounting == EXACT, totals.missed) == (NUMBERED, 0 if NUMBERED else None)
+        with self._accounts.entry(topic) as account:
+            published = sum(span.published for span in account.publishers.values())
+        assert published == (totals.received if NUMBERED else 0)
+        batches = [batch for batch in self._batches if batch.topic == topic]
+        assert sum(len(batch.samples) for batch in batches) == totals.received
+        found: dict[type, list[int]] = {}
+        for batch in batches:
+            data = [deserialize_message(sample.cdr, TYPES[batch.type]).data for sample in batch.samples]
+            found.setdefault(TYPES[batch.type], []).extend(int(each) for each in data if each not in {'warm-up', -1})
+        return {kind: sorted(numbers) for kind, numbers in found.items()}
+
+    def numbers(self, sensor: str, least: int) -> list[int]:
+        """The same of a topic of Strings."""
+        return self.kept(sensor, least)[String]
+
+    def _count(self, topic: str) -> int:
+        totals = self._accounts.totals().get(topic)
+        return totals.received if totals is not None else 0
+
+
+def until(condition: Callable[[], object], what: Callable[[], str]) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s, what()
+        time.sleep(0.01)
+
+
+def texts(numbers: range) -> list[String]:
+    return [String(data=str(number)) for number in numbers]
+
+
+@pytest.fixture(scope='module')
+def listening() -> Iterator[Listening]:
+    with free_domain() as domain, ExitStack() as stack:
+        yield Listening(domain, stack)
+
+
+@pytest.mark.parametrize('topic', [name for name in EARLY if name != 'early_transient_local'])
+def test_a_publisher_that_starts_before_the_node(listening: Listening, topic: str) -> None:
+    """Everything that it publishes after the match is kept, and once."""
+    listening.heard(listening.early, f'/{topic}')
+    listening.early.publish(*texts(range(COUNT)), topic=f'/{topic}', period_s=PERIOD_S)
+    assert listening.numbers(topic, COUNT + 1) == list(range(COUNT))
+
+
+def test_what_a_transient_local_publisher_sent_before(listening: Listening) -> None:
+    """The history of a TRANSIENT_LOCAL publisher is kept too, and what follows it once."""
+    listening.received('/early_transient_local', HISTORY)
+    listening.early.publish(*texts(range(HISTORY, COUNT)), topic='/early_transient_local', period_s=PERIOD_S)
+    assert listening.numbers('early_transient_local', COUNT) == list(range(COUNT))
+
+
+def test_a_history_beside_a_publisher_that_has_none(listening: Listening) -> None:
+    """The history of the one that is TRANSIENT_LOCAL and the messages of the one that is not are kept, and once."""
+    listening.late.create(String, '/both')
+    listening.heard(listening.late, '/both')
+    listening.early.create(String, '/both', latched=True)
+    listening.early.publish(*texts(range(HISTORY)), topic='/both')
+    for publisher, first in ((listening.early, HISTORY), (listening.late, COUNT)):
+        publisher.publish(*texts(range(first, first + COUNT - HISTORY)), topic='/both', period_s=PERIOD_S)
+    numbers = listening.numbers('both', 2 * (COUNT - HISTORY) + HISTORY + 1)
+    assert numbers == [*range(COUNT), *range(COUNT, 2 * COUNT - HISTORY)]
+
+
+@pytest.mark.parametrize('kind', ['late', 'expected'])
+@pytest.mark.parametrize('name', QUALITIES)
+def test_a_publisher_that_starts_after_the_node(listening: Listening, kind: str, name: str) -> None:
+    """Everything is kept once, whether its type was known before or is taken from the graph."""
+    topic, publisher = f'{kind}_{name}', listening.late
+    publisher.create(String, f'/{topic}', **QUALITIES[name])
+    listening.heard(publisher, f'/{topic}')
+    publisher.publish(*texts(range(COUNT)), topic=f'/{topic}', period_s=PERIOD_S)
+    assert listening.numbers(topic, COUNT + 1) == list(range(COUNT))
+
+
+def test_an_expected_topic_is_matched_from_its_first_message_on(listening: Listening) -> None:
+    """A publisher of the expected type that waits for its match loses nothing, its first message included."""
+    listening.late.create(String, '/expected_first')
+    until(lambda: listening.late.matched('/expected_first'), lambda: 'it is matched')
+    listening.late.publish(*texts(range(COUNT)), topic='/expected_first', period_s=PERIOD_S)
+    assert listening.numbers('expected_first', COUNT) == list(range(COUNT))
+
+
+def test_a_publisher_that_restarts(listening: Listening) -> None:
+    """The messages of both of its lives are kept once. One that is killed is left to test/e2e: it takes a process."""
+    for life in range(2):
+        publisher = listening.join(f'life{life}')
+        publisher.create(String, '/ended')
+        listening.heard(publisher, '/ended')
+        publisher.publish(*texts(range(life * COUNT, (life + 1) * COUNT)), period_s=PERIOD_S)
+        listening.received('/ended', (life + 1) * (COUNT + 1))
+        publisher.end()
+    assert listening.numbers('ended', 2 * COUNT + 2) == list(range(2 * COUNT))
+
+
+@pytest.mark.parametrize(
+    ('topic', 'reliable'), [('two_best_effort', (False, False)), ('two_reliable', (True, True)), ('mixed', (False, True))]
+)
+def test_two_publishers_on_a_topic(listening: Listening, topic: str, reliable: tuple[bool, bool]) -> None:
+    """The messages of both are kept once, also where one is BEST_EFFORT and the other RELIABLE."""
+    both = (listening.early, listening.late)
+    for publisher, quality in zip(both, reliable, strict=True):
+        publisher.create(String, f'/{topic}', reliable=quality)
+        listening.heard(publisher, f'/{topic}')
+    with ThreadPoolExecutor(2) as pool:
+        halves = [texts(range(COUNT)), texts(range(COUNT, 2 * COUNT))]
+        publishing = [pool.submit(publisher.publish, *half, topic=f'/{topic}', period_s=PERIOD_S)
+                      for publisher, half in zip(both, halves, strict=True)]  # fmt: skip
+        for each in publishing:
+            each.result(WAIT_S)
+    assert listening.numbers(topic, 2 * COUNT + 2) == list(range(2 * COUNT))
+
+
+def test_a_topic_that_changes_its_type(listening: Listening) -> None:
+    """What is published after the change is kept as the new type, what came before as the old one."""
+    publisher = listening.late
+    publisher.create(String, '/retyped')
+    listening.heard(publisher, '/retyped')
+    publisher.publish(*texts(range(COUNT)), topic='/retyped', period_s=PERIOD_S)
+    listening.received('/retyped', COUNT + 1)
+    publisher.leave('/retyped')
+    publisher.create(Int32, '/retyped')
+    listening.heard(publisher, '/retyped', Int32(data=-1))
+    numbers = [Int32(data=number) for number in range(COUNT, 2 * COUNT)]
+    publisher.publish(*numbers, topic='/retyped', period_s=PERIOD_S)
+    assert listening.kept('retyped', 2 * COUNT + 2) == {String: list(range(COUNT)), Int32: list(range(COUNT, 2 * COUNT))}
+
+
+def test_a_publisher_that_vanishes_leaves_the_others_alone(listening: Listening) -> None:
+    """When one of two publishers ends, nothing of the other one is lost, though the subscriptions change."""
+    staying, leaving = listening.early, listening.late
+    for publisher, reliable in ((staying, False), (leaving, True)):
+        publisher.create(String, '/vanishing', reliable=reliable)
+        listening.heard(publisher, '/vanishing')
+    with ThreadPoolExecutor(1) as pool:
+        publishing = pool.submit(staying.publish, *texts(range(4 * COUNT)), topic='/vanishing', period_s=2 * PERIOD_S)
+        leaving.leave('/vanishing')
+        publishing.result(WAIT_S)
+    assert listening.numbers('vanishing', 4 * COUNT + 2) == list(range(4 * COUNT))

@@ -1,0 +1,35 @@
+"""Spools to ship from, and the rule that no upload thread outlives its test."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from shipping.drive import Drive
+from shipping.fakes import FakeSpool, Time, until
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> FakeSpool:
+    folder = tmp_path / 'ready'
+    folder.mkdir()
+    return FakeSpool(folder)
+
+
+@pytest.fixture
+def clock() -> Time:
+    return Time()
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    yield
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name.startswith('upload-')])
+
+
+@pytest.fixture
+def drive(spool: FakeSpool, clock: Time) -> Drive:
+    """A schedule with a spool and a clock by hand."""
+    return Drive(spool, clock)

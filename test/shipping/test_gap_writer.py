@@ -1,0 +1,348 @@
+"""The gap journal on its way out: every change in a part, with watermarks behind it, across deaths, retries and new indexes."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+from spool.making import NOON_NS, FakeClock, abandon, make, new_spool
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.formats.rows.gaps import GAPS
+from shadowhound_data_logger.lake.gaps import folded, of_rows
+from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.spool import gap_table
+from shadowhound_data_logger.spool.gaps import FORGOTTEN
+from shadowhound_data_logger.spool.listing import retry, tell_gaps_again
+from shadowhound_data_logger.spool.spool import Spool
+
+CAMERA = '/camera'
+DAY_NS = 24 * 3600 * SECOND
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / 'spool'
+
+
+@pytest.fixture
+def spool(root: Path) -> Iterator[Spool]:
+    opened = new_spool(root, FakeClock())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def writer(root: Path, clock: FakeClock | None = None, **more: Any) -> CatalogueWriter:
+    return CatalogueWriter(root, CatalogueSettings(), 'thor', clock or FakeClock(), **more)
+
+
+def told(parts: list[DataObject]) -> list[dict[str, Any]]:
+    """The statements in parts of the journal."""
+    found: list[dict[str, Any]] = []
+    for part in parts:
+        if part.key.startswith('thor/_gaps/'):
+            assert isinstance(part.body, bytes)
+            table = pyarrow.parquet.read_table(io.BytesIO(part.body))
+            assert table.schema.equals(arrow_schema(GAPS))
+            found += table.to_pylist()
+    return found
+
+
+def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
+    """Messages with these numbers, a tenth of a second apart."""
+    with spool.accounts.entry(topic) as account:
+        for number in numbers:
+            account.receive('p', number, NOON_NS + number * SECOND // 10)
+            account.gaps.heard_ns = NOON_NS + number * SECOND // 10
+    clock = spool._clock
+    assert isinstance(clock, FakeClock)
+    clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * SECOND // 10)
+
+
+def store(spool: Spool, name: str, state: State = State.DELIVERED, **fields: Any) -> SpooledObject:
+    """An object of one message, delivered or what became of it."""
+    (item,) = spool.commit([make(name, name.encode(), **fields)])
+    if state is not State.PENDING:
+        spool.commit(outcomes=[Outcome(item, state, 'AccessDenied' if state is State.QUARANTINED else None)])
+    return item
+
+
+def what(rows: list[dict[str, Any]]) -> list[tuple[str, str | None, int | None, float]]:
+    return [(row['what'], row['cause'], row['count'], (row['to_ns'] - NOON_NS) / SECOND) for row in rows]
+
+
+def test_what_was_missed_is_told_once_with_a_watermark_behind_it(spool: Spool, root: Path) -> None:
+    """A row for the gap, one up to where all is known; and no part while nothing changes."""
+    hear(spool, 1)
+    store(spool, 'a')
+    hear(spool, 6)
+    store(spool, 'b')
+    catalogue = writer(root)
+    made = catalogue.parts()
+    assert what(told(made)) == [('gap', 'transport', 4, 0.6), ('complete', None, None, 0.6)]
+    (part,) = [part for part in made if part.key.startswith('thor/_gaps/')]
+    assert part.key == 'thor/_gaps/date=2025-10-18/thor_20251018T120000_a-boot.parquet'
+    assert (part.protected, part.sensor, part.metadata['count'], part.metadata['gap_version']) == (True, '_catalog', '2', '1')
+    spool.commit(made)
+    assert catalogue.parts() == []
+
+
+def test_another_process_goes_on_where_parts_are_durable(spool: Spool, root: Path) -> None:
+    """What a process handed out and did not spool is told by the next; what it spooled is not told again."""
+    hear(spool, 1, 6)
+    spool.commit()
+    lost_with_its_process = writer(root).parts()
+    assert [row['cause'] for row in told(lost_with_its_process)] == ['transport']
+    again = writer(root).parts()
+    assert told(again) == told(lost_with_its_process)
+    spool.commit(again)
+    hear(spool, 11)
+    spool.commit()
+    assert [row['to_ns'] - NOON_NS for row in told(writer(root).parts()) if row['what'] == 'gap'] == [11 * SECOND // 10]
+
+
+def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
+    """The same name, a higher revision."""
+    catalogue = writer(root)
+    hear(spool, 1, 3)
+    spool.commit()
+    (gap,) = told(catalogue.parts())
+    hear(spool, 2)
+    spool.commit()
+    (withdrawn,) = told(catalogue.parts())
+    assert (withdrawn['what'], withdrawn['id'], withdrawn['revision'] > gap['revision']) == ('withdrawn', gap['id'], True)
+
+
+def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path) -> None:
+    """While an object waits it may be evicted; quarantined it is told, retried the watermark goes back before it."""
+    hear(spool, 1)
+    store(spool, 'a')
+    hear(spool, 20)
+    waiting = store(spool, 'b', State.PENDING, t_start_ns=NOON_NS + 2 * SECOND, t_end_ns=NOON_NS + 2 * SECOND)
+    hear(spool, 40)
+    store(spool, 'c', t_start_ns=NOON_NS + 4 * SECOND, t_end_ns=NOON_NS + 4 * SECOND)
+    catalogue = writer(root)
+    assert what(told(catalogue.parts()))[-1] == ('complete', None, None, 2.0)
+    spool.commit(outcomes=[Outcome(waiting, State.QUARANTINED, 'AccessDenied')])
+    rows = told(catalogue.parts())
+    assert what(rows) == [('gap', 'AccessDenied', 1, 2.0), ('complete', None, None, 4.0)]
+    assert retry(root).objects == 1
+    again = told(catalogue.parts())
+    assert what(again) == [('withdrawn', 'AccessDenied', 0, 2.0), ('complete', None, None, 2.0)]
+    newest = folded(pyarrow.Table.from_pylist([*rows, *again], schema=arrow_schema(GAPS))).to_pylist()
+    known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, newest)
+    assert known.complete_ns == NOON_NS + 2 * SECOND
+
+
+def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
+    """While a part with gaps is on its way, or refused, the store must not hear that all is known."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    item = store(spool, 'a', State.PENDING, samples=2)
+    made = catalogue.parts()
+    assert [row['what'] for row in told(made)] == ['gap']
+    (part,) = spool.commit(made)
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
+    assert told(catalogue.parts()) == []
+    spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'AccessDenied')])
+    assert told(catalogue.parts()) == []
+    assert retry(root).objects == 1
+    spool.commit(outcomes=[Outcome(part, State.DELIVERED)])
+    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+
+
+def test_gaps_of_another_date_are_told_before_the_watermark(spool: Spool, root: Path) -> None:
+    """They are parts of their own, of which any may come first."""
+    catalogue = writer(root)
+    hear(spool, 1)
+    store(spool, 'a')
+    store(spool, 'b', State.QUARANTINED, topic='/old', t_start_ns=NOON_NS - DAY_NS, t_end_ns=NOON_NS - DAY_NS)
+    hear(spool, 2)
+    store(spool, 'c')
+    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
+    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+
+
+def test_what_a_lost_part_told_is_told_again(spool: Spool, root: Path) -> None:
+    """Somebody deleted its file before it was delivered."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    spool.commit()
+    (part,) = spool.commit(catalogue.parts())
+    assert catalogue.parts() == []
+    spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'missing')])
+    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
+    assert catalogue.parts() == []
+
+
+def test_a_full_disk_keeps_the_parts(root: Path) -> None:
+    """None is evicted, nor left out: what they told would not be told again."""
+    spool = new_spool(root, FakeClock(), max_bytes=1)
+    spool.open()
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    spool.commit([make('a')])
+    (part,) = spool.commit([part for part in catalogue.parts() if '/_gaps/' in part.key])
+    spool.commit([make('b', priority=0)])
+    assert spool.states('sensor-data', '') == {'a': State.EVICTED, 'b': State.EVICTED, part.key: State.PENDING}
+    spool.close()
+
+
+def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Path) -> None:
+    """Where the store lost its parts: every gap, and the watermark behind them."""
+    catalogue = writer(root)
+    hear(spool, 1, 6)
+    store(spool, 'a', samples=2)
+    before = told(catalogue.parts())
+    assert [row['what'] for row in before] == ['gap', 'complete']
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
+    assert catalogue.parts() == []
+    assert tell_gaps_again(root) == 1
+    again = catalogue.parts()
+    assert told(again) == before
+    assert catalogue.parts() == [], 'once'
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(again)])
+    assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not begin anew'
+    assert tell_gaps_again(root) == 1
+    assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
+
+
+@pytest.mark.parametrize('is_of_older_version', [False, True])
+def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, root: Path, is_of_older_version: bool) -> None:
+    """The store may have lost what the robot forgot: it would be taken for all that was lost."""
+    hear(spool, 20)
+    store(spool, 'a')
+    hear(spool, 26, 27, 28)
+    store(spool, 'b', samples=3)
+    spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
+    with spool._index.transaction():
+        assert spool._index.gaps.forget(NOON_NS + SECOND * 27 // 10, 100)
+        if is_of_older_version:
+            spool._index._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
+    (mark,) = told(writer(root).parts())
+    assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was told'
+    tell_gaps_again(root)
+    (mark,) = told(writer(root).parts())
+    begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
+    assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
+    (total,) = [gap for gap in spool._index.gaps.known({}) if gap.begin_ns == FORGOTTEN]
+    assert (total.count, total.from_ns, total.to_ns) == (5, None, None), 'a sum has no time'
+
+
+def test_no_watermark_covers_what_was_forgotten_before_it_was_told(
+    spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows beyond the bound of the journal go, told or not: where they were, nobody knows what was lost."""
+    hear(spool, 20)
+    store(spool, 'a')
+    hear(spool, 26, 27, 28)
+    store(spool, 'b', samples=3)
+    monkeypatch.setattr(gap_table, 'MOST_ROWS', 0)
+    with spool._index.transaction():
+        assert spool._index.gaps.forget(0, 100)
+    (mark,) = told(writer(root).parts())
+    assert (mark['what'], mark['from_ns'], mark['to_ns']) == (
+        'complete',
+        NOON_NS + SECOND * 26 // 10,
+        NOON_NS + SECOND * 28 // 10,
+    )
+    (total,) = spool._index.gaps.known({})
+    assert (total.count, total.from_ns, total.to_ns) == (5, None, None)
+
+
+def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
+    """The watermark does not pass the time in which the node was off, unless numbers tell what was lost in it."""
+    first = new_spool(root, FakeClock())
+    first.open()
+    hear(first, 1, 2)
+    store(first, 'a', samples=2)
+    abandon(first)
+    later = FakeClock(NOON_NS + 100 * SECOND)
+    second = new_spool(root, later)
+    second.open()
+    catalogue = writer(root, later)
+    assert what(told(catalogue.parts())) == [('complete', None, None, 0.2)]
+    hear(second, 1000, 1010)
+    store(second, 'b', samples=2)
+    rows = told(catalogue.parts())
+    assert [(row['what'], row['cause'], row['count']) for row in rows] == [
+        ('gap', 'restart', 997), ('gap', 'transport', 9), ('complete', None, None),
+    ]  # fmt: skip
+    assert (rows[-1]['from_ns'], rows[-1]['to_ns']) == (NOON_NS + 101 * SECOND, NOON_NS + 101 * SECOND)
+    second.close()
+
+
+def test_revisions_go_on_when_the_index_is_made_anew(root: Path) -> None:
+    """Versions begin anew then; what is told by the new index is newer than all that the old one told."""
+    spool = new_spool(root, FakeClock())
+    spool.open()
+    hear(spool, 1, 6, 11, 16)
+    store(spool, 'a', samples=4)
+    before = writer(root).parts()
+    spool.commit(before)
+    spool.close()
+    (root / 'index.db').unlink()
+    spool = new_spool(root, FakeClock(NOON_NS + 10 * SECOND))
+    spool.open()
+    hear(spool, 1, 6)
+    spool.commit()
+    (gap,) = [row for row in told(writer(root).parts()) if row['cause'] == 'transport']
+    assert gap['revision'] > max(row['revision'] for row in told(before))
+    spool.close()
+
+
+def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: Path) -> None:
+    """First without a date, then with one, under the same name: the newest is the dated one."""
+    with spool.accounts.entry(CAMERA) as account:
+        account.drop('queue_full', 3, 5 * SECOND, 6 * SECOND)
+    spool.commit()
+    catalogue = writer(root)
+    made = catalogue.parts()
+    (row,) = told(made)
+    assert (row['clock'], row['t_from']) == ('unset', None)
+    assert made[0].key.startswith('thor/_gaps/date=1970-01-01/')
+    record = {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'offsets': {'a-boot': NOON_NS}}
+    (root / 'clock-thor.json').write_text(json.dumps(record), encoding='utf-8')
+    (dated,) = told(catalogue.parts())
+    assert (dated['id'], dated['clock'], dated['from_ns']) == (row['id'], 'set_later', NOON_NS + 5 * SECOND)
+    (newest,) = folded(pyarrow.Table.from_pylist([dated, row], schema=arrow_schema(GAPS))).to_pylist()
+    assert newest['clock'] == 'set_later'
+    assert catalogue.parts() == []
+
+
+def test_a_mission_s_end_is_told_soon(spool: Spool, root: Path) -> None:
+    """Within seconds, not within the period."""
+    now = [0.0]
+    catalogue = writer(root, monotonic=lambda: now[0])
+    catalogue.due()
+    hear(spool, 1, 6)
+    spool.commit()
+    now[0] = 20.0
+    assert catalogue.due() == []
+    catalogue.hasten()
+    assert catalogue.due() == []
+    now[0] = 25.0
+    assert len(told(catalogue.due())) == 1
+
+
+def test_a_backlog_of_rows_is_told_in_pieces_and_the_watermark_last(
+    spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No watermark stands over rows that are not told yet."""
+    monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MOST_ROWS', 2)
+    for number in range(1, 100, 20):
+        hear(spool, number)
+        store(spool, f'n{number}')
+    catalogue = writer(root)
+    found = [[row['what'] for row in told(catalogue.due())] for _ in range(4)]
+    assert [what for part in found for what in part] == ['gap'] * 4 + ['complete']
+    assert max(map(len, found)) <= 3
