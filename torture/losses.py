@@ -38,7 +38,7 @@ ROBOT: Final = 'torture'
 STRING: Final = 'std_msgs/msg/String'
 CYCLONE: Final = {'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}
 LEAVE_OUT: Final = """
-from shadowhound_data_logger import model
+from shadowhound_data_logger.core import model
 class Taken(model.Taken):
     def __new__(cls, cdr, source_ns, publisher, number, received_ns):
         return super().__new__(cls, cdr, source_ns, None, None, received_ns)

@@ -191,7 +191,7 @@ class _LatchedBefore:
             latched.keep(Lot(channel.topic, channel.type, '', [Taken(cdr, publish_ns, None, sequence, log_ns)], count))
         kept = [
             RecordedMessage(replace(channels[lot.topic, lot.type], repeated=True), start_ns, source_ns, number or 0, cdr)
-            for lot in latched for cdr, source_ns, _, number, _ in lot.messages
+            for lot in latched for cdr, source_ns, _, number, *_ in lot.messages
         ]  # fmt: skip
         found = [message for message in kept if self.is_new(message)]
         self.count += len(found)

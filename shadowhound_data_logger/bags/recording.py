@@ -104,7 +104,7 @@ class Recording:
             if is_first:
                 self._began_s = self._monotonic()
                 self._repeat(writer, lot.messages[0].received_ns)
-            for cdr, source_ns, _, number, received_ns in lot.messages:
+            for cdr, source_ns, _, number, received_ns, *_ in lot.messages:
                 writer.write(channel, received_ns, source_ns, next(places) if number is None else number, cdr)
         except OSError as error:
             self._break(error)
@@ -117,7 +117,7 @@ class Recording:
         log_ns, size = max(0, first_ns - REPEAT_LEAD_NS), writer.size
         for lot in self._latched:
             channel = self._channel(lot, repeated=True)
-            for cdr, source_ns, _, number, _ in lot.messages:
+            for cdr, source_ns, _, number, *_ in lot.messages:
                 writer.write(channel, log_ns, source_ns, number or 0, cdr)
         self._repeated_bytes = writer.size - size
 

@@ -24,7 +24,7 @@ class Sample(NamedTuple):
     """One message as it was taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
 
     stamp_ns: int
-    """By ``stamps.StampRule``."""
+    """By ``stamps.StampTrack``."""
     cdr: bytes
     received_ns: int = 0
     """When it arrived, as of ``Taken``."""
@@ -41,7 +41,11 @@ class Taken(NamedTuple):
     publisher: str | None
     number: int | None
     received_ns: int = 0
-    """When the middleware of this machine had it, Unix nanoseconds; 0 where it does not say."""
+    """When the middleware of this machine received it, Unix nanoseconds; 0 if it does not report that."""
+    stamp_ns: int = 0
+    """The time of the message by ``stamps.StampTrack``; 0 before its stream has decided that."""
+    clock: str | None = None
+    """The publisher, if its stamps are trusted and more than a second from their arrival: they follow another clock."""
 
 
 @dataclass(frozen=True, slots=True)

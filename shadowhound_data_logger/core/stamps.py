@@ -1,7 +1,13 @@
-"""Which time a message gets: its own stamp where that can be trusted, otherwise the time at which it arrived.
+"""The two times of a message, and which of them dates it.
 
-Anybody in the robot's network can publish, with any stamp. A stamp is trusted only within a bound on both sides of the arrival,
-so that no message can add to, or seem to be missing from, a day that is long over.
+A message has a ``stamp`` (when its content was measured: ``header.stamp``, or the time of sending if it has no header) and a time
+at which it was ``received``. The stamp is used while it can be trusted, otherwise the time of arrival. Two rules decide, both
+listed in docs/formats.md:
+
+- ``StampRule`` has no memory. Any program on the robot's network can publish any stamp, so a stamp counts only within a bound
+  around the arrival: no message can add to, or seem to be missing from, a day that ended long ago.
+- ``StampTrack`` follows one publisher of a topic. A stamp is trusted while its offset from the arrival is stable for that
+  publisher, however large the offset is. Stamps that jump back and forth or that do not advance are not.
 """
 
 from __future__ import annotations
@@ -12,9 +18,25 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, SECOND, Clock
 
 DAY_NS: Final = 24 * 3600 * SECOND
-UNSET, TOO_OLD, AHEAD = 'before_2024', 'too_old', 'ahead'
+UNSET, TOO_OLD, AHEAD, ERRATIC, STUCK = 'before_2024', 'too_old', 'ahead', 'erratic', 'stuck'
 STAMP, SENT = 'stamp_', 'sent_'
 """What was not trusted: the stamp in the message's header, or the time of sending that the middleware delivers with it."""
+STABLE, OFFSET = 'stable', 'offset'
+"""States of a publisher's stamps besides ``ERRATIC``, ``STUCK`` and the reasons of ``StampRule``: within a second of the arrival,
+or steadily further from it."""
+SAME_NS: Final = SECOND
+"""Offsets that differ by less belong to the same clock; stamps within this of their arrival are always trusted."""
+CONFIRMING: Final = 5
+"""Consecutive messages with a new offset after which it counts: a clock that was set, not a stray stamp."""
+RECENT: Final = 50
+"""The messages by which a publisher's stamps are judged as erratic."""
+MAX_DOUBTED, FEW_DOUBTED = RECENT // 5, RECENT // 10
+"""Of these: with more that do not fit the offset none is trusted, with at most this few they are trusted again."""
+MAX_PUBLISHERS: Final = 64
+"""Publishers of a topic that are followed; the one that came first gives way."""
+SMOOTHING: Final = 32
+"""The offset and its spread follow a message by one part in so many: 500 ppm of drift at 1 Hz stay within ``SAME_NS``."""
+_MASK: Final = (1 << RECENT) - 1
 
 
 class Dated(NamedTuple):
@@ -28,7 +50,7 @@ class Dated(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StampRule:
-    """The rule by which messages get their times. It has no state of its own; use it from any thread."""
+    """The bound within which a stamp is believed at all. It has no state of its own; use it from any thread."""
 
     clock: Clock
     max_offset_ns: int = DAY_NS
@@ -38,7 +60,7 @@ class StampRule:
         """The time of a message that was just taken; all times are Unix ns, 0 where there is none.
 
         ``header_ns`` is the stamp in the message, ``source_ns`` when its publisher's middleware sent it, and ``received_ns``
-        when the middleware of this machine had it. A message without a header's stamp is dated by ``source_ns``.
+        when the middleware of this machine received it. A message without a header's stamp is dated by ``source_ns``.
 
         ========================  ==================================================================================
         our clock is set          the message's own time within the bound about the arrival, otherwise the arrival
@@ -62,3 +84,115 @@ class StampRule:
         if -self.max_offset_ns <= own_ns - reference_ns <= self.max_offset_ns:
             return Dated(own_ns)
         return Dated(reference_ns, f'{what}{TOO_OLD if own_ns < reference_ns else AHEAD}')
+
+
+class StampTrack:
+    """Judges the stamps of one publisher of one topic.
+
+    Lifecycle: New; ``date`` each of its messages in the order of arrival. Not thread-safe: the intake thread owns it.
+    """
+
+    __slots__ = (
+        '_advanced_ns', '_agreeing', '_candidate_ns', '_doubted', '_is_erratic', '_newest_ns', '_rule', 'offset_ns', 'refused',
+        'sent_offset_ns', 'since_ns', 'spread_ns',
+    )  # fmt: skip
+
+    def __init__(self, rule: StampRule) -> None:
+        self._rule = rule
+        self.offset_ns: int | None = None
+        """Received minus stamp, smoothed: positive where stamps are older than the arrival. None before the first message."""
+        self.spread_ns = 0
+        """How far messages are from that, on average."""
+        self.sent_offset_ns: int | None = None
+        """Received minus the time of sending, which tells late stamps from a wrong clock; None if it is unknown."""
+        self.since_ns = 0
+        """When the present state began, by the arrival."""
+        self.refused = ''
+        """Why the newest message was not dated by its stamp; empty where it was."""
+        self._newest_ns = self._advanced_ns = 0  # the newest trusted stamp, and when it arrived
+        self._candidate_ns = self._agreeing = 0  # an offset that may become the new one, and how many messages had it
+        self._doubted = 0  # one bit for each of the recent messages
+        self._is_erratic = False
+
+    @property
+    def state(self) -> str:
+        """``stable``, ``offset``, ``erratic``, ``stuck``, or why the bound refuses the stamps (``before_2024``, ...)."""
+        if self._is_erratic:
+            return ERRATIC
+        if self.refused and not self.refused.endswith(ERRATIC):
+            return self.refused.removeprefix(STAMP).removeprefix(SENT)
+        return OFFSET if self.is_apart else STABLE
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether the offset is more than a second."""
+        return self.offset_ns is not None and abs(self.offset_ns) > SAME_NS
+
+    def date(self, header_ns: int, source_ns: int, received_ns: int) -> Dated:
+        """The time of the next message; the arguments as of ``StampRule.date``."""
+        dated = self._rule.date(header_ns, source_ns, received_ns)
+        if received_ns < EARLIEST_SANE_NS:
+            return dated
+        if source_ns >= EARLIEST_SANE_NS:
+            sent_ns, before_ns = received_ns - source_ns, self.sent_offset_ns
+            self.sent_offset_ns = sent_ns if before_ns is None else before_ns + (sent_ns - before_ns) // SMOOTHING
+        if not dated.refused and (why := self._doubt(dated.ns, received_ns)):
+            dated = Dated(received_ns, (STAMP if header_ns else SENT) + why)
+        if dated.refused != self.refused:
+            self.refused, self.since_ns = dated.refused, received_ns
+        return dated
+
+    def _doubt(self, stamp_ns: int, received_ns: int) -> str:
+        """Why a stamp within the bound is not trusted; empty where it is."""
+        if stamp_ns == self._newest_ns and received_ns - self._advanced_ns > SAME_NS:
+            return STUCK
+        is_trusted = self._fits(stamp_ns, received_ns)
+        if is_trusted and stamp_ns > self._newest_ns:
+            self._newest_ns, self._advanced_ns = stamp_ns, received_ns
+        self._doubted = (self._doubted << 1 | (not is_trusted)) & _MASK
+        doubted = self._doubted.bit_count()
+        if doubted > MAX_DOUBTED or (self._is_erratic and doubted > FEW_DOUBTED):
+            if not self._is_erratic:
+                self._is_erratic, self.since_ns = True, received_ns
+            return ERRATIC
+        self._is_erratic = False
+        return '' if is_trusted else ERRATIC
+
+    def _fits(self, stamp_ns: int, received_ns: int) -> bool:
+        """Whether a stamp is that of the clock that the publisher's stamps were last known to follow, or of a new one."""
+        offset_ns, known_ns = received_ns - stamp_ns, self.offset_ns
+        if known_ns is not None and abs(offset_ns - known_ns) <= SAME_NS:
+            self.offset_ns = known_ns + (offset_ns - known_ns) // SMOOTHING
+            self.spread_ns += (abs(offset_ns - known_ns) - self.spread_ns) // SMOOTHING
+            self._agreeing = 0
+            return True
+        if abs(offset_ns - self._candidate_ns) <= SAME_NS:
+            self._agreeing += 1
+        else:
+            self._candidate_ns, self._agreeing = offset_ns, 1
+        if known_ns is None or abs(offset_ns) <= SAME_NS or self._agreeing >= CONFIRMING:
+            self.offset_ns, self.spread_ns, self.since_ns, self._agreeing = offset_ns, 0, received_ns, 0
+            self._newest_ns = 0
+            return True
+        return offset_ns > known_ns and stamp_ns > self._newest_ns  # late, but in order: a queue that was held up
+
+
+class StampTracks:
+    """The publishers of one topic. Lifecycle as ``StampTrack``."""
+
+    def __init__(self, rule: StampRule) -> None:
+        self._rule = rule
+        self._tracks: dict[str | None, StampTrack] = {}
+
+    def of(self, publisher: str | None) -> StampTrack:
+        """That of a publisher; None stands for all whose name is unknown."""
+        track = self._tracks.get(publisher)
+        if track is None:
+            while len(self._tracks) >= MAX_PUBLISHERS:
+                del self._tracks[next(iter(self._tracks))]
+            track = self._tracks[publisher] = StampTrack(self._rule)
+        return track
+
+    def known(self) -> list[tuple[str | None, StampTrack]]:
+        """All that are followed, those of ended publishers too."""
+        return list(self._tracks.items())

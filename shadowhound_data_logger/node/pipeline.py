@@ -144,14 +144,14 @@ class Pipeline:
         bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         stamps = StampRule(self._clock, round(settings.clock.max_offset_s * SECOND))
-        track = RobotTrack(settings.mission, types, stamps, node.resolve_topic_name)
+        track = RobotTrack(settings.mission, types, node.resolve_topic_name)
         self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)
         self.uploader.wait_for(self._rules.closed)
         self._make_request_server(track)
         keeps = self._requests is not None
         self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
-        sampler = Sampler(sensors, accounts, types, stamps, queue)
+        sampler = Sampler(sensors, accounts, types, queue)
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)

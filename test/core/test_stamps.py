@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable, Iterable
+from itertools import accumulate
+
 import pytest
 from clocks import NOON_NS as NOW_NS
 from clocks import Clocks
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.core.stamps import DAY_NS, Dated, StampRule
+from shadowhound_data_logger.core.stamps import CONFIRMING, DAY_NS, RECENT, SAME_NS, Dated, StampRule, StampTrack
 
 WEEK_NS = 7 * DAY_NS
 
@@ -61,3 +65,107 @@ def test_the_bound_can_be_raised() -> None:
     rule = StampRule(Clocks(), 365 * DAY_NS)
     assert rule.date(NOW_NS - 364 * DAY_NS, NOW_NS, NOW_NS) == Dated(NOW_NS - 364 * DAY_NS)
     assert rule.date(NOW_NS - 366 * DAY_NS, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_too_old')
+
+
+PERIOD_NS = SECOND // 30
+MS = 1_000_000
+random_ = random.Random(5)
+
+
+def follow(track: StampTrack, offsets_ns: Iterable[int], period_ns: int = PERIOD_NS, start_ns: int = NOW_NS) -> list[str]:
+    """What each message was refused for, if stamps are this much before their arrival; trusted ones keep their stamp."""
+    found = []
+    for number, offset_ns in enumerate(offsets_ns):
+        received_ns = start_ns + number * period_ns
+        dated = track.date(received_ns - offset_ns, received_ns - 2 * MS, received_ns)
+        assert dated.ns == (received_ns if dated.refused else received_ns - offset_ns)
+        found.append(dated.refused)
+    return found
+
+
+def new_track() -> StampTrack:
+    clocks = Clocks()
+    clocks.set(NOW_NS)
+    return StampTrack(StampRule(clocks))
+
+
+@pytest.mark.parametrize(('offsets_ns', 'refused', 'state'), [
+    pytest.param([5 * MS] * 200, 0, 'stable', id='a synchronized robot'),
+    pytest.param([random_.randrange(200 * MS) for _ in range(200)], 0, 'stable', id='with the jitter of a busy machine'),
+    pytest.param([-MS] * 200, 0, 'stable', id='a publisher a millisecond ahead'),
+    pytest.param([146 * SECOND] * 200, 0, 'offset', id='a driver that stamps late, always as much'),
+    pytest.param([-3600 * SECOND] * 200, 0, 'offset', id='a computer an hour ahead'),
+    pytest.param([300 * SECOND + number * PERIOD_NS // 2000 for number in range(20_000)], 0, 'offset', id='500 ppm of drift'),
+    pytest.param([5 * MS] * 100 + [60 * SECOND] * 100, CONFIRMING - 1, 'offset', id='a clock that is set back'),
+    pytest.param([5 * MS] * 100 + [-60 * SECOND] * 100, CONFIRMING - 1, 'offset', id='a clock that is set ahead'),
+    pytest.param([60 * SECOND] * 100 + [5 * MS] * 100, 0, 'stable', id='a clock that is set right'),
+    pytest.param([67 * SECOND if number % 10 == 9 else 5 * MS for number in range(200)], 20, 'stable', id='a tenth is old'),
+    pytest.param([5 * MS] * 100 + [(30 - late) * PERIOD_NS for late in range(30)] + [5 * MS] * 9, 0, 'stable', id='late by 1 s'),
+])  # fmt: skip
+def test_stamps_are_trusted_while_their_offset_is_stable(offsets_ns: list[int], refused: int, state: str) -> None:
+    """However large it is; a new offset counts when some messages in a row have it, a stray stamp does not."""
+    track = new_track()
+    assert sum(map(bool, follow(track, offsets_ns))) == refused
+    assert track.state == state
+
+
+@pytest.mark.parametrize('offset', [
+    pytest.param(lambda: random_.randrange(-60, 60) * SECOND, id='anything within a minute'),
+    pytest.param(lambda: random_.choice((0, 300 * SECOND)), id='two clocks that nobody tells apart'),
+])  # fmt: skip
+def test_erratic_stamps_are_dated_by_arrival(offset: Callable[[], int]) -> None:
+    """All of them, even those that happen to be near their arrival. They are trusted again once they are stable."""
+    track = new_track()
+    found = follow(track, [offset() for _ in range(500)])
+    assert set(found[2 * RECENT :]) == {'stamp_erratic'}
+    assert track.state == 'erratic'
+    found = follow(track, [5 * MS] * 100, start_ns=NOW_NS + 500 * PERIOD_NS)
+    assert found[0] == 'stamp_erratic'
+    assert found[-1] == ''
+    assert track.state == 'stable'
+
+
+def test_messages_that_a_queue_held_up_keep_their_stamps() -> None:
+    """Ten seconds without any, then all of them at twice the rate, in order."""
+    track = new_track()
+    follow(track, [5 * MS] * 60)
+    found = follow(track, [10 * SECOND - number * PERIOD_NS // 2 for number in range(500)], PERIOD_NS // 2, NOW_NS + 12 * SECOND)
+    assert set(found) == {''}
+
+
+@pytest.mark.parametrize('hz', [1, 30, 1000])
+def test_stamps_that_do_not_advance_are_stuck(hz: int) -> None:
+    """A second after the last that did, at whatever rate; repeats within a second are none of our business."""
+    track, period_ns = new_track(), SECOND // hz
+    follow(track, [MS] * 10, period_ns)
+    found = follow(track, accumulate([MS] + [period_ns] * (5 * hz)), period_ns, NOW_NS + 10 * period_ns)
+    stuck = [bool(why) for why in found]
+    assert set(found) == {'', 'stamp_stuck'}
+    assert stuck == sorted(stuck), 'once stuck, it stays so'
+    assert stuck.index(True) * period_ns <= SAME_NS + 2 * period_ns
+    assert track.state == 'stuck'
+    assert follow(track, [MS] * 3, period_ns, NOW_NS + 20 * SECOND) == ['', '', '']
+    assert track.state == 'stable'
+
+
+def test_a_latched_message_keeps_its_stamp() -> None:
+    """It was sent long before it was received; so does the next one, which comes at once."""
+    track = new_track()
+    assert follow(track, [600 * SECOND, 2 * MS], 60 * SECOND) == ['', '']
+
+
+def test_the_state_has_its_beginning() -> None:
+    """By the arrival; the offset and how far messages are from it are known, and that of the time of sending beside them."""
+    track = new_track()
+    follow(track, [5 * MS] * 10)
+    follow(track, [60 * SECOND] * 50, start_ns=NOW_NS + 10 * PERIOD_NS)
+    assert track.since_ns == NOW_NS + (10 + CONFIRMING - 1) * PERIOD_NS
+    assert track.offset_ns == 60 * SECOND
+    assert (track.spread_ns, track.sent_offset_ns) == (0, 2 * MS)
+
+
+def test_sim_time_is_reported_as_what_it_is() -> None:
+    """A stamp before 2024 is refused by the bound, and named as the state."""
+    track = new_track()
+    assert track.date(70 * SECOND, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_before_2024')
+    assert track.state == 'before_2024'

@@ -13,7 +13,7 @@ from e2e.processes import Node, Processes, until
 from e2e.reading import STRING, texts
 
 LEAVE_OUT = """
-from shadowhound_data_logger import model
+from shadowhound_data_logger.core import model
 Taken = model.Taken
 model.Taken = lambda cdr, source_ns, publisher, number, received_ns: Taken(cdr, source_ns, None, None, received_ns)
 """

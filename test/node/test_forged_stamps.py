@@ -46,7 +46,7 @@ class Robot:
         stack.callback(logger.end)
         sensors = {'odom': SensorSettings(name='odom', topics=(TOPIC,), types=(TYPE,), rate_hz=0.0)}
         types, stamps, queue = MessageTypes(), StampRule(SystemClock.of_this_machine()), BatchQueue(QueueSettings())
-        sampler = Sampler(sensors, self.accounts, types, stamps, queue)
+        sampler = Sampler(sensors, self.accounts, types, queue)
         self.intake = Intake(logger.node, sensors, self.accounts, types, stamps, [sampler])
         writer: Any = SimpleNamespace(
             spool=SimpleNamespace(accounts=self.accounts), put=lambda *items: self.objects.extend(items)

@@ -62,7 +62,7 @@ class Listening(Participant):
         types_here = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         stamps = StampRule(SystemClock.of_this_machine())
         around = Surroundings(self.node, PolledGroup(), self.accounts, types_here, stamps)
-        self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, stamps, self.batches)
+        self.sampler = Sampler({sensor.name: sensor}, self.accounts, types_here, self.batches)
         self.source = Subscriber(around, sensor, [self.sampler], self.others)
 
     def turn(self) -> None:

@@ -73,7 +73,7 @@ class Listening:
         self._accounts, self._batches = Accounts(), Batches()
         installed, queue = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':')), self._batches
         stamps = StampRule(SystemClock.of_this_machine())
-        sampler = Sampler(sensors, self._accounts, installed, stamps, queue)  # type: ignore[arg-type]
+        sampler = Sampler(sensors, self._accounts, installed, queue)  # type: ignore[arg-type]
         self.logger = self.join('logger')
         self._intake = Intake(self.logger.node, sensors, self._accounts, installed, stamps, [sampler])
         self._intake.open()

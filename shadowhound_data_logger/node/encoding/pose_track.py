@@ -19,9 +19,8 @@ from shadowhound_data_logger.core.config import MissionSettings
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.metadata_words import BATTERY, POSE
 from shadowhound_data_logger.core.model import DataObject
-from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.formats.records import ODOMETRY
-from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.node.recording.mission_observer import battery_pct, yaw_of
 
@@ -109,10 +108,9 @@ class RobotTrack(Consumer):
     New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread.
     """
 
-    def __init__(self, settings: MissionSettings, types: MessageTypes, stamps: StampRule, resolve: Callable[[str], str]) -> None:
+    def __init__(self, settings: MissionSettings, types: MessageTypes, resolve: Callable[[str], str]) -> None:
         """The topics are those of missions; ``resolve`` makes their full names."""
         self._types = types
-        self._stamps = stamps
         self.odometry = resolve(settings.odometry) if settings.odometry else ''
         topic, _, field = settings.battery.partition(':')
         self._battery, self._field = resolve(topic) if topic else '', field.split('.')
@@ -122,10 +120,8 @@ class RobotTrack(Consumer):
     def take(self, drained: Drained) -> None:
         kept = self.of(drained.topic, drained.type)
         if kept is not None:
-            has_header = self._types.has_header(drained.type)
-            for cdr, source_ns, _, _, received_ns in drained.messages:
-                dated = self._stamps.date(header_stamp_ns(cdr) if has_header else 0, source_ns, received_ns)
-                kept.add(dated.ns, cdr)
+            for message in drained.messages:
+                kept.add(message.stamp_ns, message.cdr)
 
     def of(self, topic: str, type_name: str) -> KeptMessages | None:
         """Where messages of a topic are kept; None where nobody needs them."""

@@ -7,6 +7,7 @@ object, the ``Sampler`` does both for each sensor and hands the batches to the e
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol
 from zlib import crc32
 
@@ -14,8 +15,7 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.core.options import ARCHIVES
-from shadowhound_data_logger.core.stamps import StampRule
-from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.ros.endpoints import POLL_S
@@ -37,6 +37,8 @@ MAX_ARCHIVE_BYTES: Final = 16 << 20
 27 MB. One such batch may be open, as much again be in the making in each encoder, and the queue holds four."""
 MAX_BATCH_MESSAGES: Final = 10_000
 """The same for messages so small that their bytes say little; the queue holds five such batches."""
+MAX_CLOCKS: Final = 8
+"""Clocks on one topic with a rule and a batch of their own; further ones share those of the first."""
 GRACE_S: Final = 2 * POLL_S
 """How late the last message of a window may come."""
 
@@ -100,7 +102,7 @@ def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> 
 class Batcher:
     """Collects the open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC.
 
-    A late sample (of a second publisher with another clock, say) joins the open batch; a clock that was set begins a new one.
+    A late sample joins the open batch; a clock that was set begins a new one.
     """
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str) -> None:
@@ -110,9 +112,10 @@ class Batcher:
         self._window_ns = round(sensor.batch_s * 1e9)
         self._longest_s = sensor.batch_s
         self._most = MAX_BATCH_MESSAGES if sensor.batch_s else 1
-        self._most_bytes = MAX_ARCHIVE_BYTES if sensor.format in ARCHIVES else MAX_BATCH_BYTES
+        self.max_bytes = MAX_ARCHIVE_BYTES if sensor.format in ARCHIVES else MAX_BATCH_BYTES
         self._samples: list[Sample] = []
-        self._size = 0
+        self.size = 0
+        """Bytes of CDR in the open batch."""
         self._window = 0
         self._opened_s = 0.0
 
@@ -126,8 +129,8 @@ class Batcher:
             self._window = window
             self._opened_s = now_s
         self._samples.append(sample)
-        self._size += len(sample.cdr)
-        if len(self._samples) == self._most or self._size >= self._most_bytes:
+        self.size += len(sample.cdr)
+        if len(self._samples) == self._most or self.size >= self.max_bytes:
             closed.append(self.close())
         return closed
 
@@ -145,22 +148,20 @@ class Batcher:
 
     def close(self) -> Batch:
         """The open samples as a batch; there must be some."""
-        batch = Batch(self._sensor, self._topic, self._type, tuple(self._samples), self._size)
+        batch = Batch(self._sensor, self._topic, self._type, tuple(self._samples), self.size)
         self._samples = []
-        self._size = 0
+        self.size = 0
         return batch
 
 
 class Sampler(Consumer):
     """Chooses which messages of the sensors' topics are logged, and batches them. New; ``take`` what the intake drained."""
 
-    def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, stamps: StampRule,
-                 queue: BatchQueue) -> None:  # fmt: skip
+    def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, queue: BatchQueue) -> None:
         """``sensors`` are the settings in force, by name; ``queue`` gets the batches."""
         self._sensors = sensors
         self._accounts = accounts
         self._types = types
-        self._stamps = stamps
         self._queue = queue
         self._sampled: dict[str, _Sampled] = {}
         self._kept_ns: dict[str, int] = {}
@@ -179,40 +180,35 @@ class Sampler(Consumer):
         messages = drained.messages
         sampled = self._sampled[drained.topic]
         try:
-            kept = self._kept(sampled, drained, account)
+            kept = self._kept(sampled, drained)
         except Exception:
-            account.drop(SAMPLER_FAILED, len(messages), messages[0].source_ns, messages[-1].source_ns)
+            account.drop(SAMPLER_FAILED, len(messages), messages[0].stamp_ns, messages[-1].stamp_ns)
             raise
         sampled.chosen = kept
         if kept:
-            sampled.kept_ns = kept[-1].stamp_ns
-            sampled.open_ns = sampled.open_ns or kept[0].stamp_ns
+            sampled.kept_ns = kept[-1][1].stamp_ns
+            sampled.open_ns = sampled.open_ns or kept[0][1].stamp_ns
         if drained.paused:
-            account.drop(PAUSED, len(messages), account.gaps.heard_ns or messages[0].source_ns, messages[-1].source_ns)
+            account.drop(PAUSED, len(messages), account.gaps.heard_ns or messages[0].stamp_ns, messages[-1].stamp_ns)
         else:
             account.skipped += len(messages) - len(kept)
 
-    def _kept(self, sampled: _Sampled, drained: Drained, account: TopicAccount) -> list[Sample]:
+    def _kept(self, sampled: _Sampled, drained: Drained) -> list[_Chosen]:
         sampled.follow(self._sensors[drained.sensor])
-        kept: list[Sample] = []
+        kept: list[_Chosen] = []
         if not (drained.paused or self.idle):
-            keep, has_header, date = sampled.rule.keep, sampled.has_header, self._stamps.date
-            for cdr, source_ns, publisher, _, received_ns in drained.messages:
-                stamp_ns, refused = date(header_stamp_ns(cdr) if has_header else 0, source_ns, received_ns)
-                if refused:
-                    account.by_arrival[refused] += 1
-                if keep(stamp_ns, cdr):
-                    kept.append(Sample(stamp_ns, cdr, received_ns, publisher))
+            for cdr, _, publisher, _, received_ns, stamp_ns, clock in drained.messages:
+                if sampled.of(clock).rule.keep(stamp_ns, cdr):
+                    kept.append((clock, Sample(stamp_ns, cdr, received_ns, publisher)))
         return kept
 
     def take(self, drained: Drained) -> None:
         sampled = self._sampled[drained.topic]
-        add, now_s = sampled.batcher.add, drained.now_s
         chosen, sampled.chosen = sampled.chosen, ()
-        for sample in chosen:
-            for batch in add(sample, now_s):
+        for clock, sample in chosen:
+            for batch in sampled.add(clock, sample, drained.now_s):
                 self._offer(batch)
-        sampled.open_ns = sampled.batcher.first_ns
+        sampled.open_ns = sampled.first_open_ns()
 
     def leave(self, topic: str) -> None:
         sampled = self._sampled.pop(topic, None)
@@ -223,18 +219,20 @@ class Sampler(Consumer):
     def tick(self, now_s: float) -> None:
         """Close the batches whose time is over, though no message of the next one came."""
         for sampled in self._sampled.values():
-            if sampled.batcher.is_due(now_s, GRACE_S):
-                self._close(sampled)
+            self._close(sampled, now_s)
 
     def flush(self) -> None:
         """Close the open batches."""
         for sampled in self._sampled.values():
             self._close(sampled)
 
-    def _close(self, sampled: _Sampled) -> None:
-        if len(sampled.batcher):
-            self._offer(sampled.batcher.close())
-            sampled.open_ns = 0
+    def _close(self, sampled: _Sampled, due_s: float | None = None) -> None:
+        """Close the open batches; with ``due_s`` only those that are due at that time."""
+        closed = sampled.close(due_s)
+        for batch in closed:
+            self._offer(batch)
+        if closed:
+            sampled.open_ns = sampled.first_open_ns()
 
     def oldest_open(self) -> dict[str, int]:
         """Topic -> the first stamp of what was kept of it and is not encoded yet; from any thread."""
@@ -251,26 +249,71 @@ class Sampler(Consumer):
             self._accounts.drop(lost.topic, QUEUE_FULL, len(samples), samples[0].stamp_ns, samples[-1].stamp_ns)
 
 
+_Chosen = tuple[str | None, Sample]
+"""A message that is kept, and the clock that it follows (``Taken.clock``)."""
+
+
 class _Sampled:
-    """One topic and type of a sensor."""
+    """One topic and type of a sensor. Each clock that its publishers follow has a rule and a batch of its own."""
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str, has_header: bool, kept_ns: int) -> None:
         self.kept_ns = kept_ns
         """Stamp of the newest message that was kept: no period is stored twice."""
-        self.has_header = has_header
-        self.rule = rule_for(sensor, has_header=has_header, last_kept_ns=kept_ns)
         self.open_ns = 0
         """Stamp of the first message that was kept and is not in the queue yet; 0 where there is none."""
-        self.chosen: Sequence[Sample] = ()
+        self.chosen: Sequence[_Chosen] = ()
         """Of the drain under way, what is kept."""
-        self.batcher = Batcher(sensor, topic, type_name)
+        self._topic, self._type, self._has_header = topic, type_name, has_header
+        self._clocks: dict[str | None, _Sampling] = {}
         self._sensor = sensor
 
+    def of(self, clock: str | None) -> _Sampling:
+        """What messages of a clock go through."""
+        found = self._clocks.get(clock)
+        if found is None:
+            for name, each in list(self._clocks.items()):
+                if len(self._clocks) >= MAX_CLOCKS and not len(each.batcher):
+                    del self._clocks[name]
+            if len(self._clocks) >= MAX_CLOCKS:
+                return next(iter(self._clocks.values()))
+            batcher = Batcher(self._sensor, self._topic, self._type)
+            found = self._clocks[clock] = _Sampling(self._rule(self._sensor), batcher)
+        return found
+
+    def add(self, clock: str | None, sample: Sample, now_s: float) -> list[Batch]:
+        """Take a sample that is kept; returns the batches that are closed by it."""
+        batcher = self.of(clock).batcher
+        closed = batcher.add(sample, now_s)
+        if len(self._clocks) > 1 and sum(each.batcher.size for each in self._clocks.values()) >= batcher.max_bytes:
+            closed += self.close()
+        return closed
+
+    def close(self, due_s: float | None = None) -> list[Batch]:
+        """The open batches; with ``due_s`` those that are due at that time."""
+        batchers = [each.batcher for each in self._clocks.values() if len(each.batcher)]
+        return [batcher.close() for batcher in batchers if due_s is None or batcher.is_due(due_s, GRACE_S)]
+
+    def first_open_ns(self) -> int:
+        """The first stamp of the open batches; 0 if there are none."""
+        return min((each.batcher.first_ns for each in self._clocks.values() if len(each.batcher)), default=0)
+
     def follow(self, sensor: SensorSettings) -> None:
-        """Go on by other settings; the open batch stays."""
+        """Use other settings from now on; the open batches stay."""
         if sensor.rate_hz != self._sensor.rate_hz and not sensor.on_change:
-            self.rule = rule_for(sensor, has_header=self.has_header, last_kept_ns=self.kept_ns)
+            for each in self._clocks.values():
+                each.rule = self._rule(sensor)
         self._sensor = sensor
+
+    def _rule(self, sensor: SensorSettings) -> KeepRule:
+        return rule_for(sensor, has_header=self._has_header, last_kept_ns=self.kept_ns)
+
+
+@dataclass(slots=True)
+class _Sampling:
+    """What the messages of one clock go through."""
+
+    rule: KeepRule
+    batcher: Batcher
 
 
 def _is_elsewhere(stamp_ns: int, first_ns: int) -> bool:

@@ -16,8 +16,8 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Taken
-from shadowhound_data_logger.core.stamps import Dated, StampRule
-from shadowhound_data_logger.formats.types import CounterField, MessageTypes
+from shadowhound_data_logger.core.stamps import StampRule, StampTracks
+from shadowhound_data_logger.formats.types import CounterField, MessageTypes, header_stamp_ns
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, hand_on
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
@@ -119,15 +119,37 @@ class Arrivals:
         )  # fmt: skip
 
 
+class MessageTimes:
+    """The times of one topic's messages: when they were sent, and their stamps if these can be trusted (``core/stamps.py``)."""
+
+    def __init__(self, type_name: str, types: MessageTypes, stamps: StampRule) -> None:
+        self._has_header = types.has_header(type_name)
+        self._sent = stamps.date
+        self._tracks = StampTracks(stamps)
+
+    def date(self, message: Taken, publisher: str | None) -> tuple[Taken, Sequence[str]]:
+        """The message with its publisher and its times, and why the arrival had to stand in for one of these."""
+        cdr, source_ns, _, _, received_ns, *_ = message
+        stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
+        track = self._tracks.of(publisher)
+        dated = track.date(stamp_ns, source_ns, received_ns)
+        clock = publisher or '' if track.is_apart and not dated.refused else None
+        known = message._replace(publisher=publisher, stamp_ns=dated.ns, clock=clock)
+        sent = self._sent(0, source_ns, received_ns)
+        if not sent.refused:
+            return known, (dated.refused,) if dated.refused else ()
+        return known._replace(source_ns=sent.ns), tuple({sent.refused, dated.refused} - {''})
+
+
 class TopicStream:
     """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
 
-    def __init__(self, topic: str, type_name: str, stamps: StampRule, consumers: Sequence[Consumer]) -> None:
+    def __init__(self, topic: str, type_name: str, types: MessageTypes, stamps: StampRule, consumers: Sequence[Consumer]) -> None:
         """The first of ``consumers`` gets all of it, the others as far as the topic is one of theirs."""
         self._topic = topic
         self._type = type_name
         self._owner, self._others = consumers[0], consumers[1:]
-        self._stamps = stamps
+        self._times = MessageTimes(type_name, types, stamps)
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._estimate = TopicEstimate()
@@ -135,16 +157,16 @@ class TopicStream:
     def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
         """Hand on messages, in the order in which they came."""
         fresh: list[Taken] = []
-        sent: dict[str, list[int]] = {}
+        unnumbered: dict[str, list[int]] = {}
         for message in taken:
-            _, source_ns, gid, number, received_ns = message
+            _, source_ns, gid, number, *_ = message
             publisher = gid or senders.name(number, source_ns)
             if (gid is None or number is None) and self._recent.has(message):
                 continue
-            fresh.append(_known(message, publisher, self._stamps.date(0, source_ns, received_ns)))
+            fresh.append(self._times.date(message, publisher)[0])
             if publisher is None or number is None:
-                sent.setdefault(gid or '', []).append(source_ns)
-        lost = self._estimate.observe(sent, self._arrivals.hear(senders, now_s)).lost if sent else None
+                unnumbered.setdefault(gid or '', []).append(source_ns)
+        lost = self._estimate.observe(unnumbered, self._arrivals.hear(senders, now_s)).lost if unnumbered else None
         if fresh:
             drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
             hand_on(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
@@ -166,7 +188,7 @@ class SensorStream:
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str, accounts: Accounts, types: MessageTypes,
                  stamps: StampRule, consumers: Sequence[Consumer]) -> None:  # fmt: skip
-        self._stamps = stamps
+        self._times = MessageTimes(type_name, types, stamps)
         self._sensor = sensor.name
         self._topic = topic
         self._type = type_name
@@ -197,27 +219,26 @@ class SensorStream:
     def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
         """Count messages, in the order in which they came, and hand on those that are not repeats."""
         fresh: list[Taken] = []
-        sent: dict[str, list[int]] = {}
-        counter, date = self._counter, self._stamps.date
+        unnumbered: dict[str, list[int]] = {}
+        counter, date = self._counter, self._times.date
         failed: dict[Consumer, Exception] = {}
         with self._entry as account:
             for message in taken:
-                cdr, source_ns, gid, number, received_ns = message
+                cdr, source_ns, gid, number, *_ = message
                 publisher = gid or senders.name(number, source_ns)
                 if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
                     continue
-                dated = date(0, source_ns, received_ns)
-                known = _known(message, publisher, dated)
-                if not account.receive(publisher, number, known.source_ns):
+                known, refused = date(message, publisher)
+                if not account.receive(publisher, number, known.stamp_ns):
                     continue
-                if dated.refused:
-                    account.by_arrival[dated.refused] += 1
+                if refused:
+                    account.by_arrival.update(refused)
                 fresh.append(known)
                 if publisher is None or number is None:
-                    sent.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
-            newest_ns = fresh[-1].source_ns if fresh else 0
-            lost = account.observe(sent, self._arrivals.hear(senders, now_s), newest_ns) if sent else None
-            is_refuted = bool(sent) and account.estimate.refuted
+                    unnumbered.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
+            newest_ns = fresh[-1].stamp_ns if fresh else 0
+            lost = account.observe(unnumbered, self._arrivals.hear(senders, now_s), newest_ns) if unnumbered else None
+            is_refuted = bool(unnumbered) and account.estimate.refuted
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
                 for consumer in self._of_sensors:
@@ -245,10 +266,3 @@ class SensorStream:
         for consumer in self._consumers:
             if consumer.wanted_topics is None or self._topic in consumer.topics:
                 consumer.leave(self._topic)
-
-
-def _known(message: Taken, publisher: str | None, sent: Dated) -> Taken:
-    """The message with its sender, and with its arrival for a time of sending that is not trusted."""
-    if sent.refused:
-        return message._replace(publisher=publisher, source_ns=sent.ns)
-    return message if publisher is message.publisher else message._replace(publisher=publisher)

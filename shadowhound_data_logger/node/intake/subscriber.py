@@ -348,7 +348,7 @@ class Subscriber:
         """Begin with a topic that is new, or of another type than before."""
         self._leave(now_s)
         if self._others is None:
-            self._stream = TopicStream(self._chosen, type_name, self._stamps, self._consumers)
+            self._stream = TopicStream(self._chosen, type_name, self._message_types, self._stamps, self._consumers)
         else:
             self._stream = SensorStream(
                 self.sensor, self._chosen, type_name, self._accounts, self._message_types, self._stamps, self._consumers

@@ -13,10 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from shadowhound_sim.floor_plan import FloorPlan
 from shadowhound_sim.patrol import Patrol
 
-from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import MissionSettings
 from shadowhound_data_logger.core.model import DataObject, Taken
-from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.formats.records import ODOMETRY
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
@@ -54,7 +53,7 @@ def battery_state(share: float) -> bytes:
 
 
 def robot(settings: MissionSettings = SETTINGS) -> RobotTrack:
-    return RobotTrack(settings, TYPES, StampRule(SystemClock.of_this_machine()), lambda topic: f'/{topic}')
+    return RobotTrack(settings, TYPES, lambda topic: f'/{topic}')
 
 
 def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
@@ -66,7 +65,7 @@ def walking(poses: Sequence[tuple[float, bytes]]) -> RobotTrack:
 
 def take(found: RobotTrack, topic: str, type_name: str, *sent: tuple[float, bytes]) -> None:
     """Messages as the intake hands them over."""
-    messages = [Taken(cdr, ns(t), 'p', None, ns(t)) for t, cdr in sent]
+    messages = [Taken(cdr, ns(t), 'p', None, ns(t), ns(t)) for t, cdr in sent]
     found.take(Drained(topic, type_name, topic[1:], messages, None, 0.0, paused=False))
 
 

@@ -58,10 +58,10 @@ class Ear:
         batches: Any = self.batches
         self.bags = BagConsumer(self.graph, BagSettings(), self.accounts, self.queue)
         sensor, types = SensorSettings(name='talk', rate_hz=1.0), MessageTypes()
-        self.sampler = Sampler({'talk': sensor}, self.accounts, types, STAMPS, batches)
+        self.sampler = Sampler({'talk': sensor}, self.accounts, types, batches)
         self.stream: TopicStream | SensorStream
         if own:
-            self.stream = TopicStream(TOPIC, TYPE, STAMPS, [self.bags])
+            self.stream = TopicStream(TOPIC, TYPE, MessageTypes(), STAMPS, [self.bags])
         else:
             self.stream = SensorStream(sensor, TOPIC, TYPE, self.accounts, types, STAMPS, [self.sampler, self.bags])
         self.begin()
@@ -88,7 +88,7 @@ class Ear:
     def record_again(self) -> None:
         """The recording ends and another one begins, with a subscription of its own."""
         self.begin()
-        self.stream = TopicStream(TOPIC, TYPE, STAMPS, [self.bags])
+        self.stream = TopicStream(TOPIC, TYPE, MessageTypes(), STAMPS, [self.bags])
 
     @property
     def account(self) -> TopicAccount:
@@ -97,7 +97,7 @@ class Ear:
 
 
 def messages(*numbers: int, publisher: str | None = 'p') -> list[Taken]:
-    return [Taken(b'%08d' % number, NOON_NS + number * 10**7, publisher, number, NOON_NS) for number in numbers]
+    return [Taken(b'%08d' % number, (ns := NOON_NS + number * 10**7), publisher, number, ns) for number in numbers]
 
 
 @pytest.fixture(params=[True, False], ids=['own', 'shared'])
@@ -256,7 +256,7 @@ def test_each_consumer_gets_its_own_topics() -> None:
     for each in (sensors_only, chose):
         assert each.given == [(TOPIC, 'talk', [1, 2, 3]), (TOPIC, 'left', [])]
         each.given.clear()
-    unsampled = TopicStream(TOPIC, TYPE, STAMPS, [chose_not, chose, sensors_only])
+    unsampled = TopicStream(TOPIC, TYPE, MessageTypes(), STAMPS, [chose_not, chose, sensors_only])
     unsampled.add(messages(1), Senders(), 0.0, paused=False)
     unsampled.close()
     assert chose_not.given == chose.given == [(TOPIC, '', [1]), (TOPIC, 'left', [])]
