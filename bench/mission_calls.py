@@ -1,17 +1,22 @@
-"""Prints what the calls of MissionDataLogger cost an agent, with Tower up, away and hung, beside MLflow's own client.
+"""Measures how long an agent waits for each call of MissionDataLogger, and for MLflow's own client.
 
-Run it as ``python bench/mission_calls.py [--seconds S] [--folder F] [--json]``; S is for each of the three.
+Tower is up, unreachable and hung in turn; ``start_mission`` is also measured 10 ms after the constructor, on the idle machine and
+next to ten busy processes, and compared with a bare request for a run. Run it as
+``python bench/mission_calls.py [--seconds S] [--folder F] [--json]``; S is for each of the three states.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +27,8 @@ from e2e.wire import HANG, PASS, REFUSE, Wire
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.core.mlflow_rest import MlflowRest
+from shadowhound_data_logger.missions.folder import MISSIONS
 from shadowhound_data_logger.missions.tracking import ENVIRONMENT
 
 RATE_HZ: Final = 100.0
@@ -31,6 +38,8 @@ MEDIAN_S, P99_S = 1e-3, 10e-3
 PLAIN_CALLS: Final = 50
 START_S: Final = {'up': 0.1, 'away': 0.1, 'hung': 2.1}
 """Of ``start_mission`` right after the constructor."""
+STARTS, AFTER_S, BUSY, START_MEDIAN_S = 12, 0.01, 10, 0.1
+"""Rounds, the time between constructor and call, busy processes, and what the median of the rounds must stay below."""
 
 
 def timed(call: Callable[[], object]) -> float:
@@ -56,6 +65,45 @@ def calls(home: Path, seconds: float) -> dict[str, list[float]]:
         took['end_mission'].append(timed(lambda: logger.end_mission(True, 1.0, 1.0)))
     finally:
         logger.close()
+    return took
+
+
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """So many processes that compute without a pause."""
+    processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass']) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def starts(folder: Path, rest: MlflowRest, experiment_id: str) -> dict[str, list[float]]:
+    """Seconds that ``start_mission`` takes, and the bare request for a run right after it; they take turns.
+
+    Each round has a new home, and waits at its end until the sender of that home has exited.
+    """
+    took: dict[str, list[float]] = {'start_mission': [], 'runs/create': [], 'ratio': []}
+    for number in range(STARTS):
+        home = folder / str(number)
+        logger = MissionDataLogger(home=home)
+        time.sleep(AFTER_S)
+        began = time.perf_counter()
+        run_id = logger.start_mission('bench', 'start')
+        start = time.perf_counter() - began
+        body = {'experiment_id': experiment_id, 'run_name': 'bare', 'start_time': 0, 'tags': []}
+        bare = timed(lambda body=body: rest.json('POST', 'runs/create', body))  # type: ignore[misc]
+        took['start_mission'].append(start)
+        took['runs/create'].append(bare)
+        took['ratio'].append(start / bare)
+        rest.json('GET', f'runs/get?run_id={run_id}')  # raises if that is no run
+        logger.end_mission(True, 1.0, 1.0)
+        logger.close(60.0)
+        pid = json.loads((home / MISSIONS / 'replay.json').read_text(encoding='utf-8'))['pid']
+        while Path(f'/proc/{pid}/exe').exists():
+            time.sleep(0.1)
     return took
 
 
@@ -93,6 +141,22 @@ def measure(options: argparse.Namespace) -> Report:
                     for call, all_ in took.items()
                 }
             wire.set(PASS)
+            os.environ['MLFLOW_TRACKING_URI'] = tower.tracking_uri
+            rest = MlflowRest(tower.tracking_uri, os.environ, Path('/'))
+            experiment = rest.experiment('thor_missions') or {}
+            for name, count in (('idle', 0), ('busy', BUSY)):
+                progress(f'{STARTS} starts, {count} busy processes')
+                with busy(count):
+                    took = starts(Path(folder) / f'starts_{name}', rest, experiment['experiment_id'])
+                median = statistics.median(took['start_mission'])
+                where = f'next to {count} busy processes' if count else 'on the idle machine'
+                bars.append(Bar(f'start_mission {AFTER_S * 1e3:g} ms after the constructor, {where}', 'median under 100 ms',
+                                median * 1e3, 'ms', median < START_MEDIAN_S, tuple(each * 1e3 for each in took['start_mission'])))  # fmt: skip
+                figures[f'start_{name}'] = {
+                    'start_mission_ms': [each * 1e3 for each in took['start_mission']],
+                    'bare_ms': [each * 1e3 for each in took['runs/create']], 'ratio': statistics.median(took['ratio']),
+                    'load': os.getloadavg()[0],
+                }  # fmt: skip
             own = plain(tower.tracking_uri)
             figures['mlflow_log_metric'] = {'median_ms': statistics.median(own) * 1e3, 'p99_ms': percentile(own, 99) * 1e3}
     return Report(tuple(bars), figures)

@@ -113,6 +113,7 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
     robot = os.environ.get('SHADOWHOUND_ROBOT') or 'thor'
     replayer = Replayer(where, experiment or f'{robot}_missions', os.environ)
     replayer.start()
+    replayer.wake()
     try:
         left = _wait(where, time.monotonic() + deadline)
     finally:

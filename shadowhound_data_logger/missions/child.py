@@ -28,11 +28,16 @@ PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 UNUSABLE: Final = 78
 """The exit code (EX_CONFIG) of an interpreter that cannot import the sender."""
 NICE: Final = 5
+HOLD_S: Final = 1.0
+"""How long it waits to be woken, or for the agent's end, before it loads MLflow: that takes a core for seconds, which the first
+mission's request for a run should not have to share."""
 PROGRAM: Final = f"""\
 import os, sys
 if sys.path[:1] == ['']:
     del sys.path[0]
+import select
 os.nice({NICE})
+select.select([0], [], [], float(sys.argv.pop(1)))
 try:
     from shadowhound_data_logger.missions.replay import main
 except ImportError as error:
@@ -50,10 +55,10 @@ REMEDY: Final = 'send them with `shadowhound-data missions resume`, from a Pytho
 class Replayer:
     """Starts and wakes the process that sends missions.
 
-    Life: New; start once; wake and look any number; let_go once. Not thread-safe but for ``wake``.
+    Lifecycle: New; start once; wake and look any number of times; let_go once. Only ``wake`` is thread-safe.
 
-    It runs in the agent's working directory as that was at the beginning, so that relative paths in the environment
-    (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) mean to it what they mean to the agent.
+    The process runs in the agent's working directory at construction, so that relative paths in the environment
+    (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) mean the same to it as to the agent.
     """
 
     def __init__(self, home: Path, experiment: str, environ: Mapping[str, str]) -> None:
@@ -68,13 +73,13 @@ class Replayer:
         self._next_s = 0.0
 
     def start(self) -> None:
-        """Returns at once. A machine that cannot start it now has another chance at ``look``."""
+        """Returns immediately. The process loads MLflow once it is woken, or after ``HOLD_S``; ``look`` retries a failed start."""
         _let_go[:] = [process for process in _let_go if process.poll() is None]
         folder = self._home / MISSIONS
         if self._python is None:
             self._do_without(f'this program has no Python interpreter to start (sys.executable is {sys.executable!r})')
             return
-        command = [self._python, '-c', PROGRAM, '--home', str(self._home), '--experiment', self._experiment]
+        command = [self._python, '-c', PROGRAM, str(HOLD_S), '--home', str(self._home), '--experiment', self._experiment]
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with os.fdopen(os.open(folder / 'replay.log', os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), 'ab') as output:
@@ -91,7 +96,7 @@ class Replayer:
             os.set_blocking(self._process.stdin.fileno(), False)
 
     def wake(self) -> None:
-        """Let it look at the journals now."""
+        """Have it read the journals now."""
         process = self._process
         if process is not None and process.stdin is not None:
             with suppress(OSError, ValueError):  # it has died, was let go, or has enough to read

@@ -83,6 +83,8 @@ class MissionDataLogger:
             self._runs.prepare()
         if self._replayer:
             self._replayer.start()
+            if self._runs is None:  # only the sender can create runs
+                self._replayer.wake()
         self._worker.start()
 
     def __repr__(self) -> str:
@@ -186,17 +188,17 @@ class MissionDataLogger:
     def _start(self, mission_type: str, mission_command: str) -> Mission:
         mission = self._begin(mission_type, mission_command)
         if self._replayer and mission.is_active:
-            self._replayer.wake()
-            self._await_run(mission)
+            self._await_run(mission, self._replayer)
         return mission
 
-    def _await_run(self, mission: Mission) -> None:
-        """For ``start_timeout_s``, or until no server answers."""
+    def _await_run(self, mission: Mission, replayer: Replayer) -> None:
+        """Wait for ``start_timeout_s``, or until no server answers; the sender is woken after the request of this process."""
         end, new = time.monotonic() + self._start_timeout_s, mission.new_run
         if new is not None:
             new.is_settled.wait(self._start_timeout_s)
-            if new.run is not None or new.is_hopeless:
-                return
+        replayer.wake()
+        if new is not None and (new.run is not None or new.is_hopeless):
+            return
         _until(lambda: mission.run_id is not None, end - time.monotonic())
 
     def _begin(self, mission_type: str, mission_command: str) -> Mission:

@@ -123,6 +123,34 @@ def test_an_interpreter_that_cannot_import_us_is_not_tried_again(
     assert 'shadowhound_data_logger' in (tmp_path / 'home' / MISSIONS / 'replay.log').read_text()
 
 
+def is_holding(pid: int) -> bool:
+    """Whether the sender has started and waits: it lowers its priority right before that."""
+    state, *fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return state == 'S' and int(fields[15]) == child.NICE
+
+
+@pytest.mark.parametrize('by', ['wake', 'let_go', 'HOLD_S'])
+def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str) -> None:
+    """Or its agent is gone, or a second has passed: the CPU is left to the first mission's request for a run."""
+    fake, loaded = tmp_path / 'package/shadowhound_data_logger/missions', tmp_path / 'loaded'
+    fake.mkdir(parents=True)
+    for folder in (fake, fake.parent):
+        (folder / '__init__.py').touch()
+    (fake / 'replay.py').write_text(f'open({str(loaded)!r}, "w")\ndef main(): pass\n')
+    monkeypatch.setattr(child, 'PACKAGE', str(fake.parents[1]))
+    monkeypatch.setattr(child, 'HOLD_S', 0.0 if by == 'HOLD_S' else 3600.0)
+    replayer = child.Replayer(home, 'x', {})
+    replayer.start()
+    assert replayer._process is not None
+    if by != 'HOLD_S':
+        pid = replayer._process.pid
+        until(lambda: is_holding(pid), 'it waits')
+        assert not loaded.exists()
+        getattr(replayer, by)()
+    until(loaded.exists, 'it loads the package')
+    replayer.let_go()
+
+
 @pytest.mark.parametrize('arguments', [
     {'robot': 'a/b'}, {'robot': 3}, {'home': 3}, {'home': 'a\0b'}, {'home': b'a'}, {'home': '~nobody-here/x'},
     {'tracking_uri': 3}, {'tracking_uri': 'a\0b'}, {'experiment': 'a\0b'}, {'experiment': 3}, {'start_timeout_s': 'x'},

@@ -74,6 +74,25 @@ def test_the_call_costs_one_request(server: Server, warm_home: Path) -> None:
     assert [server.run(f'a request {number}').info.run_id for number in (1, 2)] == [first, second]
 
 
+def test_the_sender_is_woken_after_the_request(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that loading MLflow takes no CPU from it."""
+    events: list[str] = []
+
+    def settle(_: RunRequests, new: NewRun, __: object) -> None:
+        new.settle(RUN)
+        events.append('settled')
+
+    monkeypatch.setattr(RunRequests, 'prepare', lambda _: None)
+    monkeypatch.setattr(RunRequests, 'create', settle)
+    monkeypatch.setattr(Replayer, 'start', lambda _: None)
+    monkeypatch.setattr(Replayer, 'wake', lambda _: events.append('woken'))
+    logger = MissionDataLogger(home=home, tracking_uri='http://127.0.0.1:9')
+    assert events == []
+    assert logger.start_mission('patrol', '') == RUN.run_id
+    assert events == ['settled', 'woken']
+    ended(logger)
+
+
 @pytest.mark.seaweedfs
 def test_many_missions_in_a_row_have_a_run_each(server: Server, warm_home: Path) -> None:
     """The agent and the sender look after the same missions at the same time."""
