@@ -38,7 +38,7 @@ MEDIAN_S, P99_S = 1e-3, 10e-3
 PLAIN_CALLS: Final = 50
 START_S: Final = {'up': 0.1, 'away': 0.1, 'hung': 2.1}
 """Of ``start_mission`` right after the constructor."""
-STARTS, AFTER_S, BUSY, START_MEDIAN_S = 12, 0.01, 10, 0.1
+STARTS, AFTER_S, BUSY, START_MEDIAN_MS = 12, 0.01, 10, 100.0
 """Rounds, the time between constructor and call, busy processes, and what the median of the rounds must stay below."""
 
 
@@ -148,14 +148,14 @@ def measure(options: argparse.Namespace) -> Report:
                 progress(f'{STARTS} starts, {count} busy processes')
                 with busy(count):
                     took = starts(Path(folder) / f'starts_{name}', rest, experiment['experiment_id'])
-                median = statistics.median(took['start_mission'])
+                took_ms = [each * 1e3 for each in took['start_mission']]
+                median_ms = statistics.median(took_ms)
                 where = f'next to {count} busy processes' if count else 'on the idle machine'
                 bars.append(Bar(f'start_mission {AFTER_S * 1e3:g} ms after the constructor, {where}', 'median under 100 ms',
-                                median * 1e3, 'ms', median < START_MEDIAN_S, tuple(each * 1e3 for each in took['start_mission'])))  # fmt: skip
+                                median_ms, 'ms', median_ms < START_MEDIAN_MS, tuple(took_ms)))  # fmt: skip
                 figures[f'start_{name}'] = {
-                    'start_mission_ms': [each * 1e3 for each in took['start_mission']],
-                    'bare_ms': [each * 1e3 for each in took['runs/create']], 'ratio': statistics.median(took['ratio']),
-                    'load': os.getloadavg()[0],
+                    'start_mission_ms': took_ms, 'bare_ms': [each * 1e3 for each in took['runs/create']],
+                    'ratio': statistics.median(took['ratio']), 'load': os.getloadavg()[0],
                 }  # fmt: skip
             own = plain(tower.tracking_uri)
             figures['mlflow_log_metric'] = {'median_ms': statistics.median(own) * 1e3, 'p99_ms': percentile(own, 99) * 1e3}

@@ -35,16 +35,16 @@ PROGRAM: Final = f"""\
 import os, sys
 if sys.path[:1] == ['']:
     del sys.path[0]
-import select
+from select import select
 os.nice({NICE})
-select.select([0], [], [], float(sys.argv.pop(1)))
+select([0], [], [], float(sys.argv.pop(1)))
 try:
     from shadowhound_data_logger.missions.replay import main
 except ImportError as error:
     print(error, file=sys.stderr)
     sys.exit({UNUSABLE})
 sys.exit(main())
-"""
+"""  # noqa: S608 - it is no SQL
 """The sender. The working directory, which is the agent's, is not searched for modules: one called ``queue.py`` would replace
 Python's own."""
 _PYTHON: Final = re.compile(r'(?:python|pypy)(\d+(?:\.\d+)?)?[a-z]*')
@@ -73,7 +73,7 @@ class Replayer:
         self._next_s = 0.0
 
     def start(self) -> None:
-        """Returns immediately. The process loads MLflow once it is woken, or after ``HOLD_S``; ``look`` retries a failed start."""
+        """Returns immediately. The process loads MLflow when woken, or after ``HOLD_S``; ``look`` retries a failed start."""
         _let_go[:] = [process for process in _let_go if process.poll() is None]
         folder = self._home / MISSIONS
         if self._python is None:
