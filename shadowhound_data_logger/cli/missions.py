@@ -130,14 +130,15 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
 @missions.command('export', epilog=examples('missions export patrol_20251018_120000 --format csv --to mission.csv'))
 @click.option('--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='What to write.')
 @click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
+@as_json
 @_mission
-def export_(*, folder: MissionFolder, kind: str, to: IO[str]) -> ExitCode:
+def export_(*, folder: MissionFolder, kind: str, to: IO[str], as_json: bool) -> ExitCode:
     """Write one mission to JSON or CSV.
 
     All points, events and parameters, as they were logged on this machine, without MLflow.
     """
     found = export(folder)
-    if kind == 'json':
+    if as_json or kind == 'json':
         json.dump(found, to, indent=2)
         to.write('\n')
     else:

@@ -57,7 +57,7 @@ COMMANDS: Final = """\
 
 *Made from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
 
-`shadowhound-data VERB --help` describes each verb with all of its options; almost every one prints JSON with `--json`. Times
+`shadowhound-data VERB --help` describes each verb with all of its options; each prints JSON with `--json`. Times
 are UTC, and all of them are written alike: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
 An error names the verb, what is wrong and where, and on the next line what to do:

@@ -111,13 +111,17 @@ def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt
 @policy.command(name='sign-root', epilog=examples('policy sign-root root.json --key alice.key'))
 @click.argument('root', type=_file)
 @click.option('--key', type=_file, required=True, help='Private key of a person who keeps a part of the root.')
-def sign_root(*, root: Path, key: Path) -> ExitCode:
+@as_json
+def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
     """Sign a new root with another key."""
     repository = _signers()[1]
-    for line in repository.described(root):
-        click.echo(line)
+    lines = [*repository.described(root)]
+    if not as_json:
+        click.echo('\n'.join(lines))  # before the passphrase is asked for
     found = repository.sign_root(root, key, _passphrase)
-    click.echo(f'{found.signed} signatures, {found.missing} missing' if found.missing else f'{found.signed} signatures: complete')
+    missing = f', {found.missing} missing' if found.missing else ': complete'
+    told = {'root': str(root), 'content': lines, 'signatures': found.signed, 'missing_signatures': found.missing}
+    print_json(told) if as_json else click.echo(f'{found.signed} signatures{missing}')
     return ExitCode.FINE
 
 
@@ -129,8 +133,9 @@ def sign_root(*, root: Path, key: Path) -> ExitCode:
 @click.option('--threshold', type=click.IntRange(1), help='How many keys of a new root must sign  [default: as before]')
 @_encrypt
 @_signs
+@as_json
 def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[Path, ...], threshold: int | None, encrypt: bool,
-           folder: Path | None) -> ExitCode:  # fmt: skip
+           folder: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Replace keys that may have been stolen.
 
     By default those are targets.key and online.key.
@@ -145,18 +150,21 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
         before = signing.listed()
         found = signing.rotate(roles or ('targets', 'online'), secrets, new_root, threshold, passphrase)
         listed = before if found.missing else signing.listed()
+    gone = sorted({*before} - {*listed})
     if found.missing:
-        click.echo(f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh')
-        return ExitCode.FINE
-    click.echo(f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}')
-    if gone := sorted({*before} - {*listed}):
-        click.echo(
-            f'not signed in this folder, and no longer listed: {", ".join(gone)}; policy publish lists what is yours again'
-        )
-    if 'online' in roles or 'targets' in roles or not roles:
-        click.echo(f'copy {place / repository.ONLINE_KEY} to where policy refresh runs')
-    if (place / repository.ROOT_KEY).is_file():
-        click.echo(f'move {place / repository.ROOT_KEY} offline')
+        lines = [f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh']
+    else:
+        lines = [f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}']
+        if gone:
+            lines.append(f'not signed in this folder, and no longer listed: {", ".join(gone)}; '
+                         'policy publish lists what is yours again')  # fmt: skip
+        if 'online' in roles or 'targets' in roles or not roles:
+            lines.append(f'copy {place / repository.ONLINE_KEY} to where policy refresh runs')
+        if (place / repository.ROOT_KEY).is_file():
+            lines.append(f'move {place / repository.ROOT_KEY} offline')
+    told = {'folder': str(place), 'root_version': found.version, 'missing_signatures': found.missing, 'listed': listed,
+            'no_longer_listed': gone}  # fmt: skip
+    print_json(told) if as_json else click.echo('\n'.join(lines))
     return ExitCode.FINE
 
 
@@ -166,15 +174,19 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
 @click.option('--end', is_flag=True, help='Take the right from NAME: no robot runs any longer what only that key listed.')
 @_key
 @_signs
-def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, folder: Path | None) -> ExitCode:
+@as_json
+def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, folder: Path | None, as_json: bool) -> ExitCode:
     """Let another key list versions of some policies."""
     if end == bool(paths):
         raise BadUsage('either --for or --end', "policy delegate alice.pub --for 'go2/go2_patrol/*'")
     with _signing(folder) as signing:
         if end:
-            click.echo(f'no longer may sign: {", ".join(signing.end_delegation(who, key))}')
+            names = list(signing.end_delegation(who, key))
+            text = f'no longer may sign: {", ".join(names)}'
         else:
-            click.echo(f'{signing.delegate(_signers()[0].load_public(Path(who)), paths, key)} may sign {", ".join(paths)}')
+            names = [signing.delegate(_signers()[0].load_public(Path(who)), paths, key)]
+            text = f'{names[0]} may sign {", ".join(paths)}'
+    print_json({'names': names, 'may_sign': list(paths)}) if as_json else click.echo(text)
     return ExitCode.FINE
 
 
@@ -264,7 +276,8 @@ def publish(
 @click.option('--robot-type', 'robot_types', multiple=True, default=('go2',), show_default=True, help='Robots it was for.')
 @_key
 @_signs
-def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folder: Path | None) -> ExitCode:
+@as_json
+def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folder: Path | None, as_json: bool) -> ExitCode:
     """Sign that a version may no longer run.
 
     Robots roll back to their last good version.
@@ -274,7 +287,9 @@ def withdraw(*, name: str, robot_types: tuple[str, ...], key: Path | None, folde
         raise BadUsage(f'{name!r} is not a version', 'such as go2_patrol@7')
     with _signing(folder) as signing:
         is_told = signing.withdraw([target_of(kind, policy_name, int(version)) for kind in robot_types], key)
-    click.echo(f'{name} is no longer listed{"" if is_told else "; robots learn of it after policy refresh, where online.key is"}')
+    text = f'{name} is no longer listed{"" if is_told else "; robots learn of it after policy refresh, where online.key is"}'
+    told = {'withdrawn': name, 'robot_types': list(robot_types), 'refreshed': is_told}
+    print_json(told) if as_json else click.echo(text)
     return ExitCode.FINE
 
 
@@ -319,8 +334,11 @@ def sync(*, as_json: bool, **given: Any) -> ExitCode:
 @policy.command(epilog=examples('policy run --name go2_patrol --max-mbps 20'))
 @click.option('--every', type=click.FloatRange(0.1, 86_400.0), default=30.0, show_default=True, help='Seconds between two looks.')
 @_follows
-def run(*, every: float, **given: Any) -> ExitCode:
+@as_json
+def run(*, every: float, as_json: bool, **given: Any) -> ExitCode:
     """Follow the registry until interrupted.
+
+    With --json, each change is one line of JSON on standard output.
 
     A Tower that is away changes nothing: what is active goes on. Where there is ROS, the node shadowhound_policy publishes the
     active version as ~/policy (std_msgs/String, latched), and takes word of its health on ~/health.
@@ -333,12 +351,13 @@ def run(*, every: float, **given: Any) -> ExitCode:
     with suppress(KeyboardInterrupt), _syncing(given) as one, _telling():
         while True:
             try:
-                text = _sentence(one.run(again=False))
+                result = one.run(again=False)
+                text, told = _sentence(result), _told(result)
             except (DataLoggerError, OSError) as error:
-                text = f'{error}'
+                text, told = f'{error}', {'error': f'{error}'}
             if text != said:
-                print(text, file=sys.stderr, flush=True)
                 said = text
+                print_json(told, is_line=True) if as_json else print(text, file=sys.stderr, flush=True)
             time.sleep(every * random.uniform(1.0 - JITTER, 1.0 + JITTER))
     return ExitCode.FINE
 
@@ -400,7 +419,8 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
 @click.argument('name')
 @click.option('--now', is_flag=True, help='Also while a mission is active.')
 @_isolation
-def use(*, name: str, now: bool, isolation: str) -> ExitCode:
+@as_json
+def use(*, name: str, now: bool, isolation: str, as_json: bool) -> ExitCode:
     """Activate a version that is on this robot, and pin it."""
     folder = _policies()
     found = folder.find(name)
@@ -411,39 +431,45 @@ def use(*, name: str, now: bool, isolation: str) -> ExitCode:
     if not now and not _no_mission()():
         raise PolicyError('a mission is active', remedy='wait for its end, or add --now')
     folder.use(found)
-    click.echo(f'{found} is active and pinned')
+    print_json({'active': found, 'pinned': found}) if as_json else click.echo(f'{found} is active and pinned')
     return ExitCode.FINE
 
 
 @policy.command(epilog=examples('policy rollback'))
-def rollback() -> ExitCode:
+@as_json
+def rollback(*, as_json: bool) -> ExitCode:
     """Go back to the last good version, at once.
 
     What was active is not taken again, unless policy use brings it back.
     """
-    click.echo(f'active: {_policies().roll_back() or "none"}')
+    active = _policies().roll_back()
+    print_json({'active': active}) if as_json else click.echo(f'active: {active or "none"}')
     return ExitCode.FINE
 
 
 @policy.command(epilog=examples('policy pin'))
-def pin() -> ExitCode:
+@as_json
+def pin(*, as_json: bool) -> ExitCode:
     """Stay with the active version, whatever the registry says."""
-    click.echo(f'pinned: {_policies().pin()}')
+    pinned = _policies().pin()
+    print_json({'pinned': pinned}) if as_json else click.echo(f'pinned: {pinned}')
     return ExitCode.FINE
 
 
 @policy.command(epilog=examples('policy unpin'))
-def unpin() -> ExitCode:
+@as_json
+def unpin(*, as_json: bool) -> ExitCode:
     """Follow the registry again."""
     _policies().unpin()
-    click.echo('follows the registry again')
+    print_json({'pinned': None}) if as_json else click.echo('follows the registry again')
     return ExitCode.FINE
 
 
 @policy.command(epilog=examples('policy report --failures 4', 'policy report --p99-ms 180'))
 @click.option('--failures', type=click.IntRange(0), default=0, help='Failed steps among the last 100.')
 @click.option('--p99-ms', type=click.FloatRange(0.0), default=0.0, help='p99 of a step.')
-def report(*, failures: int, p99_ms: float) -> ExitCode:
+@as_json
+def report(*, failures: int, p99_ms: float, as_json: bool) -> ExitCode:
     """Report how the active version does.
 
     Beyond the limits of its manifest it is rolled back.
@@ -452,10 +478,13 @@ def report(*, failures: int, p99_ms: float) -> ExitCode:
     name = folder.current()
     if name is None:
         raise PolicyError('no policy is active')
-    if running.judge(folder, name, folder.check(name, folder.state(), hashes=False), failures, p99_ms):
-        return ExitCode.FINE
-    click.echo(f'{name} is rolled back; active: {folder.current() or "none"}')
-    return ExitCode.FINDING
+    is_good = running.judge(folder, name, folder.check(name, folder.state(), hashes=False), failures, p99_ms)
+    active = folder.current()
+    if as_json:
+        print_json({'policy': name, 'rolled_back': not is_good, 'active': active})
+    elif not is_good:
+        click.echo(f'{name} is rolled back; active: {active or "none"}')
+    return exit_code(finding=not is_good)
 
 
 def _keys_folder(folder: Path | None) -> Path:

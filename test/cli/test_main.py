@@ -115,6 +115,12 @@ def test_every_verb_ends_with_a_code_of_the_table(name: str) -> None:
     assert inner.__annotations__['return'] == 'ExitCode'
 
 
+@pytest.mark.parametrize('name', LEAVES)
+def test_every_verb_answers_in_json(name: str) -> None:
+    """Each has --json, for programs."""
+    assert any('--json' in option.opts for option in LEAVES[name].params)
+
+
 # -- errors ------------------------------------------------------------------------------------------------------------
 
 

@@ -152,6 +152,7 @@ def test_an_export_has_all_that_was_logged(tmp_path: Path) -> None:
     mission_id = fly(tmp_path)
     see(tmp_path, mission_id)
     said = json.loads(run(tmp_path, 'export', mission_id).output)
+    assert json.loads(run(tmp_path, 'export', '--json', mission_id).output) == said
     assert said['params']['mission_type'] == 'patrol'
     points = {(point['key'], point['value'], point['step'], point['source']) for point in said['points']}
     assert {('people_met', 2.0, 3, 'agent'), ('battery_pct', 77.0, 1, 'node'), ('distance_m', 12.5, 0, 'agent')} <= points

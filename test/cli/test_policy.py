@@ -10,14 +10,16 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from policies.models import Scene
 from tuf.api.metadata import Metadata, Root, Timestamp
 
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.policies import trust
+from shadowhound_data_logger.policies import sync, trust
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.repository import Repository
+from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
 from shadowhound_data_logger.stores import open_store
 
 
@@ -280,3 +282,49 @@ def test_a_robot_that_received_nothing_fresh_says_so(team: Team, tmp_path: Path,
     old.signed.expires = datetime.now(timezone.utc) - timedelta(days=1)
     path.write_bytes(old.to_bytes())  # as it is a fortnight later
     assert said() == [True] * 4
+
+
+def test_signing_answers_in_json(team: Team) -> None:
+    """Each verb prints one JSON value, whatever it signs."""
+
+    def told(*arguments: object) -> Any:
+        return json.loads(team.run(*arguments, '--json'))
+
+    people = team.home / 'people'
+    for name in ('alice', 'bob'):
+        told('keys', '--only', name, '--keys', people)
+    publics = [part for name in ('alice', 'bob') for part in ('--root-key', people / f'{name}.pub')]
+    assert told('keys', '--threshold', 2, *publics)['missing_signatures'] == 2
+    root = team.keys / 'root.json'
+    assert told('sign-root', root, '--key', people / 'alice.key')['missing_signatures'] == 1
+    signed = told('sign-root', root, '--key', people / 'bob.key')
+    assert (signed['root'], signed['signatures'], signed['missing_signatures']) == (str(root), 2, 0)
+    team.publish('go2/go2_patrol/7')
+    (name,) = told('delegate', people / 'alice.pub', '--for', 'go2/stairs/*')['names']
+    assert name.startswith('alice-')
+    assert told('delegate', 'alice', '--end') == {'names': [name], 'may_sign': []}
+    assert told('withdraw', 'go2_patrol@7') == {'withdrawn': 'go2_patrol@7', 'robot_types': ['go2'], 'refreshed': True}
+    team.publish('go2/go2_patrol/8')
+    begun = told('rotate', '--root-secret', people / 'alice.key')
+    assert (begun['root_version'], begun['missing_signatures'], begun['listed']) == (2, 1, ['go2/go2_patrol/8'])
+    ended = told('rotate', *(part for name in ('alice', 'bob') for part in ('--root-secret', people / f'{name}.key')))
+    assert (ended['missing_signatures'], ended['listed'], ended['no_longer_listed']) == (0, ['go2/go2_patrol/8'], [])
+
+
+def test_a_robot_answers_in_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The verbs that choose the active version, and the report by which it is rolled back (exit code 1)."""
+    monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
+    scene = Scene(tmp_path)
+    ids = [(scene.publish(version), scene.robot.run())[0] for version in (1, 2)]
+    scene.store.close()
+    robot = Team(tmp_path / 'thor')
+
+    def told(*arguments: object, code: int = 0) -> Any:
+        return json.loads(robot.run(*arguments, '--json', code=code))
+
+    assert told('pin') == {'pinned': ids[1]}
+    assert told('unpin') == {'pinned': None}
+    assert told('rollback') == {'active': ids[0]}
+    assert told('use', 'go2_patrol@2') == {'active': ids[1], 'pinned': ids[1]}
+    assert told('report', '--failures', 0) == {'policy': ids[1], 'rolled_back': False, 'active': ids[1]}
+    assert told('report', '--failures', 100, code=1) == {'policy': ids[1], 'rolled_back': True, 'active': ids[0]}
