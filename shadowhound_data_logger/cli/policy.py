@@ -564,7 +564,8 @@ def _registry() -> MlflowRegistry:
 
 def _told(result: SyncResult) -> dict[str, object]:
     return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms,
-            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew, 'stale': result.stale}  # fmt: skip
+            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew, 'stale': result.stale,
+            'isolation': result.isolation}  # fmt: skip
 
 
 def _sentence(result: SyncResult) -> str:

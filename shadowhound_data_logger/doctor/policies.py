@@ -8,6 +8,7 @@ from typing import Final
 
 from shadowhound_data_logger.doctor.model import Context, Result, ok, warning
 from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.smoke import SANDBOX
 from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 
 NAME: Final = 'policies'
@@ -26,4 +27,11 @@ def check(context: Context) -> Iterator[Result]:
             'shadowhound-data policy sync ; shadowhound-data doctor --only clock',
         )
     else:
-        yield ok(NAME, f'what signers say is fresh; active is {folder.current() or "no policy"}')
+        yield ok(NAME, f'the signed lists are fresh; active is {folder.current() or "no policy"}')
+    if (active := folder.current()) and (tried := folder.state().verified.get(active)) != SANDBOX:
+        yield warning(
+            'policies.isolation',
+            f'{active} was tried in {tried or "an unknown isolation"}, not in a sandbox',
+            'bubblewrap is missing or may not create namespaces here, and policy run was started with --isolation limits',
+            'sudo apt install bubblewrap ; shadowhound-data policy sync --isolation sandbox',
+        )

@@ -77,6 +77,8 @@ class SyncResult:
     """Files of which what had arrived was thrown away: it was damaged, or the object changed meanwhile."""
     stale: str = ''
     """Why no new version is taken now; empty where one would be."""
+    isolation: str | None = None
+    """In which the active version was tried (``smoke.ISOLATIONS``)."""
 
 
 @dataclass(slots=True)
@@ -109,11 +111,14 @@ class PolicySync:
             if isinstance(listing, trust.Trust):
                 if self.folder.withdraw(self._withdrawn(listing)):
                     log.warning('no signer lists the policy that was active any longer; active is %s', self.folder.current())
-                    return SyncResult('', self.folder.current(), 'withdrawn')
+                    return self._finished(SyncResult('', self.folder.current(), 'withdrawn'))
                 if why := trust.why_stale(self.folder.path, self.wall_ns()):
                     listing = PolicyRefused('clock', why)
             result = self._followed(listing, traffic, again=again)
-            return result if isinstance(listing, trust.Trust) else replace(result, stale=f'{listing}')
+            return self._finished(result if isinstance(listing, trust.Trust) else replace(result, stale=f'{listing}'))
+
+    def _finished(self, result: SyncResult) -> SyncResult:
+        return replace(result, isolation=self.folder.state().verified.get(result.active) if result.active else None)
 
     def _listing(self, traffic: _Traffic) -> trust.Trust | DataLoggerError:
         """What signers list, or why that cannot be verified: then no new version is taken."""

@@ -405,7 +405,7 @@ def test_a_pinned_version_waits_for_the_end_of_a_mission_too(second: Scene) -> N
     with second.folder.changing() as state:
         state.pin = first
     second.robot.may_activate = lambda: False
-    assert second.robot.run() == sync.SyncResult(first, later, 'waiting')
+    assert second.robot.run() == sync.SyncResult(first, later, 'waiting', isolation='sandbox')
     assert second.folder.current() == later
     second.robot.may_activate = lambda: True
     assert second.robot.run().active == first

@@ -219,7 +219,8 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     scene.robot.settings = replace(scene.robot.settings, isolation=LIMITS)
     assert scene.robot.run().active == first
     second = scene.publish(2)
-    assert scene.robot.run().active == second
+    result = scene.robot.run()
+    assert (result.active, result.isolation) == (second, LIMITS)
     assert scene.folder.state().verified == {first: LIMITS, second: LIMITS}
 
     scene.robot.settings = replace(scene.robot.settings, isolation=SANDBOX)
@@ -232,7 +233,8 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
         scene.robot.run()
     assert scene.folder.current() == second
     possible = SANDBOX
-    assert scene.robot.run().active == first
+    result = scene.robot.run()
+    assert (result.active, result.isolation) == (first, SANDBOX)
     assert scene.folder.state().verified == {second: LIMITS, first: SANDBOX}
     assert runs == ['incoming', 'incoming', 'incoming', 'versions', 'versions']
 
