@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +37,7 @@ from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, visible
 
 if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.bucket import Bucket
     from shadowhound_data_logger.lake.labels import Label
 
 SHOWN: Final = 100
@@ -129,6 +130,8 @@ def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCod
 
         left_out, source = quietly(), default_source(the_store_settings())
         found = labels.read(source, robot, label=name, findings=left_out)
+        if not found:
+            _check(source, labels.read(source, None, findings=quietly()), robots={robot}, labels={name})
     if as_json:
         print_json([asdict(each) for each in found])
         return tell_left_out(left_out)
@@ -158,7 +161,7 @@ _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', '
 def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by: str | None, as_json: bool) -> ExitCode:
     """Remove labels, by their ids or all of a name.
 
-    A layer says so; what was said before stays in the store. Exit code 1 when an id is not there.
+    A layer records the removal; what was labeled before stays in the store. Exit code 1 if some of the ids do not exist.
     """
     if bool(ids) == bool(name):
         raise BadUsage('give either ids or --label', 'shadowhound-data label list')
@@ -166,9 +169,11 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
-        left_out = quietly()
-        standing = labels.read(default_source(the_store_settings()), robot, label=name, findings=left_out)
-    found = [each for each in standing if name or each.id in ids]
+        left_out, source = quietly(), default_source(the_store_settings())
+        standing = labels.read(source, robot, label=name, findings=left_out)
+        found = [each for each in standing if name or each.id in ids]
+        if not found:
+            _check(source, labels.read(source, None, findings=quietly()), robots={robot}, labels={name}, ids=ids)
     unknown = sorted(set(ids) - {each.id for each in found})
     with the_store() as store:
         keys = [labels.write(store, of, some, by=by or _me(), is_removal=True) for of, some in labels.by_robot(found)]
@@ -185,9 +190,10 @@ def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
     from shadowhound_data_logger.lake import labels  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
-    left_out = quietly()
+    left_out, source = quietly(), default_source(the_store_settings())
     with asking():
-        kept, absent = labels.timed(default_source(the_store_settings()), found, left_out)
+        _check(source, (), robots={each.robot for each in found})
+        kept, absent = labels.timed(source, found, left_out)
         checked = [each.checked() for each in kept]
         with the_store() as store:
             keys = [labels.write(store, robot, some, by=by or _me()) for robot, some in labels.by_robot(checked)]
@@ -197,6 +203,17 @@ def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
         print_lines(f'{counted(len(checked), "label")} added, in {counted(len(keys), "layer")}.',
                     *(f'{visible(key)} is not in the catalogue.' for key in absent[:SHOWN]))  # fmt: skip
     return exit_code(finding=absent or tell_left_out(left_out))
+
+
+def _check(source: Bucket, there: Sequence[Label], *, robots: Iterable[str | None], labels: Iterable[str | None] = (),
+           ids: Iterable[str] = ()) -> None:  # fmt: skip
+    """Raises UnknownName for a robot that the store does not have, or for a label or an id that is not among those there are."""
+    from shadowhound_data_logger.lake import live_files, names  # noqa: PLC0415
+
+    known = {'robot': live_files.robots(source), 'label': [each.label for each in there], 'label id': [each.id for each in there]}
+    for what, wanted in (('robot', robots), ('label', labels), ('label id', ids)):
+        for name in filter(None, wanted):
+            names.check_name_of(what, name, known[what])
 
 
 def _me() -> str:

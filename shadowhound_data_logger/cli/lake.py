@@ -159,12 +159,18 @@ def lake_prune(
         now_ns = SystemClock.of_this_machine().wall_ns()
         from shadowhound_data_logger.lake import prune as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
+        from shadowhound_data_logger.lake.names import check_name_of  # noqa: PLC0415
 
         keep = library.keep_rules(rules, now_ns)
         how: dict[str, Any] = {'robot': robot, 'most_bytes': None if most is None else library.size_of(most), 'is_forced': force}
     source, left_out = default_source(the_store_settings()), quietly()
     with progress('looking at what there is') as bar:
         made = library.plan(source, keep, exported=_exported(bar.say), findings=left_out, tell=bar.say, **how)
+    with asking():
+        check_name_of('robot', robot or '', robots(source) if robot else ())
+        for rule in keep:
+            check_name_of('sensor', rule.sensor, made.known_sensors())
     if not as_json:
         print_page(*_planned(made, dry_run=dry_run))
     if dry_run or not (made.going or made.unfinished):
@@ -302,6 +308,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - Daft takes half a second
         from shadowhound_data_logger.lake import verify as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
 
         store = the_store_settings()
         begun_s = time.monotonic()
@@ -310,6 +317,8 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         theirs = library.rows(selecting.fetched(catalogue), left_out, **flags) if catalogue else own
         if not len(theirs) and catalogue:
             raise BadUsage(f'there are no rows in {catalogue}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}')
+        if not len(own) and not catalogue:
+            check_names(default_source(store), left_out, **flags)
         rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
     with closing(open_reader(store)) as target:
         where = target.describe()

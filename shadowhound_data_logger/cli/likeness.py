@@ -49,10 +49,14 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
         from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - Daft takes half a second
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
+        from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
 
         chosen, left_out = open_model(model), quietly()
         with the_store() as store, progress('pictures', of='objects') as bar:
-            found = likeness.embed(store, default_source(the_store_settings()), chosen, findings=left_out, told=bar, **flags)
+            source = default_source(the_store_settings())
+            found = likeness.embed(store, source, chosen, findings=left_out, told=bar, **flags)
+        if not found.pictures:
+            check_names(source, left_out, **flags)
     took_s = time.monotonic() - begun_s
     if as_json:
         print_json({'model': chosen.digest, 'pictures': found.pictures, 'known': found.known, 'made': found.made,

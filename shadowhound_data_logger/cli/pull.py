@@ -53,9 +53,12 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while
         from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
+        from shadowhound_data_logger.lake.names import check_name_of  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
         robot = flags.get('robot') or _only_robot(source)
+        check_name_of('robot', robot, robots(source))
         name = by or lake.requester()
         if not is_name(name):
             raise BadUsage(f'--by {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
@@ -69,6 +72,8 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
             want, asked = _want(source, robot, flags, bag, left_out)
             table, want = _named(lake.known(source, robot, want, left_out), want, asked)
             rows = table.to_pylist()
+            if not rows:
+                _check_names(source, robot, flags, bag, left_out)
             said = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
             if not as_json:
                 click.echo(_found_sentence(said))
@@ -169,6 +174,20 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
     if not want.to_json() and asked.where is None:
         raise BadUsage('nothing says what to ask for', "name a --sensor, a --bag or a time; --bag '*' is all bags")
     return want, asked
+
+
+def _check_names(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, left_out: Any) -> None:
+    """Raises UnknownName for a name that nothing has: neither the catalog nor what the robot keeps."""
+    from shadowhound_data_logger.lake import names  # noqa: PLC0415
+    from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
+
+    kept = lake.known(source, robot, KeptFilter(), left_out)
+    if bag is None:
+        names.check_names(source, left_out, kept, **{**flags, 'robot': robot})
+    elif not {'*', '?'} & {*bag}:
+        prefix = f'{robot}/rosbags/'
+        keys = [key.removeprefix(prefix) for key in kept['key'].to_pylist() if key.startswith(prefix)]
+        names.check_name_of('bag', bag, (key.partition('/')[0] for key in keys))
 
 
 def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]:

@@ -136,7 +136,7 @@ def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | 
 
     ask = functools.partial(lake.sql, sql) if sql else lake.objects
     frame = ask(source, findings=left_out, **flags)
-    with lake.answering():
+    with lake.answering(order or '', {'': frame}):
         frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
         return (frame.limit(limit) if limit else frame).to_arrow()
 

@@ -1,10 +1,13 @@
-"""Whether the names in a question exist: a misspelt one must not look like an answer without objects."""
+"""Whether the names in a query exist: a misspelled one must not look like an answer without objects."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any, Final
+
+import pyarrow as pa
 
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import UnknownName
@@ -15,17 +18,17 @@ from shadowhound_data_logger.lake.live_files import robots
 MOST_NAMED: Final = 10
 """Names in a remedy."""
 SHORT: Final = 3
-"""Of such a name one wrong letter is a third of it, or half."""
+"""In a name of this length one wrong letter is a third of it, or half."""
+_WORD: Final = re.compile(r'[A-Za-z_]\w*', re.ASCII)
 _COLUMNS: Final = ('sensor', 'topic', 'mission_type')
 
 
 def check_name_of(what: str, name: str, known: Iterable[str | None]) -> None:
-    """Raises UnknownName, with the nearest names, for one that is not among the known ones; where none is known, it may exist."""
+    """Raises UnknownName, with the nearest names, for a name that is not among the known ones; if none is known, it may exist."""
     there = sorted({each for each in known if each})
     if not there or name in there:
         return
-    folded = {each.casefold(): each for each in there}
-    near = [folded[each] for each in get_close_matches(name.casefold(), folded, cutoff=0.5 if len(name) <= SHORT else 0.6)]
+    near = nearest(name, there)
     if near:
         remedy = f'is it {" or ".join(map(repr, near))}?'
     else:
@@ -34,10 +37,31 @@ def check_name_of(what: str, name: str, known: Iterable[str | None]) -> None:
     raise UnknownName(f'there is no {what} {name!r}', remedy=remedy, kind=what, name=name, near=near)
 
 
-def check_names(source: Bucket, findings: Findings, **flags: Any) -> None:
-    """Raises UnknownName for the first name in the flags of ``lake.objects`` that nothing in the catalogue has.
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """At most three of the known names, the most similar first; empty if none is similar."""
+    folded = {each.casefold(): each for each in known}
+    cutoff = 0.5 if len(name) <= SHORT else 0.6
+    return [folded[each] for each in get_close_matches(name.casefold(), folded, cutoff=cutoff)]
 
-    It reads the names of all objects of the robot: ask only where there was no answer. Raises StoreError, LakeError.
+
+def misspelled(query: str, error: str, known: Iterable[str]) -> str:
+    """A remedy for SQL that an engine cannot answer: the names nearest to one that the query has and the error quotes, or ''.
+
+    ``known`` are the columns and views. It depends on no engine's wording.
+    """
+    there = set(known)
+    asked = set(_WORD.findall(query)) - there
+    for name in _WORD.findall(error):
+        if name in asked and len(name) > SHORT and (near := nearest(name, there)):
+            return f'is {name!r} {" or ".join(map(repr, near))}?'
+    return ''
+
+
+def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None, **flags: Any) -> None:
+    """Raises UnknownName for the first name in the flags of ``lake.objects`` that nothing in the catalog has.
+
+    ``kept`` are rows of what robots keep: names in them exist as well. It reads the names of all objects of the robot: call it
+    only after an empty answer. Raises StoreError, LakeError.
     """
     from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - Daft takes half a second
 
@@ -50,7 +74,9 @@ def check_names(source: Bucket, findings: Findings, **flags: Any) -> None:
     if columns:
         with query.answering():
             found = query.objects(source, findings=findings, robot=robot).select(*columns).distinct().to_pydict()
-        known: dict[str, list[str | None]] = {name: found[name] for name in columns}
+        known: dict[str, list[str | None]] = {
+            name: [*found[name], *(kept[name].to_pylist() if kept is not None else ())] for name in columns
+        }
         for name in _COLUMNS:
             if name in known and not (name == 'sensor' and flags[name] in DEFAULT_SENSORS):  # one of these may have nothing yet
                 check_name_of(name.replace('_', ' '), flags[name], known[name])

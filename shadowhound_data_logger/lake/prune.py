@@ -28,6 +28,7 @@ import pyarrow.compute as pc
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter
 from shadowhound_data_logger.core.model import ObjectInfo
@@ -206,6 +207,11 @@ class PrunePlan:
     @property
     def going_bytes(self) -> int:
         return sum(each.going_bytes for each in self.sensors.values())
+
+    def known_sensors(self) -> tuple[str, ...]:
+        """What a rule may name: the sensors that have objects, and those that every robot and store may have."""
+        there = [name for name, each in self.sensors.items() if each.objects]
+        return (*there, *DEFAULT_SENSORS, BAGS, EVENTS, MISSIONS) if there else ()
 
     def lets_go(self, why: tuple[str, str] | None) -> bool:
         """Whether an object goes if the rules say so, and this protects it."""

@@ -32,6 +32,7 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.lake.gaps import newest, watermarks
+from shadowhound_data_logger.lake.names import misspelled
 from shadowhound_data_logger.lake.reading import arrow_schema, narrow
 from shadowhound_data_logger.lake.scan import PartGroup, catalogue_rows, planned
 from shadowhound_data_logger.lake.select import Wanted, wanted
@@ -123,9 +124,7 @@ def objects_in_pieces(source: Bucket | None = None, *, findings: Findings | None
         if parts is not None:
             piece.append(parts)
         if piece and (parts is None or sum(entry.size for each in piece for entry in each.entries) > PIECE_BYTES):
-            with answering():
-                frame = _Catalogue(lake.source, asked, lake.findings, piece).read().where(condition)
-            yield frame
+            yield _where(_Catalogue(lake.source, asked, lake.findings, piece), asked, condition)
             piece = []
 
 
@@ -152,31 +151,39 @@ def sql(query: str, source: Bucket | None = None, *, findings: Findings | None =
         views['forgotten'] = _forgotten(chosen, asked)
     if _GAPS.search(query):
         views.update(_gaps(chosen, asked))
-    with answering():
+    with answering(query, views):
         return daft.sql(query, register_globals=False, **views)
 
 
 def chosen(rows: pa.Table, where: str) -> pa.Table:
     """The rows for which a condition holds. Raises LakeError for what is not SQL or names no column."""
-    with answering():
-        return daft.from_arrow(rows).where(daft.sql_expr(where)).to_arrow()
+    frame = daft.from_arrow(rows)
+    with answering(where, {'': frame}):
+        return frame.where(daft.sql_expr(where)).to_arrow()
 
 
 @contextmanager
-def answering() -> Iterator[None]:
-    """What Daft cannot make sense of is a LakeError; use it around what computes a frame, too."""
+def answering(query: str = '', views: Mapping[str, DataFrame] | None = None) -> Iterator[None]:
+    """Raises LakeError for what Daft cannot answer, with the nearest names in the views; use it around computing a frame, too."""
     try:
         yield
     except Exception as error:  # Daft's error for SQL has no name that could be imported
         if type(error).__module__ != 'daft.exceptions':
             raise
-        raise LakeError(f'the query cannot be answered: {" ".join(str(error).split())}') from error
+        text, views = ' '.join(str(error).split()), views or {}
+        known = {*filter(None, views), *(name for view in views.values() for name in view.column_names)}
+        raise LakeError(f'the query cannot be answered: {text}', remedy=misspelled(query, text, known)) from error
 
 
 def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
     asked, condition = _understood(lake, asked)
-    with answering():
-        return _Catalogue(lake.source, asked, lake.findings).read().where(condition)
+    return _where(_Catalogue(lake.source, asked, lake.findings), asked, condition)
+
+
+def _where(catalog: _Catalogue, asked: Wanted, condition: Expression) -> DataFrame:
+    rows = catalog.read()
+    with answering(asked.where or '', {'': rows}):
+        return rows.where(condition)
 
 
 def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, Expression]:

@@ -90,8 +90,38 @@ def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Pat
                         (LAST, ['mug', 'person'])]  # fmt: skip
     assert told(home, 'query', '--where', 's.a >= 0', '--label', 'first')['objects'] == 1
     assert told(home, 'label', 'remove', '--label', 'mug')['removed'] == 1
-    assert run(home, 'label', 'remove', 'none').return_value == 1
+    (first,) = (each['id'] for each in told(home, 'label', 'list', '--label', 'first'))
+    assert run(home, 'label', 'remove', first, 'none').return_value == 1
+    assert told(home, 'label', 'import', str(table))['added'] == 1
     assert [each['label'] for each in told(home, 'label', 'list')] == ['first', 'high', 'person']
+
+
+@pytest.mark.parametrize(('arguments', 'what', 'remedy'), [
+    (['add', 'x', '--robot', 'thro', '--since', '2026-10-28T12:00', '--until', '2026-10-28T12:01'], 'robot', "is it 'thor'?"),
+    (['list', '--label', 'stiars'], 'label', "is it 'stairs'?"), (['list', '--robot', 'thro'], 'robot', "is it 'thor'?"),
+    (['remove', '--label', 'stiars'], 'label', "is it 'stairs'?"), (['remove', '0000000000000000'], 'label id', 'there are '),
+])  # fmt: skip
+def test_a_label_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], what: str, remedy: str) -> None:
+    """The nearest names are suggested, and nothing is written."""
+    ends = ('--robot', 'thor', '--since', '2026-10-28T12:00', '--until', '2026-10-28T12:01')
+    (given,) = told(home, 'label', 'add', 'stairs', *ends)['ids']
+    with pytest.raises(BadUsage, match=f'there is no {what} ') as raised:
+        run(home, 'label', *arguments)
+    assert raised.value.remedy.startswith(remedy)
+    assert [each['id'] for each in told(home, 'label', 'list', '--label', 'stairs')] == [given]
+    assert told(home, 'label', 'remove', given)['removed'] == 1
+
+
+@pytest.mark.parametrize(('where', 'remedy'), [
+    ('s.aa > 1', "is it 'a'?"), ('z.a > 1', 'there are s'), ('s.a > 1 and s.aa > 1', "is it 'a'?"),
+    ('max(s.aa) > 1 or s.aa < 0', "is it 'a'?"),
+])  # fmt: skip
+def test_a_field_that_nothing_has_is_wrong_usage(tmp_path: Path, where: str, remedy: str) -> None:
+    """Wherever in the condition it is."""
+    filled(tmp_path, BATCHES, [True] * 10)
+    with pytest.raises(BadUsage) as raised:
+        run(tmp_path, 'query', '--where', where)
+    assert raised.value.remedy.startswith(remedy)
 
 
 def test_words_are_found_with_the_labels_of_their_time(home: Path) -> None:

@@ -11,6 +11,7 @@ from lake.gap_parts import IMU, lost, mark, tell
 from lake.making import NOON_NS, fill, folder_store
 from PIL import Image
 
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.label import label
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.formats.rows.gaps import GAP, statement
@@ -89,6 +90,18 @@ def test_prune_says_what_goes_and_asks_before_all_of_a_sensor_does(home: Path) -
     assert json.loads(ended(home, *rules, '--force', '--yes', '--json').output)['deleted'] == 2
     assert (run(home, 'prune', '--keep', 'camera').exit_code, run(home, *rules, '--max-bytes', 'much').exit_code) == (2, 2)
     assert ended(home, *rules, '--max-bytes', '1', '--dry-run').return_value == 1
+
+
+@pytest.mark.parametrize(('arguments', 'remedy'), [
+    (['--keep', 'camra 1d'], "is it 'camera' or 'camera_info'?"), (['--keep', 'odom 30d, bagz 1d'], "is it 'bags'?"),
+    (['--keep', 'camera 1d', '--robot', 'thro'], "is it 'thor'?"),
+])  # fmt: skip
+def test_prune_takes_a_name_that_nothing_has_for_wrong_usage(home: Path, arguments: list[str], remedy: str) -> None:
+    """Nothing is deleted then, with --yes either; the nearest names are suggested."""
+    found = ended(home, 'prune', *arguments, '--yes')
+    assert isinstance(found.exception, BadUsage)
+    assert found.exception.remedy == remedy
+    assert json.loads(ended(home, 'prune', '--keep', 'camera 1d', '--dry-run', '--json').output)['going'] == 96
 
 
 def test_bad_usage(home: Path) -> None:

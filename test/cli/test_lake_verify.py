@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
 
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
@@ -114,6 +115,16 @@ def test_the_catalogue_of_another_store_counts_as_well(home: Path, tmp_path: Pat
     text = run(home, '--catalogue', str(old)).stdout
     assert '5 are not as the catalogue says' in text
     assert 'lake reindex' in text
+
+
+@pytest.mark.parametrize(('arguments', 'remedy'), [
+    (['--sensor', 'camra'], "is it 'camera'?"), (['--robot', 'thro'], "is it 'thor'?"),
+])  # fmt: skip
+def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], remedy: str) -> None:
+    """Instead of nothing verified; the nearest names are suggested."""
+    found = run(home, *arguments)
+    assert isinstance(found.exception, BadUsage)
+    assert found.exception.remedy == remedy
 
 
 def test_nothing_to_verify_is_no_success(home: Path) -> None:

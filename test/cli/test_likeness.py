@@ -14,7 +14,7 @@ from lake.image_pairs import make_pair
 from lake.making import NOON_NS, add, add_part, folder_store, row
 from PIL import Image
 
-from shadowhound_data_logger.cli.common import ExitCode
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode
 from shadowhound_data_logger.cli.likeness import lake_embed
 from shadowhound_data_logger.cli.query import query
 from shadowhound_data_logger.core.clock import SECOND
@@ -64,6 +64,13 @@ def test_embed_then_ask(home: Path) -> None:
     table = run(home, 'query', *asked_with)
     assert '1.000  2026-10-28 12:00:01  camera' in table.output
     assert (home / 'sheet.jpg').stat().st_size > 1000
+
+
+def test_a_sensor_that_does_not_exist_is_wrong_usage(home: Path) -> None:
+    """The nearest names are suggested."""
+    found = run(home, 'embed', '--sensor', 'camra')
+    assert isinstance(found.exception, BadUsage)
+    assert found.exception.remedy == "is it 'camera'?"
 
 
 def test_without_a_model(home: Path) -> None:

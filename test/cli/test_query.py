@@ -136,7 +136,14 @@ def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
      (['--sensor', 'zzz'], "no sensor 'zzz'", 'there are camera, odom'),
      (['SELECT count(*) FROM objects', '--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'"),
      (['--where', 'camra.x > 1'], "no sensor 'camra'", "is it 'camera'"),
-     (['--where', 'no_column > 1'], 'cannot be answered', 'examples')],
+     (['--where', 'zzzz > 1'], 'cannot be answered', 'examples'),
+     (['--where', 'batery_pct < 30'], 'cannot be answered', "is 'batery_pct' 'battery_pct'?"),
+     (['--where', "sensr = 'camera' and bytes > 1"], 'cannot be answered', "is 'sensr' 'sensor'"),
+     (['--order', 't_strt'], 'cannot be answered', "is 't_strt' 't_start'"),
+     (['SELECT sensr FROM objects'], 'cannot be answered', "is 'sensr' 'sensor'"),
+     (['SELECT o.t_strt FROM objects o ORDER BY sensor'], 'cannot be answered', "is 't_strt' 't_start'"),
+     (['SELECT * FROM objcts'], 'cannot be answered', "is 'objcts' 'objects'?"),
+     (['SELECT mission_tipe FROM missions'], 'cannot be answered', "is 'mission_tipe' 'mission_type'")],
 )  # fmt: skip
 def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str], what: str, remedy: str) -> None:
     """Exit code 2 and the nearest names; where none is known of a kind, any may exist."""

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger.bags.kept import KeptCut
+from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pull import _sentence
 from shadowhound_data_logger.core import metadata_words as words
@@ -194,10 +195,11 @@ def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: P
     spans = [{'robot': 'thor', 'since_ns': NOON_NS + at * SECOND, 'until_ns': NOON_NS + at * SECOND + 1} for at in (1, 5)]
     ranges.write_text(json.dumps(spans))
     seen = Label(robot='thor', label='door', since_ns=NOON_NS + 6 * SECOND, until_ns=NOON_NS + 7 * SECOND).checked()
-    labels.write(field.store, 'thor', [seen], by='x')
+    early = Label(robot='thor', label='early', since_ns=NOON_NS - 7 * SECOND, until_ns=NOON_NS - 6 * SECOND).checked()
+    labels.write(field.store, 'thor', [seen, early], by='x')
     none = run('pull', '--sensor', 'camera', '--where', 'x > 100')
     assert (none['objects'], none['id']) == (0, None)
-    assert run('pull', '--sensor', 'camera', '--label', 'nothing', '--dry-run')['objects'] == 0
+    assert run('pull', '--sensor', 'camera', '--label', 'early', '--dry-run')['objects'] == 0
     assert run('pull', '--sensor', 'camera', '--label', 'door', '--where', 'x < 7', '--dry-run')['objects'] == 1
     assert run('pull', '--sensor', 'camera', '--ranges', str(ranges))['objects'] == 2
     field.passes()
@@ -218,6 +220,32 @@ def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ..
     field.records(1)
     done = CliRunner().invoke(cli, ['pull', *arguments], standalone_mode=False)
     assert done.exception is not None
+    assert run('pull', '--list') == []
+
+
+@pytest.mark.parametrize(('arguments', 'what', 'remedy'), [
+    (['--robot', 'thro', '--sensor', 'camera'], "no robot 'thro'", "is it 'thor'?"),
+    (['--sensor', 'camra'], "no sensor 'camra'", "is it 'camera'?"),
+    (['--sensor', 'camera', '--mission-type', 'patrl'], "no mission type 'patrl'", "is it 'patrol'?"),
+    (['--bag', 'patrl_20251018'], "no bag 'patrl_20251018'", "is it 'patrol_20251018'?"),
+    (['--sensor', 'thermal', '--until', '2025-10-18'], '', ''), (['--bag', 'patrl_*'], '', ''),
+])  # fmt: skip
+def test_a_name_that_nothing_has_is_wrong_usage(field: Field, arguments: list[str], what: str, remedy: str) -> None:
+    """The nearest names are suggested; what the robot keeps and the catalog does not know exists as well."""
+    field.records(1)
+    item = make('thor/thermal/20251018/000000_x.jpg', t_start_ns=NOON_NS, t_end_ns=NOON_NS, sensor='thermal', topic='/thermal',
+                metadata={words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST, words.MISSION_TYPE: 'patrol'})  # fmt: skip
+    slice_ = make('thor/rosbags/patrol_20251018/0.mcap', t_start_ns=NOON_NS, t_end_ns=NOON_NS, sensor='bag', topic=None,
+                  metadata={words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST})  # fmt: skip
+    receive(field.spool, 2)
+    field.spool.commit([item, slice_])
+    field.passes()
+    done = CliRunner().invoke(cli, ['pull', *arguments], standalone_mode=False)
+    if not what:
+        assert (done.exception, done.return_value) == (None, 0)
+        return
+    assert isinstance(done.exception, BadUsage), done.exception
+    assert (what in done.exception.message, remedy) == (True, done.exception.remedy)
     assert run('pull', '--list') == []
 
 
