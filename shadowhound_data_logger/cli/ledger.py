@@ -26,6 +26,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
@@ -190,6 +191,8 @@ def notes(found: Mapping[str, Any]) -> list[str]:
         lines += [f'{topic}: {name} by {_listed(row[name])}' for name in ('rejected', 'dropped') if row[name]]
         if row.get('corrected'):
             lines.append(f'{topic}: of the stored messages, corrected: {_listed(row["corrected"])}')
+        if row.get('stamps'):
+            lines.append(f'{topic}: {describe(row["stamps"])}')
         if row.get('by_arrival'):
             lines.append(f'{topic}: dated by arrival, not by the message: {_listed(row["by_arrival"])}')
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}

@@ -12,10 +12,11 @@ listed in docs/formats.md:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, SECOND, Clock
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, SECOND, Clock, iso
 
 DAY_NS: Final = 24 * 3600 * SECOND
 UNSET, TOO_OLD, AHEAD, ERRATIC, STUCK = 'before_2024', 'too_old', 'ahead', 'erratic', 'stuck'
@@ -32,6 +33,8 @@ RECENT: Final = 50
 """The messages by which a publisher's stamps are judged as erratic."""
 MAX_DOUBTED, FEW_DOUBTED = RECENT // 5, RECENT // 10
 """Of these: with more that do not fit the offset none is trusted, with at most this few they are trusted again."""
+HEARD_NS: Final = 60 * SECOND
+"""Publishers that were silent for longer than this before the topic's newest message are not reported."""
 MAX_PUBLISHERS: Final = 64
 """Publishers of a topic that are followed; the one that came first gives way."""
 SMOOTHING: Final = 32
@@ -93,8 +96,8 @@ class StampTrack:
     """
 
     __slots__ = (
-        '_advanced_ns', '_agreeing', '_candidate_ns', '_doubted', '_is_erratic', '_newest_ns', '_rule', 'offset_ns', 'refused',
-        'sent_offset_ns', 'since_ns', 'spread_ns',
+        '_advanced_ns', '_agreeing', '_candidate_ns', '_doubted', '_is_erratic', '_newest_ns', '_rule', 'messages', 'offset_ns',
+        'received_ns', 'refused', 'sent_offset_ns', 'since_ns', 'spread_ns',
     )  # fmt: skip
 
     def __init__(self, rule: StampRule) -> None:
@@ -105,6 +108,10 @@ class StampTrack:
         """How far messages are from that, on average."""
         self.sent_offset_ns: int | None = None
         """Received minus the time of sending, which tells late stamps from a wrong clock; None if it is unknown."""
+        self.messages = 0
+        """How many were judged: a latched one alone says nothing about a clock."""
+        self.received_ns = 0
+        """When the newest message arrived."""
         self.since_ns = 0
         """When the present state began, by the arrival."""
         self.refused = ''
@@ -124,6 +131,16 @@ class StampTrack:
         return OFFSET if self.is_apart else STABLE
 
     @property
+    def cause(self) -> str:
+        """Why the state probably is what it is: a key of ``CAUSES``; empty if it is stable."""
+        if (state := self.state) != OFFSET:
+            return {UNSET: 'sim_time', TOO_OLD: 'replay', AHEAD: 'replay', STABLE: ''}.get(state, state)
+        assert self.offset_ns is not None
+        if self.sent_offset_ns is not None and abs(self.sent_offset_ns - self.offset_ns) <= SAME_NS:
+            return 'clock'
+        return 'late' if self.offset_ns > 0 else 'early'
+
+    @property
     def is_apart(self) -> bool:
         """Whether the offset is more than a second."""
         return self.offset_ns is not None and abs(self.offset_ns) > SAME_NS
@@ -133,6 +150,8 @@ class StampTrack:
         dated = self._rule.date(header_ns, source_ns, received_ns)
         if received_ns < EARLIEST_SANE_NS:
             return dated
+        self.messages += 1
+        self.received_ns = received_ns
         if source_ns >= EARLIEST_SANE_NS:
             sent_ns, before_ns = received_ns - source_ns, self.sent_offset_ns
             self.sent_offset_ns = sent_ns if before_ns is None else before_ns + (sent_ns - before_ns) // SMOOTHING
@@ -177,6 +196,46 @@ class StampTrack:
         return offset_ns > known_ns and stamp_ns > self._newest_ns  # late, but in order: a queue that was held up
 
 
+class StampReport(NamedTuple):
+    """What is wrong with the stamps of a publisher, or unusual; the field names are those of ``status --json``."""
+
+    publisher: str | None
+    state: str
+    """As of ``StampTrack.state``; never ``stable``."""
+    offset_s: float | None
+    """Received minus stamp: positive where stamps are older than the arrival. None if no stamp was within the bound."""
+    spread_s: float
+    since_ns: int
+    """By the arrival."""
+    cause: str
+    """The likely one, of ``CAUSES``."""
+
+
+CAUSES: Final = {
+    'clock': 'the clock of the computer that publishes it is not synchronized with this one',
+    'late': 'the driver stamps its messages late, or publishes them late',
+    'early': 'the driver stamps its messages ahead of the time at which it sends them',
+    'erratic': 'the driver mixes clocks, or several publishers share a name that cannot be told apart',
+    'stuck': 'the driver repeats a stamp: its source stands still, or it forgets to set the stamp',
+    'sim_time': 'use_sim_time without a simulation, or a clock that was never set',
+    'replay': 'a bag that is replayed, or a clock that is more than a day off',
+}
+
+
+def describe(report: Mapping[str, Any]) -> str:
+    """What is said of a report, after the names of the topics: ``... stamps are 146.0 s older than their arrival since ...``."""
+    offset_s, since = report['offset_s'], iso(report['since_ns'])
+    if report['state'] == OFFSET:
+        what = f'stamps are {abs(offset_s):,.1f} s {"older" if offset_s > 0 else "newer"} than their arrival since {since}'
+    else:
+        what = {
+            ERRATIC: 'stamps jump back and forth', STUCK: 'stamps do not advance', UNSET: 'stamps are before 2024',
+            TOO_OLD: 'stamps are too old to be trusted', AHEAD: 'stamps are too far in the future to be trusted',
+        }.get(report['state'], f'stamps are {report["state"]}')  # fmt: skip
+        what += f' since {since}, messages are dated by their arrival'
+    return f'{what}: {CAUSES.get(report["cause"], "the cause is unknown")}'
+
+
 class StampTracks:
     """The publishers of one topic. Lifecycle as ``StampTrack``."""
 
@@ -193,6 +252,16 @@ class StampTracks:
             track = self._tracks[publisher] = StampTrack(self._rule)
         return track
 
-    def known(self) -> list[tuple[str | None, StampTrack]]:
-        """All that are followed, those of ended publishers too."""
-        return list(self._tracks.items())
+    def report(self) -> StampReport | None:
+        """The publisher with the worst stamps among those heard in the last minute; None if all are stable."""
+        newest_ns = max((track.received_ns for track in self._tracks.values()), default=0)
+        found = [
+            (track.refused != '', abs(track.offset_ns or 0), publisher or '', track.state, track)
+            for publisher, track in self._tracks.items()
+            if track.messages >= CONFIRMING and track.state != STABLE and newest_ns - track.received_ns < HEARD_NS
+        ]  # fmt: skip
+        if not found:
+            return None
+        *_, publisher, state, track = max(found, key=lambda each: each[:3])
+        offset_s = None if track.offset_ns is None else round(track.offset_ns / SECOND, 3)
+        return StampReport(publisher or None, state, offset_s, round(track.spread_ns / SECOND, 3), track.since_ns, track.cause)

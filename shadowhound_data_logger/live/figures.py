@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, Clock, utc
 from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
 from shadowhound_data_logger.spool.status import read as read_status
@@ -114,6 +115,7 @@ def _row(topic: str, account: Mapping[str, Any], live: Mapping[str, Any]) -> dic
         **{name: account.get(name) for name in ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')},
         'lost': sum(sum(account.get(name, {}).values()) for name in ('rejected', 'dropped')),
         'pending': account.get('stored_in', {}).get('pending', 0),
+        'stamps': describe(live['stamps']) if live.get('stamps') else '',
         **{name: live.get(name) for name in _OF_STATUS},
     }  # fmt: skip
 

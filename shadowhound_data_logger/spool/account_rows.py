@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from shadowhound_data_logger.core.stamps import StampReport
 from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
 
 
@@ -65,6 +66,8 @@ class TopicRow:
     """Messages that were dated by their arrival, by the reason why their own time was not trusted."""
     corrected: Mapping[str, int] = field(default_factory=dict)
     """Stored messages that had to be corrected, by what was wrong with them."""
+    stamps: StampReport | None = None
+    """What was unusual about the stamps of its publishers in the end."""
 
     @property
     def open(self) -> int:
@@ -103,6 +106,8 @@ class Totals:
     """As of ``TopicRow``."""
     corrected: Mapping[str, int] = field(default_factory=dict)
     """As of ``TopicRow``."""
+    stamps: Mapping[str, Any] | None = None
+    """What is unusual about the stamps of its publishers now (``StampReport``)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Mapping
+from typing import Any
 
+from shadowhound_data_logger.core.stamps import StampReport
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table
@@ -63,9 +65,10 @@ class AccountTable(Table):
     def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
         self._db.executemany(
-            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
+            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
-              _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected), row.last_kept_ns,
+              _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected),
+              _json(row.stamps._asdict() if row.stamps else {}), row.last_kept_ns,
               row.first_ns, row.heard_ns, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self._db.executemany(
@@ -100,14 +103,14 @@ class AccountTable(Table):
         where, values = ('WHERE session = ?', (session,)) if session is not None else _continued_by(robot)
         columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped, ifnull(estimated, 0),'
                    " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns, by_arrival,"
-                   ' corrected')  # fmt: skip
+                   ' corrected, stamps')  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
                      estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns,
-                     json.loads(by_arrival), json.loads(corrected))
+                     json.loads(by_arrival), json.loads(corrected), _stamps(stamps))
             for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
-            first_ns, heard_ns, complete_ns, by_arrival, corrected in self._db.execute(query, values)
+            first_ns, heard_ns, complete_ns, by_arrival, corrected, stamps in self._db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self, *, robot: str | None = None) -> list[PublisherRow]:
@@ -143,6 +146,12 @@ def _continued_by(robot: str | None) -> tuple[str, tuple[str | int, ...]]:
     return "WHERE topic GLOB '/*' OR session IN (SELECT id FROM sessions WHERE robot = ?)", (robot,)
 
 
-def _json(by_reason: Mapping[str, int]) -> str:
+def _stamps(text: str) -> StampReport | None:
+    """None for a report of another shape: it is information, and no reason to refuse an account."""
+    found = json.loads(text)
+    return StampReport(**found) if found.keys() == set(StampReport._fields) else None
+
+
+def _json(by_reason: Mapping[str, Any]) -> str:
     """Nearly all are empty."""
     return json.dumps(by_reason) if by_reason else '{}'

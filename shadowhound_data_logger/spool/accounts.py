@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
+from shadowhound_data_logger.core.stamps import StampReport
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
@@ -82,6 +83,8 @@ class TopicAccount:
     dropped: Counter[str] = field(default_factory=Counter)
     by_arrival: Counter[str] = field(default_factory=Counter)
     """Messages whose stamp or time of sending was replaced by their arrival, by reason (``stamps``)."""
+    stamps: StampReport | None = None
+    """What is unusual about the stamps of its publishers now; None if they are all near the arrival."""
     corrected: Counter[str] = field(default_factory=Counter)
     """Messages in objects that had to be corrected, by what was wrong with them (``encode/payload``)."""
     publishers: dict[str, Span] = field(default_factory=dict)
@@ -612,7 +615,7 @@ class Accounts:
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
             dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
             account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, heard_ns,
-            account.complete_ns, dict(account.by_arrival), dict(account.corrected),
+            account.complete_ns, dict(account.by_arrival), dict(account.corrected), account.stamps,
         )  # fmt: skip
 
 
@@ -628,4 +631,5 @@ def _totals(account: TopicAccount) -> Totals:
         account.rejected[WRONG_TYPE],
         {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
         dict(missed_by), account.gaps.count, dict(account.by_arrival), dict(account.corrected),
+        account.stamps and account.stamps._asdict(),
     )  # fmt: skip

@@ -156,6 +156,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         'skipped': sum(row.skipped for row in rows),
         'by_arrival': _sum(row.by_arrival for row in rows),
         'corrected': _sum(row.corrected for row in rows),
+        'stamps': rows[-1].stamps and rows[-1].stamps._asdict() if rows else None,
         'rejected': _sum(row.rejected for row in rows),
         'other_types': _other_types(row for row in others if row.topic == topic),
         'dropped': _sum(row.dropped for row in rows),

@@ -22,7 +22,7 @@ _COUNTS: Final = frozenset({
 """Never negative, and no more than can be counted. Times and sequence numbers are whatever a publisher sends."""
 _MOST: Final = 1 << 53
 _JSON: Final = {
-    'accounts': ('rejected', 'dropped', 'by_arrival', 'corrected'), 'publishers': ('missed',), 'estimates': ('missed',),
+    'accounts': ('rejected', 'dropped', 'by_arrival', 'corrected', 'stamps'), 'publishers': ('missed',), 'estimates': ('missed',),
     'objects': ('metadata',), 'requests': ('wanted', 'gone'),
 }  # fmt: skip
 _MORE: Final = {

@@ -185,6 +185,7 @@ CREATE TABLE accounts (
   dropped TEXT NOT NULL,        -- JSON: messages by reason
   by_arrival TEXT NOT NULL,     -- JSON: messages dated by their arrival, by the reason why their own time was not trusted
   corrected TEXT NOT NULL,      -- JSON: messages stored by the only reading that their data allow, by what was wrong with them
+  stamps TEXT NOT NULL,         -- JSON: what was unusual about its publishers' stamps (core/stamps.py, StampReport); '{}' if nothing
   last_kept_ns INTEGER NOT NULL,
   first_ns INTEGER NOT NULL,
   heard_ns INTEGER NOT NULL,

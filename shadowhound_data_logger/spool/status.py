@@ -17,6 +17,7 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.usage import usage_of
 
@@ -33,6 +34,7 @@ _TOPIC: Final[dict[str, Any]] = {
     'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
     'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
     'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {}, 'corrected': {},
+    'stamps': None,
 }  # fmt: skip
 _SECTIONS: Final[dict[str, dict[str, Any]]] = {
     'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
@@ -191,11 +193,23 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
             yield f'{what} in this session: {_most(lost)}'
     yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
     yield from _by_arrival(found['topics'])
+    yield from stamp_findings(found['topics'])
     yield from _other_types(found)
     yield from _left_out(found)
     yield from _given_up(found['spool'] or {})
     if store['quarantined']:
         yield f'quarantined in this session: {store["quarantined"]:,} objects'
+
+
+def stamp_findings(topics: Mapping[str, Any]) -> Iterator[str]:
+    """A line for all topics whose stamps have the same fault: one computer's clock shows on each of its topics."""
+    groups: dict[tuple[str, str, int], list[str]] = {}
+    for topic, row in topics.items():
+        if report := row.get('stamps'):
+            groups.setdefault((report['state'], report['cause'], round(report['offset_s'] or 0.0)), []).append(topic)
+    for names in groups.values():
+        more = f' and {len(names) - NAMED} more' if len(names) > NAMED else ''
+        yield f'{", ".join(names[:NAMED])}{more}: {describe(topics[names[0]]["stamps"])}'
 
 
 def _by_arrival(topics: Mapping[str, Any]) -> Iterator[str]:

@@ -147,6 +147,14 @@ def test_messages_that_were_dated_by_their_arrival_are_told() -> None:
     assert '/odom: dated by arrival, not by the message: stamp_too_old 1,200, sent_ahead 3' in text
 
 
+def test_a_clock_that_is_off_is_named() -> None:
+    """The ledger says so of the topic, with the likely cause."""
+    stamps = {'publisher': 'p', 'state': 'offset', 'offset_s': -3600.0, 'spread_s': 0.1, 'since_ns': 0, 'cause': 'clock'}
+    text = shown(a_ledger(odom=a_topic(stamps=stamps)), 300)
+    assert '/odom: stamps are 3,600.0 s newer than their arrival since 1970-01-01' in text
+    assert 'the clock of the computer that publishes it is not synchronized' in text
+
+
 def test_what_is_not_delivered_is_said() -> None:
     """Stored messages whose objects are elsewhere than in the store are named with where they are."""
     text = shown(a_ledger(imu=a_topic(stored_in=dict.fromkeys(STATES, 0) | {'delivered': 50, 'pending': 10})))

@@ -32,7 +32,7 @@ def a_topic(**figures: Any) -> dict[str, Any]:
         'unavailable': '', 'rate_hz': 99.84, 'age_s': 0.02, 'received': 1200,
         'stored': 1100, 'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': 0, 'open': 100, 'accounting': 'exact',
         'missed_estimated': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0,
-        'by_arrival': {}, 'corrected': {},
+        'by_arrival': {}, 'corrected': {}, 'stamps': None,
     }  # fmt: skip
     return row | figures
 

@@ -11,7 +11,18 @@ from clocks import NOON_NS as NOW_NS
 from clocks import Clocks
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.core.stamps import CONFIRMING, DAY_NS, RECENT, SAME_NS, Dated, StampRule, StampTrack
+from shadowhound_data_logger.core.stamps import (
+    CONFIRMING,
+    DAY_NS,
+    RECENT,
+    SAME_NS,
+    Dated,
+    StampReport,
+    StampRule,
+    StampTrack,
+    StampTracks,
+    describe,
+)
 
 WEEK_NS = 7 * DAY_NS
 
@@ -169,3 +180,41 @@ def test_sim_time_is_reported_as_what_it_is() -> None:
     track = new_track()
     assert track.date(70 * SECOND, NOW_NS, NOW_NS) == Dated(NOW_NS, 'stamp_before_2024')
     assert track.state == 'before_2024'
+
+
+@pytest.mark.parametrize(('stamp_s', 'sent_s', 'state', 'cause'), [
+    pytest.param(146.0, 146.0, 'offset', 'clock', id='another computer'),
+    pytest.param(-60.0, -60.0, 'offset', 'clock', id='ahead'),
+    pytest.param(146.0, 0.0, 'offset', 'late', id='a driver that stamps late'),
+    pytest.param(-60.0, 0.0, 'offset', 'early', id='a driver that predicts'),
+    pytest.param(2e7, 0.0, 'too_old', 'replay', id='an old bag'),
+    pytest.param(1.7e9, 0.0, 'before_2024', 'sim_time', id='sim time'),
+])  # fmt: skip
+def test_the_likely_cause_is_reported(stamp_s: float, sent_s: float, state: str, cause: str) -> None:
+    """From the time of sending, which the publisher's own clock gives: if it is as far off, that clock is."""
+    clocks = Clocks()
+    clocks.set(NOW_NS)
+    tracks = StampTracks(StampRule(clocks))
+    for number in range(10):
+        at_ns = NOW_NS + number * PERIOD_NS
+        tracks.of('p').date(at_ns - round(stamp_s * SECOND), at_ns - round(sent_s * SECOND), at_ns)
+        tracks.of('q').date(at_ns, at_ns, at_ns)
+    report = tracks.report()
+    assert report is not None
+    assert (report.publisher, report.state, report.cause) == ('p', state, cause)
+    assert report.offset_s == (stamp_s if state == 'offset' else None)
+    assert report.since_ns == NOW_NS
+    assert describe(report._asdict()).startswith('stamps are ')
+
+
+def test_nothing_is_reported_of_stable_and_of_latched_stamps() -> None:
+    """A message that was sent an hour ago says nothing about a clock; nor does a publisher that is silent now."""
+    clocks = Clocks()
+    clocks.set(NOW_NS)
+    tracks = StampTracks(StampRule(clocks))
+    tracks.of('latched').date(NOW_NS - 3600 * SECOND, NOW_NS, NOW_NS)
+    assert tracks.report() is None
+    follow(tracks.of('ended'), [146 * SECOND] * 10)
+    assert isinstance(tracks.report(), StampReport)
+    follow(tracks.of('now'), [MS] * 10, start_ns=NOW_NS + 120 * SECOND)
+    assert tracks.report() is None

@@ -11,8 +11,11 @@ from spool.making import assert_whole, make, put, rows, settle
 
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.stamps import StampReport
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Outcome, Spool
+
+LATE = StampReport('p', 'offset', 146.0, 0.1, 1, 'clock')
 
 
 def run_sql(root: Path, *statements: str) -> None:
@@ -33,6 +36,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
         account.skipped += 3
         account.by_arrival['stamp_too_old'] += 2
         account.corrected['row_step'] += 2
+        account.stamps = LATE
     spool.accounts.reject('/camera', {'truncated': 1})
     spool.accounts.drop('/camera', 'queue_full', 1)
     with spool.accounts.entry('/imu') as account:
@@ -54,7 +58,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'skipped': 3, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                 'gaps': {'missed': {'transport': 2}, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                          'quarantined': {'refused': 1}},
-                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'corrected': {'row_step': 2},
+                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'corrected': {'row_step': 2}, 'stamps': LATE._asdict(),
                 'stored': 3, 'open': 1, 'stored_in': {
                     'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0, 'kept': 0,
                 },
@@ -65,6 +69,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                     'received-only': {'published': None, 'published_estimated': None, 'received': 5, 'missed': None,
                                       'missed_estimated': None, 'missed_by': {}}},
                 'skipped': 0, 'rejected': {}, 'dropped': {}, 'gaps': {}, 'other_types': {}, 'by_arrival': {}, 'corrected': {},
+                'stamps': None,
                 'stored': 0, 'open': 5, 'stored_in': {
                     'delivered': 0, 'pending': 0, 'held': 0, 'evicted': 0, 'quarantined': 0, 'deduplicated': 0, 'kept': 0,
                 },

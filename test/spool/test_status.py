@@ -16,9 +16,10 @@ from typing import Any
 import pytest
 from spool.making import NOON_NS, FakeClock, make, new_spool, put, settle
 
-from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.clock import SECOND, SystemClock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.stamps import CAUSES as OF
 from shadowhound_data_logger.spool.status import file, limits, read, robots
 
 
@@ -156,6 +157,10 @@ def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
 
 MANY = {'/a': {'missed': 1}, '/b': {'missed': 4_000}, '/c': {'missed': 1}, '/d': {'missed': 2}, '/e': {'missed': 0}}
 FORGED = {'/odom': {'by_arrival': {'stamp_too_old': 3, 'sent_ahead': 2}}, '/imu': {'by_arrival': {'stamp_too_old': 4}}}
+SINCE = iso(NOON_NS)
+LATE_CLOCK = {'publisher': None, 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.0, 'since_ns': NOON_NS, 'cause': 'clock'}
+LATE = {topic: {'stamps': LATE_CLOCK} for topic in ('/imu', '/odom')}
+STUCK = {'/odom': {'stamps': {**LATE_CLOCK, 'state': 'stuck', 'cause': 'stuck'}}}
 CAUSES = {'/odom': {'missed': 5, 'missed_by': {'restart': 3, 'transport': 2}}}
 TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected': 1, 'missed': 0}}
 
@@ -171,6 +176,8 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'topics': FORGED}, 'dated by arrival in this session, because of sent_ahead: /odom 2'),
         ({'topics': FORGED}, 'dated by arrival in this session, because of stamp_too_old: /imu 4, /odom 3'),
         ({'topics': MANY}, 'missed in this session: /b 4,000, /d 2, /a 1 and 1 more'),
+        ({'topics': LATE}, f'/imu, /odom: stamps are 146.0 s older than their arrival since {SINCE}: {OF["clock"]}'),
+        ({'topics': STUCK}, f'/odom: stamps do not advance since {SINCE}, messages are dated by their arrival: {OF["stuck"]}'),
         ({'store': {'quarantined': 4}}, 'quarantined in this session: 4 objects'),
         (
             {'spool': {'evicted': 4000}},

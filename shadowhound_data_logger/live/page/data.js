@@ -9,6 +9,7 @@ function state(row) {
   if (row.unavailable) return ['bad', row.unavailable];
   if (row.lost) return ['bad', `${row.lost} messages were rejected or dropped`];
   if (row.missed || row.missed_estimated) return ['watch', `${row.missed ?? row.missed_estimated} messages were missed`];
+  if (row.stamps) return ['watch', row.stamps];
   if (row.publishers === 0) return ['none', 'nobody publishes it now'];
   if (row.age_s !== null && row.age_s > 5 && !row.may_be_silent) return ['watch', `silent for ${span(row.age_s)}`];
   return ['good', MARKS.good[1]];
@@ -45,7 +46,8 @@ export function TopicTable({ figures, now }) {
       <tbody>${rows.map((row) => {
         const [kind, why] = state(row);
         return html`<tr key=${row.topic}><td><${Mark} kind=${kind} why=${why} /></td>
-          <td><b>${row.topic}</b><small>${row.sensor || '–'} · ${row.type.split('/').at(-1)}</small></td>
+          <td><b>${row.topic}</b><small>${row.sensor || '–'} · ${row.type.split('/').at(-1)}</small>
+            ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps">${row.stamps}</small>`}</td>
           ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`;
       })}</tbody></table></div></div>`;
 }

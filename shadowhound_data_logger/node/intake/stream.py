@@ -16,7 +16,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Taken
-from shadowhound_data_logger.core.stamps import StampRule, StampTracks
+from shadowhound_data_logger.core.stamps import StampReport, StampRule, StampTracks
 from shadowhound_data_logger.formats.types import CounterField, MessageTypes, header_stamp_ns
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, hand_on
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -140,6 +140,10 @@ class MessageTimes:
             return known, (dated.refused,) if dated.refused else ()
         return known._replace(source_ns=sent.ns), tuple({sent.refused, dated.refused} - {''})
 
+    def report(self) -> StampReport | None:
+        """What is unusual about the stamps now."""
+        return self._tracks.report()
+
 
 class TopicStream:
     """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
@@ -247,6 +251,7 @@ class SensorStream:
                     except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
                         failed[consumer] = error
                 account.gaps.heard_ns = newest_ns
+                account.stamps = self._times.report()
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
             text = '%s: messages come more often than expected_hz says: their rate is learned instead'

@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
+from shadowhound_data_logger.core.stamps import describe
+
 FULL: Final = 0.8
 """Share of its limit from which on the spool is worth a look."""
 STEPPED_S: Final = 60.0
@@ -94,6 +96,8 @@ def _topic(row: Mapping[str, Any], before: Mapping[str, Any], stall: str) -> tup
         grown.insert(0, f'~{about} missed')
     if grown:
         return WARN, f'{", ".join(grown)} lately'
+    if row['stamps']:
+        return WARN, describe(row['stamps'])
     if row['other_types']:
         return (
             WARN,

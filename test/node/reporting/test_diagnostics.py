@@ -11,12 +11,13 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.node.reporting.diagnostics import ERROR, OK, STALE, WARN, _text, entries
 
 TOPIC = {
     'sensor': 'imu', 'type': 'go2_interfaces/msg/IMU', 'enabled': True, 'publishers': 1, 'rate_hz': 100.0, 'age_s': 0.02,
     'received': 1200, 'stored': 1100, 'skipped': 0, 'rejected': 2, 'dropped': 3, 'missed': 4, 'open': 91, 'accounting': 'exact',
-    'missed_estimated': None, 'other_types': {},
+    'missed_estimated': None, 'other_types': {}, 'stamps': None,
 }  # fmt: skip
 STATUS: dict[str, Any] = {
     'robot': 'thor', 'version': '0.1.0', 'pid': 7, 'uptime_s': 12.3, 'paused': False, 'topics': {'/imu': TOPIC},
@@ -47,6 +48,9 @@ def changed(**values: Any) -> dict[str, Any]:
         else:
             status[section] = value
     return status
+
+
+LATE = {'publisher': 'p', 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.1, 'since_ns': 0, 'cause': 'late'}
 
 
 def told(name: str, **values: Any) -> tuple[Any, str]:
@@ -88,6 +92,8 @@ def test_all_is_fine() -> None:
         ({'stalls': {'/imu': 'silent for 7 s'}, 'topic__publishers': 0}, STALE, 'nobody publishes it'),
         ({'stalls': {'/odom': 'silent for 7 s'}}, OK, '100 Hz'),
         ({'topic__age_s': None}, OK, '100 Hz'),
+        ({'topic__stamps': LATE}, WARN, describe(LATE)),
+        ({'topic__stamps': LATE, 'topic__missed': 6}, WARN, '2 missed lately'),
         ({'topic__other_types': {'B': {}}}, WARN, 'it was published as B too; only go2_interfaces/msg/IMU is logged'),
     ],
 )  # fmt: skip
