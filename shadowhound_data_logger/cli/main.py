@@ -114,8 +114,8 @@ def main() -> None:
     except NO_VERB as error:
         click.echo(error.format_message(), err=True)
         sys.exit(ExitCode.USAGE)
-    except (click.ClickException, DataLoggerError, OSError, sqlite3.Error) as error:
-        is_usage = isinstance(error, (click.ClickException, SettingError, UnknownName))
+    except (click.ClickException, DataLoggerError, OSError, sqlite3.Error, UnicodeEncodeError) as error:
+        is_usage = isinstance(error, (click.ClickException, SettingError, UnknownName, UnicodeEncodeError))
         code = ExitCode.USAGE if is_usage else ExitCode.FINDING
         told = described(error, sys.argv[1:])
         if wants_json(sys.argv[1:]):
@@ -138,6 +138,8 @@ def described(error: Exception, arguments: Sequence[str]) -> tuple[str, str, str
         return verb, error.what, error.remedy or error.DEFAULT_REMEDY
     if isinstance(error, click.ClickException):
         return verb, error.format_message().rstrip('.'), (isinstance(error, BadUsage) and error.remedy) or f'{verb} --help'
+    if isinstance(error, UnicodeEncodeError):  # bytes of an argument that the locale of the shell does not have
+        return verb, f'{error.object!r:.200} is not text', 'is the locale of this shell UTF-8? export LC_ALL=C.UTF-8'
     if isinstance(error, OSError):
         names = ' and '.join(str(name) for name in (error.filename, error.filename2) if name)
         what = error.strerror or str(error)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.core.config import endpoint_url, store_settings
 from shadowhound_data_logger.missions.folder import MISSIONS
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,10 @@ class Replayer:
     """
 
     def __init__(self, home: Path, experiment: str, environ: Mapping[str, str]) -> None:
+        """Raises SettingError for stores of objects and artifacts to which the process could send nothing."""
+        store_settings(environ, home)
+        if artifacts := environ.get('MLFLOW_S3_ENDPOINT_URL'):
+            endpoint_url(artifacts, 'MLFLOW_S3_ENDPOINT_URL')
         self._home = home
         self._experiment = experiment
         self._python = interpreter()

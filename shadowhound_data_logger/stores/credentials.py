@@ -17,7 +17,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from botocore.credentials import Credentials, ReadOnlyCredentials
-from botocore.exceptions import BotoCoreError, CredentialRetrievalError, NoCredentialsError
+from botocore.exceptions import BotoCoreError, CredentialRetrievalError, NoCredentialsError, ProfileNotFound
 from botocore.session import Session
 
 from shadowhound_data_logger.core.config import StoreSettings
@@ -108,13 +108,23 @@ class Keys(Credentials):
 
 
 def has_keys(settings: StoreSettings) -> bool:
-    """Whether there are keys for this store, here or given. Raises SettingError for half a pair."""
+    """Whether there are keys for this store, here or given. Raises SettingError for half a pair, or a profile that is missing."""
     keys = Keys(settings)
     try:
         keys.get_frozen_credentials()
+    except ProfileNotFound as error:
+        raise no_profile(error) from error
     except BotoCoreError:
         return False
     return True
+
+
+def no_profile(error: ProfileNotFound) -> SettingError:
+    """The same for every client."""
+    allowed = (
+        'a profile in ~/.aws/credentials or ~/.aws/config, or in the files of AWS_SHARED_CREDENTIALS_FILE and AWS_CONFIG_FILE'
+    )
+    return SettingError('AWS_PROFILE', error.kwargs['profile'], allowed)
 
 
 class _Provider:

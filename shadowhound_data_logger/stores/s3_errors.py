@@ -117,6 +117,7 @@ _BROKEN: Final = (boto.ConnectionClosedError, boto.ResponseStreamingError, boto.
                   ConnectionResetError)  # fmt: skip
 
 _SILENT: Final[_Row] = (StoreUnavailable, 'Tower at {endpoint} gave no answer for {bucket}/{key}', 'is Tower on, and the WiFi?')
+_PROXY: Final[_Row] = (StoreUnavailable, 'the proxy to {endpoint} cannot be reached', 'add Tower to NO_PROXY')
 _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ...], _Row], ...]] = (
     (_NO_KEYS, (CredentialsRejected, 'there are no credentials for Tower at {endpoint}',
                 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them')),
@@ -125,7 +126,7 @@ _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ..
     (ResponseParserError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
     (boto.SSLError, (StoreUnavailable, 'no TLS connection to Tower at {endpoint}',
                      'does the server speak TLS there? else use http:// in AWS_ENDPOINT_URL')),
-    (boto.ProxyConnectionError, (StoreUnavailable, 'the proxy to {endpoint} cannot be reached', 'add Tower to NO_PROXY')),
+    (boto.ProxyConnectionError, _PROXY),
     (boto.ConnectTimeoutError, (StoreUnavailable, 'no connection to Tower at {endpoint} within {connect_timeout_s:g} s',
                                 'is Tower on, and the WiFi?')),
     (_SLOW, (StoreUnavailable, 'Tower at {endpoint} gave no answer within {read_timeout_s:g} s',
@@ -191,10 +192,10 @@ def refused(code: str, status: int, detail: str, request: Request, *, is_head: b
     return _error(*row, request, code=detail if code.isdigit() else code, status=status, detail=detail)
 
 
-def away(reason: str, request: Request) -> StoreError:
-    """For a request that got no answer, by a client that has only words for why."""
+def away(reason: str, request: Request, *, is_proxied: bool = False) -> StoreError:
+    """For a request that got no answer, by a client whose errors are only text."""
     untrusted = distrust_told(reason, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
-    row = (StoreUntrusted, *untrusted) if untrusted else _SILENT
+    row = (StoreUntrusted, *untrusted) if untrusted else _PROXY if is_proxied else _SILENT
     return _error(*row, request, code='no answer')
 
 

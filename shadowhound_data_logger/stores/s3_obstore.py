@@ -15,6 +15,8 @@ from datetime import timedelta
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+from urllib.parse import urlsplit
+from urllib.request import getproxies, proxy_bypass
 
 import obstore
 from obstore import exceptions as refused
@@ -264,7 +266,8 @@ def _client(settings: StoreSettings, bucket: str) -> Client:
         given['session_token'] = settings.session_token
     if not (settings.access_key_id and settings.secret_access_key):
         given = {'credential_provider': _provider(settings)}
-    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE}
+    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE,
+                    **_proxy(settings.endpoint_url or '')}  # fmt: skip
     if (authorities := _authorities(settings)) is not None:
         options['root_certificate'] = authorities
     return Client(
@@ -285,6 +288,16 @@ def _provider(settings: StoreSettings) -> Any:
         remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
         raise CredentialsRejected(text, remedy=remedy, endpoint=endpoint)
     return Boto3CredentialProvider()
+
+
+def _proxy(endpoint: str) -> dict[str, str]:
+    """The options for the proxy that botocore would use. On its own, obstore reads ALL_PROXY and NO_PROXY by other rules."""
+    url, proxies = urlsplit(endpoint), getproxies()
+    if not proxies:
+        return {}
+    if url.scheme in proxies and not proxy_bypass(url.netloc):
+        return {'proxy_url': proxies[url.scheme]}
+    return {'proxy_url': 'http://localhost', 'proxy_excludes': url.hostname or ''}  # no proxy at all
 
 
 def _authorities(settings: StoreSettings) -> bytes | None:
@@ -335,4 +348,4 @@ def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> S
         return s3_errors.refused('InvalidAccessKeyId', 401, message, request)
     if isinstance(error, (refused.InvalidPathError, ValueError)):
         return ObjectRefused(f'the key {bucket}/{key:.80} is not a path', reason='name', bucket=bucket, key=key)
-    return s3_errors.away(str(error), request)
+    return s3_errors.away(str(error), request, is_proxied=_proxy(endpoint).keys() == {'proxy_url'})

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 
 import botocore
 from botocore.config import Config
-from botocore.exceptions import BotoCoreError, ClientError
+from botocore.exceptions import BotoCoreError, ClientError, ProfileNotFound
 from botocore.handlers import add_expect_header
 from botocore.session import Session
 
@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.stores.bandwidth import Body, Pace
 from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, Part
-from shadowhound_data_logger.stores.credentials import Keys, session_with, trusted
+from shadowhound_data_logger.stores.credentials import Keys, no_profile, session_with, trusted
 from shadowhound_data_logger.stores.s3_errors import REQUEST_ERRORS, Request, classify, code_of, public_url, status_of
 from shadowhound_data_logger.stores.s3_metadata import from_headers, to_headers
 
@@ -339,6 +339,8 @@ def _client(session: Session, settings: StoreSettings, upload: UploadSettings) -
     except ValueError as error:
         endpoint = public_url(settings.endpoint_url or '')
         raise SettingError('AWS_ENDPOINT_URL', endpoint, 'a URL such as http://TOWER_IP:9000') from error
+    except ProfileNotFound as error:
+        raise no_profile(error) from error
     except BotoCoreError as error:
         raise SettingError('the AWS configuration', type(error).__name__, f'one that botocore can read: {error}') from error
     client.meta.events.register_last('before-parameter-build.s3', _follow_no_redirect)

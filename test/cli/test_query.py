@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from lake.making import FAILED, NOON_NS, add, fill, folder_store, row
+from lake.making import FAILED, NOON_NS, add, add_part, fill, folder_store, row
 from PIL import Image
 
 from shadowhound_data_logger.cli.common import BadUsage
@@ -110,6 +110,36 @@ def test_what_is_no_question_is_bad_usage(home: Path, arguments: list[str], says
     found = run(home, *arguments)
     assert found.exit_code == 2
     assert says in found.output
+
+
+@pytest.fixture(scope='module')
+def spoken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One object of a mission whose command and type are not ASCII."""
+    home = tmp_path_factory.mktemp('spoken')
+    told = {'mission_id': 'm', 'mission_type': '巡逻', 'mission_command': '去厨房 café', 'success': True}
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        add(store, home / 'tmp', 'thor/missions/run/summary.json', json.dumps(told).encode())
+        found = {**row('camera', NOON_NS), 'mission_id': 'm', 'run_id': 'run', 'mission_type': '巡逻'}
+        add_part(store, [found], '1', home / 'tmp')
+    return home
+
+
+@pytest.mark.parametrize(('encoding', 'cells'), [
+    ('ascii', rb'\u53bb\u53a8\u623f caf\xe9,\u5de1\u903b'), ('latin-1', b'\\u53bb\\u53a8\\u623f caf\xe9,\\u5de1\\u903b'),
+    ('utf-8', '去厨房 café,巡逻'.encode()),
+])  # fmt: skip
+def test_a_csv_for_a_pipe_that_is_not_utf_8(spoken: Path, encoding: str, cells: bytes) -> None:
+    """What the encoding does not have is escaped; an argument that the locale cannot hold is one line. No traceback."""
+    command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
+    environ = {**os.environ, 'SHADOWHOUND_HOME': str(spoken), 'AWS_ENDPOINT_URL': '', 'PYTHONIOENCODING': encoding,
+               'PYTHONUTF8': '0', 'LC_ALL': 'C'}  # fmt: skip
+    sql = 'SELECT command, mission_type FROM missions'
+    found = subprocess.run([*command, sql, '--format', 'csv'], env=environ, capture_output=True, check=False)
+    assert (found.returncode, found.stderr, found.stdout) == (0, b'', b'command,mission_type\n' + cells + b'\n')
+    found = subprocess.run([*command, '--mission-type', '巡逻'], env=environ, capture_output=True, check=False)
+    assert found.returncode == 2
+    assert b'LC_ALL=C.UTF-8' in found.stderr
+    assert b'Traceback' not in found.stderr
 
 
 @pytest.mark.long('a process of its own')

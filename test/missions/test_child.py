@@ -163,6 +163,21 @@ def test_the_constructor_raises_setting_errors_only(arguments: dict[str, Any]) -
         MissionDataLogger(**arguments)
 
 
+@pytest.mark.parametrize('name', ['AWS_ENDPOINT_URL', 'AWS_ENDPOINT_URL_S3', 'MLFLOW_S3_ENDPOINT_URL'])
+@pytest.mark.parametrize(
+    'value', ['http://tower:9000 ', 'tower:9000', 'http://tower:9000?x=1', 'http://a:b@tower:9000', 'http://t:99999']
+)
+def test_an_endpoint_that_no_client_can_use_is_an_invalid_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str
+) -> None:
+    """By the same rules for objects and for MLflow's artifacts: the sender, which would fail, is not started."""
+    monkeypatch.setattr(child.Replayer, 'start', lambda _: pytest.fail('it is started'))
+    monkeypatch.setenv(name, value)
+    with pytest.raises(SettingError, match=f'^{name} = '):
+        MissionDataLogger(home=tmp_path)
+    MissionDataLogger(home=tmp_path, replay=False).close()
+
+
 def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An absolute home works all the same, a relative one is a setting that cannot be used."""
     gone = tmp_path / 'gone'

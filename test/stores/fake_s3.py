@@ -21,7 +21,7 @@ class FakeS3(ThreadingHTTPServer):
     def __init__(
         self, *, condition: str = 'honoured', answer: tuple[int, bytes] | None = None, without_buckets: bool = False
     ) -> None:
-        super().__init__(('127.0.0.1', 0), _Handler)
+        super().__init__(('127.0.0.1', 0), Handler)
         self.condition = condition
         self.answer = answer
         self.without_buckets = without_buckets
@@ -41,7 +41,11 @@ class FakeS3(ThreadingHTTPServer):
         return f'http://127.0.0.1:{self.server_port}'
 
 
-class _Handler(BaseHTTPRequestHandler):
+class Handler(BaseHTTPRequestHandler):
+    """Answers as S3 does."""
+
+    """Answers as S3 does."""
+
     protocol_version = 'HTTP/1.1'
     server: FakeS3
 

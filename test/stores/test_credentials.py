@@ -15,15 +15,16 @@ from botocore.credentials import InstanceMetadataProvider
 from botocore.exceptions import NoCredentialsError, PartialCredentialsError
 from shadowhound_tower.embedded import Tower
 from stores.asking import SECRET, error_of
-from stores.fake_s3 import FakeS3, error, served
+from stores.fake_s3 import FakeS3, Handler, error, served
 from stores.spooled import Spool
 
-from shadowhound_data_logger.core.config import StoreSettings
-from shadowhound_data_logger.core.errors import CredentialsRejected, SettingError
+from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.errors import CredentialsRejected, ObjectRefused, SettingError
 from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.credentials import REREAD_S, Keys
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES
+from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
 OWN = StoreSettings(endpoint_url='http://127.0.0.1:1')
 
@@ -81,6 +82,31 @@ def test_another_profile(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
     assert '[robot]' in file.path.with_name('config').read_text()
     file.path.with_name('config').write_text(f'[profile robot]\naws_access_key_id=OTHER\naws_secret_access_key={SECRET}\n')
     assert Keys(OWN).get_frozen_credentials().access_key == 'OTHER'
+
+
+@pytest.mark.parametrize('client', [S3Store, ObstoreStore])
+def test_every_client_signs_with_the_same_profile(
+    file: File, monkeypatch: pytest.MonkeyPatch, client: type[S3Store | ObstoreStore]
+) -> None:
+    """And reports in the same words that there is no such profile."""
+    file.write('KEY', SECRET, 'robot')
+    signed: list[str] = []
+    answer = Handler.do_GET
+    monkeypatch.setattr(Handler, 'do_GET', lambda self: (signed.append(self.headers['Authorization']), answer(self)))
+    with served(FakeS3()) as server:
+        for name in ('robot', 'not-there'):
+            monkeypatch.setenv('AWS_PROFILE', name)
+            store = client(StoreSettings(endpoint_url=server.url), UploadSettings())
+            with pytest.raises((ObjectRefused, SettingError)) as raised:
+                (store.open(), store.get('sensor-data', 'a'))
+            store.close()
+            if name == 'robot':
+                assert isinstance(raised.value, ObjectRefused)
+                assert len(signed) == 1
+                assert 'Credential=KEY/' in signed[0]
+            else:
+                assert str(raised.value).startswith("AWS_PROFILE = 'not-there' is refused")
+    assert len(signed) == 1
 
 
 def test_keys_in_the_settings_come_first_and_stay(file: File) -> None:
