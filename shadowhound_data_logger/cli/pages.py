@@ -242,7 +242,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     ('AWS_PROFILE', '`default`', 'The section of that file.'),
     ('HTTP_PROXY', '', 'The proxy for `http://` servers, as for `curl`; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
-    ('NO_PROXY', '', 'Hosts without a proxy, with commas: names, ends of names, `host:port` or `*`; networks (`10.0.0.0/8`) are ignored.'),
+    ('NO_PROXY', '', 'Hosts without a proxy: names, ends of names, `host:port`, `*`; networks such as `10.0.0.0/8` are ignored.'),
     ('AWS_CA_BUNDLE', "the system's", 'Certificate of your own authority, for the S3 server ([TLS](thor.md#tls)).'),
     ('REQUESTS_CA_BUNDLE', '', 'The same, for the S3 server and MLflow.'),
     (
