@@ -99,9 +99,9 @@ def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str
 
 
 class Spooler:
-    """Puts the objects of missions into the spool, and delivers them where no node does.
+    """Puts the objects of missions into the spool; without a node, also delivers them and writes their rows of the catalog.
 
-    Life: New; add and drain any number of times; close once. Opened by the first ``add``; one thread.
+    Lifecycle: New; add and drain any number of times; close once. Opened by the first ``add``; one thread.
     """
 
     def __init__(self, settings: Settings, clock: Clock, *, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -111,7 +111,7 @@ class Spooler:
         self._used_s = 0.0
         self._node_drains = False
         self._is_new = True
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, clock)
+        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, clock, monotonic)
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:
@@ -144,11 +144,15 @@ class Spooler:
 
     @property
     def owes(self) -> bool:
-        """Whether something waits for delivery, as far as that is known, and no node is there to deliver it."""
+        """Whether an object or its row of the catalog waits for delivery, and no node delivers it."""
         try:
-            return not self._node_drains and self.pending() > 0
+            return not self._node_drains and self._has_work()
         except SpoolError:
             return True
+
+    def hasten(self) -> None:
+        """Write the rows of the catalog soon: a mission has ended."""
+        self._catalogue.hasten()
 
     def drain(self) -> None:
         """Deliver for a moment where no node does. Raises StoreError, SettingError or SpoolError when that does not work."""
@@ -157,7 +161,7 @@ class Spooler:
                 self._opened()  # for what an earlier process left
             self._is_new = False
             return
-        if not self.pending():
+        if not self._has_work():
             if self._monotonic() - self._used_s > REST_S:
                 self.close()
             return
@@ -171,6 +175,15 @@ class Spooler:
         if self._spool is not None:
             self._spool.close()
             self._spool = None
+
+    def _has_work(self) -> bool:
+        """Raises SpoolError."""
+        if self.pending():
+            return True
+        if self._spool is None or not self._settings.catalogue.enabled:
+            return False
+        with self._using(self._spool) as spool:
+            return spool.has_uncatalogued()
 
     def _drain(self, spool: Spool) -> None:
         with delivering(spool, self._settings, SLICE_S) as (uploader, writer):

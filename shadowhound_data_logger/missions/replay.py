@@ -120,6 +120,7 @@ class Replay:
         tried = [gate for gate in self.gates.values() if gate.is_open]
         for delivery in self._newest_first():
             if self._work(delivery):
+                self._spooler.hasten()
                 self._settled.add(delivery.folder.mission_id)
                 del self._deliveries[delivery.folder.mission_id]
             if self._progress and self._monotonic() - began_s > SLICE_S:
@@ -160,6 +161,10 @@ class Replay:
     def hurry(self) -> None:
         for gate in self.gates.values():
             gate.hurry()
+
+    def hasten(self) -> None:
+        """The agent is gone: write the last rows of the catalog soon, because no more will come."""
+        self._spooler.hasten()
 
     def close(self) -> None:
         self._spooler.close()
@@ -321,8 +326,10 @@ def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
             worked_s = time.monotonic()
             woken = parent.wait(0.0)
             continue
-        if parent.gone and (not replay.owes or time.monotonic() - worked_s > LINGER_S):
-            return
+        if parent.gone:
+            if not replay.owes or time.monotonic() - worked_s > LINGER_S:
+                return
+            replay.hasten()
         woken = parent.wait(LOOK_EVERY_S)
 
 

@@ -403,6 +403,10 @@ class Spool:
         """Waits for no commit."""
         return sum(row[2] for row in self._view.overview.tally() if row[1] == State.PENDING.value)
 
+    def has_uncatalogued(self) -> bool:
+        """Whether a delivered object is in no part of the catalog yet. Waits for no commit."""
+        return bool(self._view.catalog.uncatalogued(1))
+
     def usage(self) -> SpoolUsage:
         """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
         return usage_of(self._view, self.root, self._clock.wall_ns())

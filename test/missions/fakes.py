@@ -89,6 +89,9 @@ class FakeSpooler:
     def drain(self) -> None:
         pass
 
+    def hasten(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 

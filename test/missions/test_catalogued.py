@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 
 import pyarrow.parquet
+import pytest
 from missions.fakes import journalling
 
 from shadowhound_data_logger.core.clock import SystemClock
@@ -13,6 +14,7 @@ from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.missions.folder import Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of
+from shadowhound_data_logger.shipping.catalog_writer import SOON_S
 
 
 def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
@@ -41,3 +43,36 @@ def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
     )  # fmt: skip
     assert row['t_start_ns'] == frame['t']
     assert (row['x'], row['y'], row['yaw'], row['pose_frame']) == (1.0, 2.0, 0.5, 'odom')
+
+
+@pytest.mark.parametrize('is_hastened', [True, False])
+def test_the_sender_stays_until_the_last_row_is_written(tmp_path: Path, is_hastened: bool) -> None:
+    """For a period of the catalog at most, or some seconds after a mission's end: nobody else would write it."""
+    with journalling(tmp_path) as logger:
+        logger.start_mission('patrol', '')
+        logger.log_camera_frame(b'\xff\xd8one', 1)
+        logger.log_camera_frame(b'\xff\xd8two', 2)
+    (folder,) = missions(tmp_path)
+    start, *frames = [record for line in read(folder.journal) if (record := line.record or {})['k'] in {'start', 'frame'}]
+    now = [0.0]
+    settings = Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)})
+    spooler = Spooler(settings, SystemClock('boot'), monotonic=lambda: now[0])
+
+    def rows() -> int:
+        parts = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.parquet')
+        return sum(pyarrow.parquet.read_table(io.BytesIO(part.read_bytes())).num_rows for part in parts)
+
+    try:
+        for frame in frames:
+            spooler.add([item.content for item in objects_of(frame, start, folder, Run('abc', '1', 'x'))])
+            for _ in range(3):
+                spooler.drain()
+        assert (spooler.pending(), rows(), spooler.owes) == (0, 1, True)
+        if is_hastened:
+            spooler.hasten()
+        now[0] += SOON_S if is_hastened else settings.catalogue.period_s
+        for _ in range(2):
+            spooler.drain()
+        assert (spooler.pending(), rows(), spooler.owes) == (0, 2, False)
+    finally:
+        spooler.close()

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet
 import pytest
+from click.testing import CliRunner
 from missions.fakes import FakeSpooler, FakeTracking, journalling
+from missions.server import FOREIGN, complete, end_replayers, until
 from shadowhound_tower.embedded import Tower
 
+from shadowhound_data_logger import MissionDataLogger
+from shadowhound_data_logger.cli.common import BadUsage
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import Settings, UploadSettings
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.missions import recorder
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
+from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of
 from shadowhound_data_logger.stores import open_store
@@ -92,3 +99,49 @@ def test_the_run_and_the_summary_have_the_agent_s_spelling(flown: list[MissionFo
         summary = json.loads(tracking.artifacts['summary.json'])
         assert tracking.params['mission_type'] == summary['mission_type'] == given
         assert tracking.names[folder.mission_id].rpartition(' ')[0] == summary['run_name'] == f'{given}_20251018_120000'
+
+
+SEEN = ('巡逻', '探索', 'night patrol')
+
+
+@pytest.mark.long('a sender that loads MLflow')
+def test_every_verb_has_the_agent_s_spelling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From start_mission to query, search, export and missions; a type that no mission has is an error with the nearest one."""
+    for name in [name for name in os.environ if name.startswith(FOREIGN)]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path / 'home'))
+    ids: dict[str, str] = {}
+    logger = MissionDataLogger(start_timeout_s=60.0)
+    try:
+        for given in SEEN:
+            with logger.mission(given, 'look at the door') as mission:
+                ids[given] = mission.id
+        logger.close()
+        state = tmp_path / 'home' / MISSIONS / 'replay.json'
+        until(
+            lambda: complete(tmp_path / 'home', len(SEEN)) and not read_json(state)['pid'], 'the sender has sent all and exited'
+        )
+    finally:
+        end_replayers(tmp_path / 'home')
+
+    monkeypatch.chdir(tmp_path)
+
+    def told(*arguments: str, code: int = 0) -> Any:
+        done = CliRunner().invoke(cli, [*arguments, '--json'], standalone_mode=False)
+        assert (done.exception, done.return_value) == (None, code), done.output
+        return json.loads(done.stdout)
+
+    assert {each['type']: each['mission_id'] for each in told('missions', 'list')} == ids
+    assert {told('missions', 'show', mission_id)['type'] for mission_id in ids.values()} == {*SEEN}
+    counts = told('query', 'SELECT mission_type, count(*) AS n FROM missions GROUP BY mission_type')
+    assert {row['mission_type']: row['n'] for row in counts} == dict.fromkeys(SEEN, 1)
+    told('lake', 'index')
+    for given, mission_id in ids.items():
+        assert {row['mission_id'] for row in told('query', '--mission-type', given)} == {mission_id}
+        assert [each['mission_id'] for each in told('search', 'door', '--mission-type', given)['found']] == [mission_id]
+        chosen = told('export', 'lerobot', 'set', '--mission-type', given, '--dry-run', code=1)
+        assert [*chosen['refused']] == [mission_id], 'it is chosen, and has no camera'
+    for verb in (('query',), ('search', 'door'), ('export', 'lerobot', 'x', '--dry-run'), ('fetch', '--to', 'x')):
+        done = CliRunner().invoke(cli, [*verb, '--mission-type', 'night_patrol'], standalone_mode=False)
+        assert isinstance(done.exception, BadUsage), (verb, done.exception)
+        assert done.exception.remedy == "is it 'night patrol'?"
