@@ -54,8 +54,6 @@ RTSP_PORT = 8554
               help='Limit of uploads in Mbit/s while somebody watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--rtsp', type=click.IntRange(0, 65535), is_flag=False, flag_value=RTSP_PORT, metavar='[PORT]',
               help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
-@click.option('--h264', default='', metavar='ELEMENT',
-              help='GStreamer element that encodes H.264; none: never  [default: one of hardware, if it is found]')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
 @click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
@@ -64,7 +62,7 @@ RTSP_PORT = 8554
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
-         uploads_mbps: float, rtsp: int | None, h264: str, new_tokens: bool, robot_url: str | None,
+         uploads_mbps: float, rtsp: int | None, new_tokens: bool, robot_url: str | None,
          robot_token: Path | None, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a page that shows robot and data.
 
@@ -96,7 +94,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
     settings = LiveSettings(
         spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
-        certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, h264=h264, is_of_store=is_of_store,
+        certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, is_of_store=is_of_store,
         robot_url=robot_url or '', robot_token=robot_token,
     )  # fmt: skip
     logging.basicConfig(level=logging.INFO, format='%(message)s')
@@ -111,13 +109,13 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
             await server.open()
             if as_json:
                 print_json({'url': server.url, 'pid': os.getpid(), 'tokens': {role: str(path) for role, path in paths.items()},
-                            'rtsp': server.rtsp_url, 'h264': server.h264, 'problem': server.ros_problem})  # fmt: skip
+                            'rtsp': server.rtsp_url, 'problem': server.viewers.ros_problem})  # fmt: skip
             else:
                 click.echo(f"{server.url}\nthe operator's token is in {paths['operator']}, a viewer's in {paths['viewer']}")
                 if server.rtsp_url:
                     click.echo(f'{server.rtsp_url}/TOPIC: user {USER}, password in {tokens / RTSP_FILE}')
-                if server.ros_problem:
-                    click.echo(server.ros_problem, err=True)
+                if server.viewers.ros_problem:
+                    click.echo(server.viewers.ros_problem, err=True)
             await stop.wait()
         finally:
             await server.close()

@@ -279,31 +279,13 @@ class Access:
         return SignIn(VIEWER) if self._is_open else None
 
     def sign_out(self, who: SignIn) -> None:
-        """Its cookie and its tickets are worth nothing from now on; ``keep`` makes that last."""
+        """Its cookie is invalid from now on; ``keep`` makes that last."""
         if who.nonce:
             self._ended[who.role].add(who.nonce, who.expires)
 
     def keep(self, role: str) -> None:
         """Write down who of a role was signed out; waits for the disk, in any thread. Raises OSError."""
         self._ended[role].keep()
-
-    def ticket(self, who: SignIn, address: str) -> str:
-        """What lets a program at this address watch, and nothing else, for as long as the sign-in lasts: it may stand in a URL.
-
-        Raises TokenRefused.
-        """
-        text = f'{who.role}.{who.expires or self._ended[who.role].expiry()}.{who.nonce}'
-        return f'{text}.{self._sign(who.role, f"ticket.{text}.{address}")}'
-
-    def of_ticket(self, ticket: str, address: str) -> str | None:
-        """The nonce of the sign-in that asked for this ticket; None for one that is worth nothing."""
-        parts = ticket.split('.')
-        if len(parts) == 4:
-            role, until, nonce, signature = parts
-            with suppress(TokenRefused):
-                if self._is_good(role, until, nonce, f'ticket.{role}.{until}.{nonce}.{address}', signature):
-                    return nonce
-        return None
 
     def is_csrf(self, who: SignIn, given: str) -> bool:
         """Whether a request that acts comes from the page itself."""

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 FULL, HALF, SMALLEST = 0, 1, 2
 SIZES: Final = (FULL, HALF, SMALLEST)
-RAW: Final = -1
-"""In place of a size: serialized messages as they came."""
 _SIDE: Final = {HALF: 2, SMALLEST: 4}
 """By how much a smaller frame's sides are divided."""
 _QUALITY: Final = {FULL: 75, HALF: 60, SMALLEST: 45}

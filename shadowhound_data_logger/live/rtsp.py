@@ -1,8 +1,9 @@
-"""The cameras over RTSP, for players and recorders: served by GStreamer in a process of its own (``rtsp_process.py``).
+"""The cameras over RTSP, for players and recorders: JPEGs (RFC 2435), served by GStreamer in a separate process
+(``rtsp_process.py``).
 
-With an encoder of H.264 they are sent so, else as the JPEGs that came (RFC 2435). RFC 2435 knows baseline JPEGs in YUV 4:2:0 or
-4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and the log says so. A topic is read while somebody
-plays it.
+RFC 2435 supports baseline JPEGs in YUV 4:2:0 or 4:2:2 whose sides are multiples of 8 pixels up to 2040; others are not sent, and
+the log reports them. A topic is read while somebody plays it. Debian and Ubuntu build GStreamer's bindings for the system's
+Python, so a process of that runs the script.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import time
-from collections.abc import Callable, Iterable
+import struct
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -19,8 +20,6 @@ from typing import Any, Final
 import simplejpeg
 
 from shadowhound_data_logger.core.errors import DataLoggerError
-from shadowhound_data_logger.live.gstreamer import PYTHON, GstProcess
-from shadowhound_data_logger.live.h264 import BLOCKS_4_0, H264_AGAIN_S, H264Element, fitted, of_size
 from shadowhound_data_logger.live.kinds import LiveItem
 
 log = logging.getLogger(__name__)
@@ -30,8 +29,11 @@ USER: Final = 'viewer'
 START_S: Final = 20.0
 AGAIN_S: Final = 5.0
 MOST_SIDE: Final = 2040
-H264_RATE, H264_KEY_EVERY = 4_000_000, 30
-"""Bits a second; frames from one key frame to the next, for which a player that comes later waits."""
+PYTHON: Final = Path('/usr/bin/python3')
+"""Of the system."""
+MAX_WAITING: Final = 4 << 20
+"""Bytes for a process that does not read; frames beyond it are skipped."""
+END_S: Final = 5.0
 _BASELINE, _FRAMES = 0xC0, range(0xC0, 0xD0)
 _NO_FRAMES: Final = (0xC4, 0xC8, 0xCC)
 """Markers among those of frames that begin tables (ITU T.81, table B.1)."""
@@ -46,25 +48,16 @@ class RtspUnavailable(DataLoggerError):
 class RtspServer:
     """The process that serves, as long as this one. Used by one event loop. New; open once; close once.
 
-    ``changed`` is called when other topics are played than before. ``h264`` encodes; without it JPEGs are sent.
+    ``changed`` is called when other topics are played than before.
     """
 
-    def __init__(self, address: str, port: int, password: str, changed: Callable[[], None],
-                 h264: H264Element | None = None) -> None:  # fmt: skip
-        encoder = None if h264 is None else h264.told(H264_RATE, H264_KEY_EVERY)
-        self._given: dict[str, Any] = {
-            'address': address, 'port': port, 'user': USER, 'password': password, 'h264': encoder
-        }  # fmt: skip
+    def __init__(self, address: str, port: int, password: str, changed: Callable[[], None]) -> None:
+        self._given: dict[str, Any] = {'address': address, 'port': port, 'user': USER, 'password': password}
         self._changed = changed
-        self._process = GstProcess(SCRIPT)
+        self._process = _Process(SCRIPT)
         self._task: asyncio.Task[None] | None = None
         self._cameras: list[str] = []
         self._refused: dict[str, str] = {}
-        self._h264_from_s: dict[str, float] = {}
-        """By topic: when H.264 is tried again after its encoder failed."""
-        self._sizes: dict[str, tuple[int, int]] = {}
-        self._jpegs: frozenset[str] = frozenset()
-        """Those that are played as JPEG."""
         self.topics: frozenset[str] = frozenset()
         """Those that somebody plays."""
         self.players: tuple[str, ...] = ()
@@ -93,43 +86,16 @@ class RtspServer:
         """A JPEG of one of the topics."""
         if item.topic not in self.topics:
             return
-        try:
-            head = self._head(item.topic, item.body)
-        except ValueError as error:
-            if self._refused.get(item.topic) != str(error):
-                log.warning('%s is not sent over RTSP: %s', item.topic, error)
-                self._refused[item.topic] = str(error)
-        else:
-            self._process.tell(head, item.body)
-
-    def _head(self, topic: str, jpeg: bytes) -> dict[str, Any]:
-        """What the process is told of a frame. Raises ValueError with why it cannot be sent."""
-        is_jpeg = self._given['h264'] is None or topic in self._jpegs
-        if is_jpeg and (why := unsuited(jpeg)):
-            raise ValueError(why)
-        height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
-        head: dict[str, Any] = {'topic': topic, 'width': width, 'height': height}
-        if not is_jpeg:
-            head['size'] = self._sizes[topic] = fitted(width, height, BLOCKS_4_0)
-        return head
+        if why := unsuited(item.body):
+            if self._refused.get(item.topic) != why:
+                log.warning('%s is not sent over RTSP: %s', item.topic, why)
+                self._refused[item.topic] = why
+            return
+        height, width, *_ = simplejpeg.decode_jpeg_header(item.body)
+        self._process.tell({'topic': item.topic, 'width': width, 'height': height}, item.body)
 
     def _tell_topics(self) -> None:
-        now_s = time.monotonic()
-        jpegs = [topic for topic, from_s in self._h264_from_s.items() if from_s > now_s]
-        self._process.tell({'topics': self._cameras, 'jpegs': jpegs})
-
-    def _fail(self, topics: Iterable[str], why: str) -> None:
-        """The encoder of these: players that come are sent JPEG for a while, so that none is refused again and again."""
-        now_s = time.monotonic()
-        new = [topic for topic in sorted(topics) if self._h264_from_s.get(topic, 0.0) <= now_s]
-        if not new:
-            return
-        for topic in new:
-            log.warning('%s is not encoded as H.264 over RTSP: %s%s; for %.0f s players that come are sent JPEG',
-                        topic, why[:300], of_size(self._sizes.get(topic)), H264_AGAIN_S)  # fmt: skip
-            self._h264_from_s[topic] = now_s + H264_AGAIN_S
-        self._tell_topics()
-        asyncio.get_running_loop().call_later(H264_AGAIN_S + 1.0, self._tell_topics)
+        self._process.tell({'topics': self._cameras})
 
     async def _start(self) -> None:
         try:
@@ -156,12 +122,7 @@ class RtspServer:
         while True:
             while said := await self._said():
                 self.players = tuple(said.get('players', self.players))
-                self._jpegs = frozenset(said.get('jpegs', self._jpegs))
                 self._watch(said.get('watched', self.topics))
-                if 'failed' in said:
-                    self._fail([said['failed']], said['why'])
-            if self._given['h264'] is not None:  # whose encoder it was is not known
-                self._fail(self.topics - self._jpegs, 'the process has ended')
             self.players = ()
             self._watch(())
             log.warning('the process that serves RTSP has ended; it is started again')
@@ -177,6 +138,71 @@ class RtspServer:
     def _watch(self, topics: Iterable[str]) -> None:
         self.topics = frozenset(topics)
         self._changed()
+
+
+class _Process:
+    """The process of a script, which ends with its input. Used by one event loop. Start it again only after ``end``; end it.
+
+    It is fed with records: two uint32 (little-endian) with the lengths of a head in JSON and of a body, and these.
+    """
+
+    def __init__(self, script: Path) -> None:
+        self._script = script
+        self._process: asyncio.subprocess.Process | None = None
+
+    @property
+    def output(self) -> asyncio.StreamReader:
+        """What it prints, from its start until ``end``."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        return self._process.stdout
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process, while there is one."""
+        return None if self._process is None else self._process.pid
+
+    async def start(self, first: Mapping[str, Any]) -> None:
+        """``first`` is its first record: everybody can read a command line. Raises OSError."""
+        self._process = await asyncio.create_subprocess_exec(
+            str(PYTHON),
+            '-I',
+            str(self._script),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for who feeds it
+        )
+        self.tell(first)
+
+    def tell(self, head: Mapping[str, Any], body: bytes = b'') -> None:
+        if self._process is None or (stdin := self._process.stdin) is None or stdin.is_closing():
+            return
+        if not body or stdin.transport.get_write_buffer_size() < MAX_WAITING:
+            text = json.dumps(head).encode()
+            stdin.write(struct.pack('<II', len(text), len(body)) + text + body)
+
+    async def end(self) -> None:
+        """Also where an earlier one was cancelled."""
+        if (process := self._process) is None:
+            return
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            await asyncio.wait_for(_over(process), END_S)
+        except asyncio.TimeoutError:
+            with suppress(ProcessLookupError):
+                process.kill()
+            await _over(process)
+        if self._process is process:
+            self._process = None
+
+
+async def _over(process: asyncio.subprocess.Process) -> None:
+    """Wait until it has ended. What it still prints is discarded: the end of one whose pipe is full is not seen."""
+    assert process.stdout is not None
+    while await process.stdout.read(1 << 16):
+        pass
+    await process.wait()
 
 
 def unsuited(jpeg: bytes) -> str:

@@ -1,12 +1,9 @@
 """Serves JPEGs from standard input over RTSP: a script for the system's Python, which has GStreamer's bindings (python3-gi).
 
 It imports nothing of this package. Each record of its input is two uint32 (little-endian) with the lengths of a head in JSON and
-of a body, and these. The first head has ``address``, ``port``, ``user``, ``password``, and an encoder under ``h264`` as
-``h264_process.py`` has it, or null: JPEGs are sent as they are. Later ones name ``topics`` that are served, and which of these
-are sent as JPEG (``jpegs``); or a ``topic`` with ``width`` and ``height`` of the JPEG in the body, and the ``size`` in
-which it is encoded. What it says are lines of JSON: ``port``, ``watched`` (topics that clients play) and which of these they get
-as JPEG (``jpegs``), ``players`` (the addresses of these clients), a topic of which the encoder has ``failed`` and ``why``, or
-``error``. It ends with its input.
+of a body, and these. The first head has ``address``, ``port``, ``user`` and ``password``. Later ones name ``topics`` that are
+served, or a ``topic`` with ``width`` and ``height`` of the JPEG in the body. It prints lines of JSON: ``port``, ``watched``
+(topics that clients play), ``players`` (the addresses of these clients), or ``error``. It ends with its input.
 """
 
 from __future__ import annotations
@@ -20,12 +17,9 @@ from typing import Any, BinaryIO
 
 FRAMES = 'appsrc name=frames is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream'
 AS_JPEG = f'( {FRAMES} ! rtpjpegpay name=pay0 pt=26 )'
-AS_H264 = f'( {FRAMES} ! {{launch}} ! rtph264pay name=pay0 pt=96 )'
 AF41 = 34
 """DSCP of interactive video (RFC 4594)."""
 MOST_SESSIONS = 16
-TRIES = 30
-"""Frames of which an encoder makes something before it has failed."""
 CLEAN_S = 5
 ROLE = 'viewer'
 writing = threading.Lock()
@@ -55,11 +49,8 @@ class Cameras:
         self._rtsp, self._gst = rtsp, gst
         self._lock = threading.Lock()
         self._sources: dict[str, Any] = {}
-        self._caps: dict[str, tuple[Any, ...]] = {}
-        self._fed: dict[str, int] = {}
-        """By topic of which nothing came yet that could be described to a player: how many frames the encoder was given."""
-        self._h264: dict[str, Any] | None = given['h264']
-        self._factories: dict[str, Any] = {}
+        self._caps: dict[str, tuple[int, int]] = {}
+        self._mounted: set[str] = set()
         self._players: dict[Any, str] = {}
         self.server = rtsp.RTSPServer()
         self.server.set_address(given['address'])
@@ -72,44 +63,35 @@ class Cameras:
         self.server.set_auth(auth)
         self.server.connect('client-connected', self._meet)
 
-    def mount(self, topics: list[str], jpegs: list[str]) -> None:
-        """Serve these; others that were served before stay. Whoever plays one already goes on as he does."""
+    def mount(self, topics: list[str]) -> None:
+        """Serve these; others that were served before stay."""
         for topic in topics:
-            factory = self._factories.get(topic) or self._mount(topic)
-            encoder = None if topic in jpegs else self._h264
-            factory.set_launch(AS_JPEG if encoder is None else AS_H264.format(launch=encoder['launch']))
+            if topic not in self._mounted:
+                self._mounted.add(topic)
+                self._mount(topic)
 
-    def _mount(self, topic: str) -> Any:
-        factory = self._factories[topic] = self._rtsp.RTSPMediaFactory()
+    def _mount(self, topic: str) -> None:
+        factory = self._rtsp.RTSPMediaFactory()
         factory.set_shared(True)
         factory.set_dscp_qos(AF41)
+        factory.set_launch(AS_JPEG)
         permissions = self._rtsp.RTSPPermissions()
         for right in ('media.factory.access', 'media.factory.construct'):
             permissions.add_permission_for_role(ROLE, right, True)
         factory.set_permissions(permissions)
         factory.connect('media-configure', self._begin, topic)
         self.server.get_mount_points().add_factory(topic, factory)
-        return factory
 
     def push(self, head: dict[str, Any], jpeg: bytes) -> None:
-        topic, width, height = head['topic'], head['width'], head['height']
-        size: Any = head.get('size')
+        topic, size = head['topic'], (head['width'], head['height'])
         with self._lock:
-            source, scaled = self._sources.get(topic, (None, None))
-            if source is None or (scaled is not None and size is None):  # the latter was sent to a player who has left
+            source = self._sources.get(topic)
+            if source is None:
                 return
-            if self._caps.get(topic) != (width, height, size):
-                self._caps[topic] = width, height, size
-                caps = f'image/jpeg,width={width},height={height}'
-                if scaled is None:
-                    caps += ',framerate=0/1'
-                else:
-                    caps += ',framerate=30/1'
-                    scaled.set_property('caps', self._gst.Caps.from_string(
-                        f'video/x-raw,width={size[0]},height={size[1]},pixel-aspect-ratio=1/1'))  # fmt: skip
+            if self._caps.get(topic) != size:
+                self._caps[topic] = size
+                caps = f'image/jpeg,width={size[0]},height={size[1]},framerate=0/1'
                 source.set_property('caps', self._gst.Caps.from_string(caps))
-            if topic in self._fed:
-                self._fed[topic] += 1
             source.emit('push-buffer', self._gst.Buffer.new_wrapped(jpeg))
 
     def _meet(self, _: Any, client: Any) -> None:
@@ -132,44 +114,21 @@ class Cameras:
             say(players=sorted({*self._players.values()}))
 
     def _begin(self, _: Any, media: Any, topic: str) -> None:
-        pipeline = media.get_element()
-        frames, scaled = pipeline.get_by_name('frames'), pipeline.get_by_name('size')
-        if self._h264 is not None and scaled is not None:
-            encoder = pipeline.get_by_name('h264')
-            for name, text in self._h264['set'].items():
-                if encoder.find_property(name) is not None:  # as other versions have it
-                    self._gst.util_set_object_arg(encoder, name, text)
-            pipeline.get_parent().get_bus().set_sync_handler(self._on_message, topic)
+        frames = media.get_element().get_by_name('frames')
         with self._lock:
-            self._sources[topic] = frames, scaled
+            self._sources[topic] = frames
             self._caps.pop(topic, None)
-            self._fed[topic] = 0
-            media.connect('prepared', self._on_prepared, topic)
             media.connect('unprepared', self._end, topic, frames)
             self._tell()
 
-    def _on_prepared(self, _: Any, topic: str) -> None:
-        with self._lock:
-            self._fed.pop(topic, None)
-
-    def _on_message(self, _: Any, message: Any, topic: str) -> Any:
-        if message.type == self._gst.MessageType.ERROR:
-            error, _ = message.parse_error()
-            say(failed=topic, why=error.message.rstrip('.'))
-        return self._gst.BusSyncReply.PASS
-
     def _end(self, _: Any, topic: str, frames: Any) -> None:
         with self._lock:
-            own, scaled = self._sources.get(topic, (None, None))
-            if own is frames:  # and not those of one that has taken its place
+            if self._sources.get(topic) is frames:  # and not that of one that has taken its place
                 del self._sources[topic]
-                if self._fed.pop(topic, 0) >= TRIES and scaled is not None:
-                    say(failed=topic, why=f'nothing came of {TRIES} frames')
             self._tell()
 
     def _tell(self) -> None:
-        jpegs = [topic for topic, (_, scaled) in self._sources.items() if scaled is None]
-        say(watched=sorted(self._sources), jpegs=sorted(jpegs))
+        say(watched=sorted(self._sources))
 
 
 def main() -> None:
@@ -189,8 +148,7 @@ def main() -> None:
         say(error=f'the system has no RTSP server: {error}')
         return
     Gst.init(None)
-    needs = ('appsrc', 'rtpjpegpay') if first[0]['h264'] is None else ('rtph264pay',)
-    lacks = [name for name in needs if Gst.ElementFactory.find(name) is None]
+    lacks = [name for name in ('appsrc', 'rtpjpegpay') if Gst.ElementFactory.find(name) is None]
     if lacks:
         say(error=f'GStreamer has no {" and no ".join(lacks)}')
         return
@@ -204,7 +162,7 @@ def main() -> None:
         while (record := read(sys.stdin.buffer)) is not None:
             head, jpeg = record
             if 'topics' in head:
-                GLib.idle_add(cameras.mount, head['topics'], head['jpegs'])
+                GLib.idle_add(cameras.mount, head['topics'])
             else:
                 cameras.push(head, jpeg)
         GLib.idle_add(loop.quit)

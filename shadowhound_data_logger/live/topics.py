@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.live.kinds import KINDS, RAW, Kind, LiveItem, clouds, frames, series
+from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
 from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
@@ -40,25 +40,23 @@ MOST_TOPICS: Final = 500
 """Of the graph that are told; whoever publishes more is not shown all of it."""
 _Wanted = Mapping[str, frozenset[int]]
 """Topic -> the sizes in which it is watched."""
-_RAW_ALONE: Final = Kind('raw', 100.0, is_bulk=False)
-"""Of types that the page does not show."""
 
 
 class _Watched:
     """One topic that is watched."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, kind: Kind, *, is_raw: bool) -> None:
-        """Raises TypeUnavailable or SubscriptionRefused. ``is_raw``: somebody takes each message as it came."""
-        self.type, self.kind, self.is_raw = type_name, kind, is_raw
+    def __init__(self, node: Node, topic: str, type_name: str, kind: Kind) -> None:
+        """Raises TypeUnavailable or SubscriptionRefused."""
+        self.type, self.kind = type_name, kind
         self._is_each_shown = not kind.is_bulk and 1 / kind.most_hz < POLL_S
-        self.most = MAX_TAKES if kind.is_bulk or is_raw or self._is_each_shown else 1
+        self.most = MAX_TAKES if kind.is_bulk or self._is_each_shown else 1
         depth = BULK_DEPTH if kind.is_bulk else 1 if self.most == 1 else ROWS_DEPTH
         self.reader = Reader(node, Plan(topic, type_name, reliable=False, transient_local=False, depth=depth), PolledGroup())
         self._next_s = 0.0
 
     def is_due(self, now_s: float) -> bool:
         """Whether to look: what would not be shown is left to the middleware, which keeps the newest."""
-        return self.is_raw or self._is_each_shown or now_s >= self._next_s
+        return self._is_each_shown or now_s >= self._next_s
 
     def shown(self, taken: list[Taken], now_s: float) -> list[Taken]:
         """Those of them that are shown."""
@@ -157,20 +155,16 @@ class Topics:
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
         for topic in [
-            topic
-            for topic, one in self._watched.items()
-            if not _is_watched(one.kind, wanted.get(topic))
-            or self._graph.get(topic) != one.type
-            or one.is_raw is not (RAW in wanted[topic])
+            topic for topic, one in self._watched.items() if not wanted.get(topic) or self._graph.get(topic) != one.type
         ]:
             self._watched.pop(topic).reader.close()
         for topic in wanted.keys() - self._watched.keys():
             type_name = self._graph.get(topic, '')
-            kind = KINDS.get(type_name, _RAW_ALONE)
-            if not type_name or not _is_watched(kind, wanted[topic]) or self._refused.get(topic) == type_name:
+            kind = KINDS.get(type_name)
+            if kind is None or not wanted[topic] or self._refused.get(topic) == type_name:
                 continue
             try:
-                self._watched[topic] = _Watched(self._node, topic, type_name, kind, is_raw=RAW in wanted[topic])
+                self._watched[topic] = _Watched(self._node, topic, type_name, kind)
             except (TypeUnavailable, SubscriptionRefused) as error:
                 self._refused[topic] = type_name
                 log.warning('%s is not shown: %s', topic, error)
@@ -182,13 +176,11 @@ class Topics:
                 continue
             came = one.reader.drain(one.most)
             sizes = wanted.get(topic, frozenset())
-            if one.is_raw:
-                items += [_raw(topic, message) for message in came]
             taken = one.shown(came, now_s)
-            if not taken or not sizes - {RAW} or one.kind is _RAW_ALONE:
+            if not taken or not sizes:
                 continue
             try:
-                items += self._items(topic, one, taken, sorted(sizes - {RAW}))
+                items += self._items(topic, one, taken, sorted(sizes))
             except Rejected as error:
                 self.rejected[topic] = self.rejected.get(topic, 0) + 1
                 if self.rejected[topic] == 1:
@@ -206,11 +198,3 @@ class Topics:
         if one.kind.name == 'cloud':
             return list(clouds(topic, self._types, at_ms, cdr, sizes))
         return list(frames(topic, one.type, self._types, at_ms, cdr, sizes))
-
-
-def _is_watched(kind: Kind, sizes: frozenset[int] | None) -> bool:
-    return bool(sizes) and (kind is not _RAW_ALONE or RAW in (sizes or ()))
-
-
-def _raw(topic: str, message: Taken) -> LiveItem:
-    return LiveItem(topic, 'raw', RAW, {'at_ns': message.received_ns or time.time_ns()}, message.cdr)

@@ -1,11 +1,10 @@
 """The camera as video over WebRTC, encoded once for all who take it. Importing this loads aiortc (the extra ``webrtc``).
 
-The newest JPEG of a topic is decoded and encoded as VP8 on a thread of its own, or as H.264 in a process of its own where an
-encoder of GStreamer serves and the viewer takes H.264 (``h264.py``); its packets go to each peer. RTP timestamps are the
-times at which messages came, at 90 kHz, so the page knows how old each frame is. Packets go to the viewer's own address alone:
-candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for four things that are
-needed: the codec that was agreed on, the rate that a receiver can take, when it lacks a key frame, and where timestamps begin.
-They are read from the insides of the versions that setup.py names.
+The newest JPEG of a topic is decoded and encoded as VP8 on a separate thread; its packets are sent to each peer. RTP timestamps
+are the times of arrival, at 90 kHz, so the page knows how old each frame is. Packets are sent to the viewer's own address only:
+candidates of an offer give ports and no addresses, and no STUN server is asked. aiortc has no interface for three things that are
+needed: the rate that a receiver can take, when it lacks a key frame, and where timestamps begin. They are read from the private
+attributes of the versions that setup.py names.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from fractions import Fraction
 from functools import partial
 from ipaddress import ip_address
 from threading import Condition
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import av
 import numpy as np
@@ -33,7 +32,6 @@ from aiortc.rtp import RTCP_PSFB_APP, RTCP_PSFB_FIR, RTCP_PSFB_PLI, RtcpPsfbPack
 
 from shadowhound_data_logger.core.untrusted import check_pixels
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.live.h264 import H264_AGAIN_S, KEY_EVERY_S, H264Element, H264Encoder
 from shadowhound_data_logger.live.kinds import LiveItem
 
 log = logging.getLogger(__name__)
@@ -54,7 +52,9 @@ RAISE_EVERY_S: Final = 4.0
 MOST_WAITING: Final = 10
 """Packets of a peer whose turn does not come; then it goes on with the next key frame."""
 CONNECT_S: Final = 10.0
-VP8, H264 = 'video/VP8', 'video/H264'
+VP8: Final = 'video/VP8'
+KEY_EVERY_S: Final = 0.7
+"""Key frames that receivers request are sent no more often."""
 _TICKS_PER_MS: Final = CLOCK_HZ // 1000
 _CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
 _MOST_CANDIDATES: Final = 8
@@ -74,20 +74,6 @@ class _Encoded:
     at_ms: float
     is_key: bool
     """Whether it needs no other."""
-
-
-class _Encoder(Protocol):
-    """Encodes one topic, as VP8 or H.264. New; open once; close once."""
-
-    def open(self) -> None: ...
-
-    def offer(self, at_ms: float, jpeg: bytes) -> None: ...
-
-    def ask_key(self) -> None: ...
-
-    def set_rate(self, rate: int) -> None: ...
-
-    def close(self) -> Coroutine[Any, Any, None]: ...
 
 
 class _Vp8Encoder:
@@ -231,12 +217,11 @@ class _Peer:
 
     def __init__(self, topic: str, video: CameraVideo, tell: Callable[[Mapping[str, Any]], None]) -> None:
         self.topic, self._video, self._tell = topic, video, tell
-        self.codec = ''
-        """VP8 or H264, once it is answered."""
         self.pc = RTCPeerConnection(RTCConfiguration(iceServers=[]))
         self.track = _PacketTrack(lambda: video.ask_key(self), self._on_sent)
         self.rate: float | None = None
         """Bits a second that its link carries, as it says."""
+        self.is_answered = False
         self._is_told = False
         self.sender: RTCRtpSender = self.pc.addTrack(self.track)
 
@@ -244,10 +229,8 @@ class _Peer:
         """Raises OfferRefused."""
         (transceiver,) = self.pc.getTransceivers()
         known = RTCRtpSender.getCapabilities('video').codecs
-        taken = (H264, VP8, 'video/rtx') if self._video.has_h264(self.topic) else (VP8, 'video/rtx')
-        transceiver.setCodecPreferences([codec for name in taken for codec in known if codec.mimeType == name])
+        transceiver.setCodecPreferences([codec for name in (VP8, 'video/rtx') for codec in known if codec.mimeType == name])
         await self.pc.setRemoteDescription(RTCSessionDescription(_with_address(offer, remote), 'offer'))
-        self.codec = transceiver._codecs[0].mimeType
         _gather_at(self.sender.transport.transport.iceGatherer._connection, own)
         handle = self.sender._handle_rtcp_packet
 
@@ -258,6 +241,7 @@ class _Peer:
         self.sender._handle_rtcp_packet = read
         self.pc.on('connectionstatechange', self._on_state)
         await self.pc.setLocalDescription(await self.pc.createAnswer())
+        self.is_answered = True
         return str(self.pc.localDescription.sdp)
 
     def _on_state(self) -> None:
@@ -282,17 +266,15 @@ class _Peer:
 class CameraVideo:
     """Encodes the topics that peers take, and sends them. Used by one event loop. New; close once.
 
-    ``changed`` is called when other topics are to be read than before. ``h264`` is the encoder for peers that take H.264.
+    ``changed`` is called when other topics are to be read than before.
     """
 
-    def __init__(self, changed: Callable[[], None], h264: H264Element | None = None) -> None:
-        self._changed, self.h264 = changed, h264
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
         self._loop = asyncio.get_running_loop()
-        self._encoders: dict[tuple[str, str], _Encoder] = {}
-        """By topic and codec."""
-        self._rates: dict[tuple[str, str], tuple[int, float]] = {}
-        self._h264_from_s: dict[str, float] = {}
-        """By topic: when H.264 is tried again after its encoder failed."""
+        self._encoders: dict[str, _Vp8Encoder] = {}
+        """By topic."""
+        self._rates: dict[str, tuple[int, float]] = {}
         self._peers: dict[object, _Peer] = {}
         self._ending: set[asyncio.Task[None]] = set()
         for name in ('aioice', 'aiortc'):
@@ -303,18 +285,13 @@ class CameraVideo:
         """Those that somebody takes."""
         return frozenset(peer.topic for peer in self._peers.values())
 
-    def has_h264(self, topic: str) -> bool:
-        """Whether viewers who come may take the topic as H.264."""
-        return self.h264 is not None and time.monotonic() >= self._h264_from_s.get(topic, 0.0)
-
     def offer(self, item: LiveItem) -> None:
         """A JPEG of one of the topics."""
-        for (topic, _), encoder in list(self._encoders.items()):
-            if topic == item.topic and item.head is not None:
-                encoder.offer(float(item.head['at']), item.body)
+        if (encoder := self._encoders.get(item.topic)) is not None and item.head is not None:
+            encoder.offer(float(item.head['at']), item.body)
 
     def ask_key(self, peer: _Peer) -> None:
-        if (encoder := self._encoders.get((peer.topic, peer.codec))) is not None:
+        if (encoder := self._encoders.get(peer.topic)) is not None:
             encoder.ask_key()
 
     async def take(self, who: object, said: Mapping[str, Any], addresses: tuple[str, str],
@@ -367,11 +344,10 @@ class CameraVideo:
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
 
-    def lost(self, peer: _Peer, problem: str, *, again: bool = False) -> None:
-        """``again``: who asks again is given another codec."""
+    def lost(self, peer: _Peer, problem: str) -> None:
         for who, one in list(self._peers.items()):
             if one is peer:
-                peer._tell({'problem': problem, 'again': True} if again else {'problem': problem})
+                peer._tell({'problem': problem})
                 self.end(who)
 
     def has(self, who: object) -> bool:
@@ -381,14 +357,14 @@ class CameraVideo:
     def tick(self) -> None:
         """Once a second: the rate of each topic is what the slowest of its links carries."""
         now_s = time.monotonic()
-        for key, encoder in self._encoders.items():
-            told = [peer.rate for peer in self._peers.values() if (peer.topic, peer.codec) == key and peer.rate is not None]
+        for topic, encoder in self._encoders.items():
+            told = [peer.rate for peer in self._peers.values() if peer.topic == topic and peer.rate is not None]
             if not told:
                 continue
-            rate, since_s = self._rates.get(key, (FIRST_RATE, -RAISE_EVERY_S))
+            rate, since_s = self._rates.get(topic, (FIRST_RATE, -RAISE_EVERY_S))
             wanted = int(min(max(min(told) * RATE_SHARE, LEAST_RATE), MOST_RATE))
             if wanted < 0.9 * rate or (wanted > 1.25 * rate and now_s - since_s >= RAISE_EVERY_S):
-                self._rates[key] = wanted, now_s
+                self._rates[topic] = wanted, now_s
                 encoder.set_rate(wanted)
 
     async def close(self) -> None:
@@ -402,42 +378,24 @@ class CameraVideo:
             self.lost(peer, f'no connection for video (UDP) within {CONNECT_S:.0f} s')
 
     def _follow(self) -> None:
-        """Encoders of the topics that are taken, in each codec in which they are, and no others."""
-        wanted = {(peer.topic, peer.codec) for peer in self._peers.values() if peer.codec}
-        for key in self._encoders.keys() - wanted:
-            self._rates.pop(key, None)
-            self._end(self._encoders.pop(key).close())
-        for key in wanted - self._encoders.keys():
-            encoder = self._encoders[key] = self._encoder(*key)
+        """Encoders of the topics that are taken, and no others."""
+        wanted = {peer.topic for peer in self._peers.values() if peer.is_answered}
+        for topic in self._encoders.keys() - wanted:
+            self._rates.pop(topic, None)
+            self._end(self._encoders.pop(topic).close())
+        for topic in wanted - self._encoders.keys():
+            encoder = self._encoders[topic] = _Vp8Encoder(partial(self._on_encoded, topic))
             encoder.open()
         self._changed()
 
-    def _encoder(self, topic: str, codec: str) -> _Encoder:
-        if codec == H264 and self.h264 is not None:
-            return H264Encoder(self.h264, FIRST_RATE, partial(self._on_h264, topic), partial(self._on_failed, topic))
-        return _Vp8Encoder(partial(self._on_vp8, topic))
-
-    def _on_vp8(self, topic: str, encoded: _Encoded) -> None:
+    def _on_encoded(self, topic: str, encoded: _Encoded) -> None:
         """On the thread of the encoder."""
         with suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._share, topic, VP8, encoded)
+            self._loop.call_soon_threadsafe(self._share, topic, encoded)
 
-    def _on_h264(self, topic: str, at_ms: float, is_key: bool, unit: bytes) -> None:
-        packet = av.Packet(unit)
-        packet.pts, packet.time_base = round(at_ms * _TICKS_PER_MS), Fraction(1, CLOCK_HZ)
-        self._share(topic, H264, _Encoded(packet, at_ms, is_key))
-
-    def _on_failed(self, topic: str, why: str) -> None:
-        """Of the encoder of H.264: its viewers ask again, and who asks takes VP8 for a while."""
-        log.warning('%s is not encoded as H.264: %s; for %.0f s viewers who come take VP8', topic, why, H264_AGAIN_S)
-        self._h264_from_s[topic] = time.monotonic() + H264_AGAIN_S
-        for peer in list(self._peers.values()):
-            if (peer.topic, peer.codec) == (topic, H264):
-                self.lost(peer, f'the encoder of H.264 failed: {why}', again=True)
-
-    def _share(self, topic: str, codec: str, encoded: _Encoded) -> None:
+    def _share(self, topic: str, encoded: _Encoded) -> None:
         for peer in self._peers.values():
-            if (peer.topic, peer.codec) == (topic, codec):
+            if peer.topic == topic:
                 peer.track.offer(encoded)
 
 

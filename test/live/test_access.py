@@ -19,10 +19,14 @@ import aiohttp
 import pytest
 
 from shadowhound_data_logger.live import access as access_module
+from shadowhound_data_logger.live import acts as acts_module
+from shadowhound_data_logger.live import answers as answers_module
 from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live import viewers as viewers_module
 from shadowhound_data_logger.live.access import ENDED_FILE, LASTS_S, MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
-from shadowhound_data_logger.live.foxglove import PROTOCOLS
-from shadowhound_data_logger.live.server import MOST_BODY, MOST_MESSAGE, MOST_VIEWERS, LiveServer, LiveSettings
+from shadowhound_data_logger.live.auth import MAX_BODY
+from shadowhound_data_logger.live.server import LiveServer, LiveSettings
+from shadowhound_data_logger.live.viewers import MAX_MESSAGE, MAX_VIEWERS
 
 WHO = ('stranger', 'viewer', 'operator')
 UPGRADE = {'Connection': 'Upgrade', 'Upgrade': 'websocket', 'Sec-WebSocket-Version': '13',
@@ -137,7 +141,6 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('GET', '/api/session', {}, (401, 200, 200)),
     ('GET', '/api/session', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/viewer.token', {}, (404, 404, 404)),
-    ('GET', '/api/foxglove', {}, (401, 200, 200)),
     ('GET', '/api/past/robots', {}, (401, 200, 200)),
     ('GET', '/api/gaps', {}, (401, 503, 503)),  # there is no spool
     ('GET', '/api/gaps?from=-1', {}, (401, 400, 400)),
@@ -160,15 +163,15 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('POST', '/api/act', {'body': b'{"do": "set", "values": {}}'}, (401, 403, 400)),
     ('POST', '/api/act', {'body': b'{"do": "flush", "who": "somebody else"}'}, (401, 403, 400)),
     ('POST', '/api/act', {'body': b'{' * 100}, (401, 403, 400)),
-    ('POST', '/api/act', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
-    ('POST', '/api/session', {'body': b' ' * (MOST_BODY + 1)}, (413, 413, 413)),
+    ('POST', '/api/act', {'body': b' ' * (MAX_BODY + 1)}, (413, 413, 413)),
+    ('POST', '/api/session', {'body': b' ' * (MAX_BODY + 1)}, (413, 413, 413)),
     ('POST', '/api/label', {'body': LABEL}, (401, 403, 200)),
     ('POST', '/api/label', {'body': LABEL, 'csrf': False}, (401, 403, 403)),
     ('POST', '/api/label', {'body': LABEL, 'headers': FOREIGN}, (403, 403, 403)),
     ('POST', '/api/label', {'body': LABEL.replace(b'thor', b'../x')}, (401, 403, 400)),
     ('POST', '/api/label', {'body': LABEL.replace(b'"x"', b'["x"]')}, (401, 403, 400)),
     ('POST', '/api/label', {'body': LABEL.replace(b'5', b'true')}, (401, 403, 400)),
-    ('POST', '/api/label', {'body': LABEL.replace(b'x', b'x' * MOST_BODY)}, (413, 413, 413)),
+    ('POST', '/api/label', {'body': LABEL.replace(b'x', b'x' * MAX_BODY)}, (413, 413, 413)),
     ('GET', '/api/label', {}, (401, 404, 404)),
     ('POST', '/api/pull', {'body': PULL}, (401, 403, 503)),  # there is no spool
     ('POST', '/api/pull', {'body': PULL, 'csrf': False}, (401, 403, 403)),
@@ -186,8 +189,6 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('GET', '/', {'headers': {'Host': '\udcff'}}, (403, 403, 403)),
     ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.\udcff.x'}}, (401, 401, 401)),
     ('GET', '/api/session', {'headers': {'Cookie': 'shadowhound_live=viewer.9999999999.x.\udcff'}}, (401, 401, 401)),
-    ('GET', '/foxglove?ticket=viewer.9999999999.%ed%b3%bf.x', {}, (401, 401, 401)),
-    ('GET', '/foxglove?ticket=viewer.9999999999.x.%ff', {}, (401, 401, 401)),
     ('POST', '/api/act', {'body': ACT, 'headers': {'X-CSRF-Token': '\udcff'}}, (401, 403, 403)),
     ('POST', '/api/act', {'body': b'\xff'}, (401, 403, 400)),
     ('POST', '/api/act', {'body': b'{"do": "event", "name": "\\ud800"}'}, (401, 403, 200)),
@@ -231,7 +232,7 @@ def test_the_node_is_told_of_each_act_whose_it_is(tmp_path: Path, monkeypatch: p
         asked.append((do, given))
         return {'ok': True}
 
-    monkeypatch.setattr(module, 'connect', lambda *_: SimpleNamespace(ask=ask, close=lambda: None))
+    monkeypatch.setattr(acts_module, 'connect', lambda *_: SimpleNamespace(ask=ask, close=lambda: None))
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
@@ -336,7 +337,7 @@ def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, mon
 @pytest.mark.parametrize('bind', ['0.0.0.0', '127.0.0.1'])
 def test_a_sign_in_ends_the_one_whose_cookie_comes_with_it(bind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever that cookie was copied to, also after the page restarts; a wrong token ends nothing, nor does a forged cookie."""
-    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
+    monkeypatch.setattr(module, 'CHECK_S', 0.05)
     right, wrong = (json.dumps({'token': token}).encode() for token in ('{}', 'x' * 30))
 
     async def role(page: Page, who: str) -> str:
@@ -395,14 +396,12 @@ def test_a_sign_in_is_not_refused_where_the_disk_does_not_keep_the_end_of_anothe
 
 
 def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At once all tabs of that browser and its Foxglove; those of another sign-in with the same token go on."""
-    monkeypatch.setattr(module, 'ASK_AGAIN_S', 3600.0)  # nobody else looks who may watch
+    """All tabs of that browser, immediately; those of another sign-in with the same token continue."""
+    monkeypatch.setattr(module, 'CHECK_S', 3600.0)  # nobody else looks who may watch
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
             gone = {'Cookie': f'shadowhound_live={page.cookies["viewer"]}'}
-            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
-            foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
             tabs = [await session.ws_connect(f'{page.origin}/ws', headers=gone) for _ in range(2)]
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 200
             signed_out = page.cookies['viewer'], page.csrf['viewer']
@@ -411,7 +410,7 @@ def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monk
             other = await session.ws_connect(f'{page.origin}/ws', headers=stays)
             page.cookies['viewer'], page.csrf['viewer'] = signed_out
             assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
-            for each in (*tabs, foxglove):
+            for each in tabs:
                 await ended(each)
             await answers(other, 5)
             with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
@@ -423,21 +422,16 @@ def test_a_sign_out_ends_the_connections_of_its_own_sign_in(tmp_path: Path, monk
 
 
 def test_a_sign_out_outlasts_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the page: the cookie and the ticket for Foxglove stay worth nothing, and nobody else has to sign in again."""
+    """Of the page: the cookie stays invalid, and nobody else has to sign in again."""
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
-            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
-            async with aiohttp.ClientSession() as session:
-                foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
-                assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
-                await ended(foxglove)
+            assert (await page.ask('viewer', 'POST', '/api/sign-out'))[0] == 200
             assert stat.S_IMODE((page.folder / f'viewer.{ENDED_FILE}').stat().st_mode) == 0o600
             cookies = dict(page.cookies)
         async with serving(tmp_path, monkeypatch) as page:
             page.cookies = cookies
             assert (await page.ask('viewer', 'GET', '/api/session'))[0] == 401
-            assert (await page.ask('stranger', 'GET', path))[0] == 401
             assert (await page.ask('operator', 'GET', '/api/session'))[0] == 200
 
     asyncio.run(run())
@@ -461,16 +455,14 @@ def test_a_sign_out_that_the_disk_refuses_is_told(
 
 @pytest.mark.parametrize('how', ['new tokens', 'others may read it', 'it is gone', 'twelve hours'])
 def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    """A viewer and a Foxglove, within some rounds; they cannot come back by it. The other role goes on if its token is good."""
-    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
+    """Within some rounds; a viewer cannot come back by it. The other role continues if its token is valid."""
+    monkeypatch.setattr(module, 'CHECK_S', 0.05)
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page, aiohttp.ClientSession(headers={'Origin': page.origin}) as session:
-            path = json.loads((await page.ask('viewer', 'GET', '/api/foxglove'))[2])['path']
             cookies = {who: {'Cookie': f'shadowhound_live={page.cookies[who]}'} for who in ('viewer', 'operator')}
             viewer = await session.ws_connect(f'{page.origin}/ws', headers=cookies['viewer'])
             operator = await session.ws_connect(f'{page.origin}/ws', headers=cookies['operator'])
-            foxglove = await session.ws_connect(f'{page.origin}{path}', protocols=PROTOCOLS)
             await answers(viewer, 1)
             await answers(operator, 1)
             token = page.folder / 'viewer.token'
@@ -481,14 +473,12 @@ def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monk
             elif how == 'it is gone':
                 token.unlink()
             else:
-                monkeypatch.setattr(page.server._access, '_now', lambda: time.time() + LASTS_S)
+                monkeypatch.setattr(page.server.auth.access, '_now', lambda: time.time() + LASTS_S)
             await ended(viewer)
-            await ended(foxglove)
             is_of_all = how in ('new tokens', 'twelve hours')
             await (ended(operator) if is_of_all else answers(operator, 2))
             for who, status in (('viewer', 401), ('operator', 401 if is_of_all else 200)):
                 assert (await page.ask(who, 'GET', '/api/session'))[0] == status
-            assert (await page.ask('stranger', 'GET', path))[0] == 401
             await operator.close()
 
     asyncio.run(run())
@@ -496,7 +486,7 @@ def test_connections_end_with_the_sign_in_that_they_came_by(tmp_path: Path, monk
 
 def test_who_needs_no_token_watches_on_whatever_becomes_of_the_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the loopback; an operator there is ended and may come back as a viewer."""
-    monkeypatch.setattr(module, 'ASK_AGAIN_S', 0.05)
+    monkeypatch.setattr(module, 'CHECK_S', 0.05)
 
     async def run() -> None:
         async with (
@@ -513,7 +503,6 @@ def test_who_needs_no_token_watches_on_whatever_becomes_of_the_tokens(tmp_path: 
             again = await session.ws_connect(f'{page.origin}/ws', headers=signed_in)
             await answers(again, 4)
             assert (await page.ask('operator', 'POST', '/api/act', body=ACT))[0] == 403
-            assert (await page.ask('stranger', 'GET', '/api/foxglove'))[0] == 503  # nothing can sign a ticket
             await viewer.close()
             await again.close()
 
@@ -539,12 +528,12 @@ def test_the_viewers_and_their_messages_are_bounded(tmp_path: Path, monkeypatch:
             serving(tmp_path, monkeypatch, '127.0.0.1') as page,
             aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
         ):
-            there = [await session.ws_connect(f'{page.origin}/ws') for _ in range(MOST_VIEWERS)]
+            there = [await session.ws_connect(f'{page.origin}/ws') for _ in range(MAX_VIEWERS)]
             with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
                 await session.ws_connect(f'{page.origin}/ws')
             assert refused.value.status == 429
             first, second = there[:2]
-            await first.send_str('x' * (MOST_MESSAGE + 1))
+            await first.send_str('x' * (MAX_MESSAGE + 1))
             while (message := await first.receive(60.0)).type is aiohttp.WSMsgType.BINARY:
                 pass
             assert first.close_code == 1009 or message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR)
@@ -611,14 +600,14 @@ def test_a_viewer_that_chooses_again_and_again_changes_what_is_read_seldom(
             aiohttp.ClientSession(headers={'Origin': page.origin}) as session,
         ):
             viewer = await session.ws_connect(f'{page.origin}/ws')
-            monkeypatch.setattr(module, 'REWATCH_S', 3600.0)
+            monkeypatch.setattr(viewers_module, 'REWATCH_S', 3600.0)
             seen = []
             for number in range(50):
                 await viewer.send_json({'watch': [f'/topic_{number}'], 'ping': number})
                 while f'"ping":{number},'.encode() not in (await viewer.receive_bytes(timeout=60)):
                     pass
-                if not seen or page.server._wanted != seen[-1]:
-                    seen.append(page.server._wanted)
+                if not seen or page.server.viewers.wanted != seen[-1]:
+                    seen.append(page.server.viewers.wanted)
             assert len(seen) <= 3  # what happens each second looks as well
             await viewer.close()
 
@@ -627,7 +616,7 @@ def test_a_viewer_that_chooses_again_and_again_changes_what_is_read_seldom(
 
 def test_whoever_asks_for_nothing_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Connections that never say what they want, or say it for ever, go; a viewer stays, and others are answered."""
-    monkeypatch.setattr(module, 'MOST_CONNECTIONS', 8)
+    monkeypatch.setattr(module, 'MAX_CONNECTIONS', 8)
 
     async def run() -> None:
         async with (
@@ -641,7 +630,8 @@ def test_whoever_asks_for_nothing_keeps_nobody_out(tmp_path: Path, monkeypatch: 
                 writer.write(b'GET / HTTP/1.1\r\nX-Slow: ' if number % 2 else b'')
                 slow.append((reader, writer))
             assert (await page.ask('stranger', 'GET', '/'))[0] == 200
-            monkeypatch.setattr(module, 'REQUEST_S', 0.2)
+            for each in (module, answers_module):
+                monkeypatch.setattr(each, 'REQUEST_S', 0.2)
             for reader, writer in slow:
                 with suppress(ConnectionError):
                     assert await asyncio.wait_for(reader.read(), 60) == b''

@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -563,7 +562,7 @@ class Served:
 
         async def show() -> None:
             while True:
-                self.server._on_items(made())
+                self.server.viewers.on_items(made())
                 await asyncio.sleep(seconds)
 
         return asyncio.run_coroutine_threadsafe(show(), self.loop).cancel
@@ -594,7 +593,7 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         monkeypatch.setattr(server_module, '_listener', lambda *_: listener)
         served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind=ROBOT), monkeypatch)
         stack.callback(served.close)
-        served.loop.call_soon_threadsafe(served.server._on_graph, {'/imu': IMU})
+        served.loop.call_soon_threadsafe(served.server.viewers.on_graph, {'/imu': IMU})
         stack.callback(served.every(0.03, numbered))
         program = machines.program(str(CHROMIUM), tmp_path)
         elsewhere = stack.enter_context(closing(browser.browser_type.launch(executable_path=program, args=FLAGS)))
@@ -661,7 +660,7 @@ def test_a_sign_in_that_has_ended_asks_for_the_token(browser: Browser, tmp_path:
 
 def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sign-in of before ends, and its connection with it; the page goes on by the new one, without a reload."""
-    monkeypatch.setattr(server_module, 'ASK_AGAIN_S', 0.2)
+    monkeypatch.setattr(server_module, 'CHECK_S', 0.2)
     settings = LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind='0.0.0.0', port=0)
     served = Served(settings, monkeypatch)
     try:
@@ -670,13 +669,13 @@ def test_a_viewer_becomes_an_operator(browser: Browser, tmp_path: Path, monkeypa
         press(page.locator('button.primary'))
         holds(page, 'shadowhound.count.figures > 0')
         page.evaluate('window.same = true')
-        (viewer,) = served.server._viewers
+        (viewer,) = served.server.viewers.connected
         press(page.get_by_role('button', name='Sign in as operator'))
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
         press(page.locator('dialog button.primary'))
         page.locator('[data-act=flush]').wait_for()
-        until(lambda: [one.who.role for one in served.server._viewers] == ['operator'], 'the connection of the operator')
-        assert viewer not in served.server._viewers
+        until(lambda: [one.who.role for one in served.server.viewers.connected] == ['operator'], 'the connection of the operator')
+        assert viewer not in served.server.viewers.connected
         count = counted(page, 'figures')
         holds(page, f'shadowhound.count.figures > {count}')
         assert page.evaluate('window.same')
@@ -755,10 +754,11 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
     served = Served(settings, monkeypatch)
     try:
         figures, gaps = told_of_names(time.time() * 1e3)
-        monkeypatch.setattr(served.server, '_figures', SimpleNamespace(now=lambda **_: figures, gaps=lambda *_: gaps))
-        monkeypatch.setattr(served.server, '_ask', lambda *_: {'ok': True, 'message': HOSTILE + LONG})
+        monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
+        monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: gaps)
+        monkeypatch.setattr(served.server.acts, '_ask', lambda *_: {'ok': True, 'message': HOSTILE + LONG})
         graph = {f'/{name}/{place}': 'sensor_msgs/msg/Imu' for name in NAMES for place in (1, 2)}
-        served.loop.call_soon_threadsafe(served.server._on_graph, graph)
+        served.loop.call_soon_threadsafe(served.server.viewers.on_graph, graph)
         page = opened(browser, served.server.url)
         press(page.get_by_role('button', name='Sign in', exact=True))
         page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
@@ -851,7 +851,7 @@ def test_each_cause_of_a_gap_has_its_own_colour(browser: Browser, tmp_path: Path
     })"""
     served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
     try:
-        monkeypatch.setattr(served.server, '_figures', SimpleNamespace(now=served.server._figures.now, gaps=lambda *_: gaps))
+        monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: gaps)
         page = opened(browser, served.server.url)
         holds(page, f'document.querySelectorAll("rect.gap").length === {len(causes)}')
         assert page.locator('rect.gap').evaluate_all('all => all.map(rect => rect.dataset.cause)') == causes
@@ -910,7 +910,7 @@ def test_what_is_played_is_asked_for_ahead(browser: Browser, tmp_path: Path, mon
         minute(store, tmp_path / 'tmp')
     store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
     served = Served(store_page, monkeypatch)
-    ask = served.server._history.ask
+    ask = served.server.past.history.ask
 
     wanted_ms: list[int] = []
     took_s: list[float] = []
@@ -925,7 +925,7 @@ def test_what_is_played_is_asked_for_ahead(browser: Browser, tmp_path: Path, mon
             return answer
         return await ask(asked)
 
-    monkeypatch.setattr(served.server._history, 'ask', ask_slowly)
+    monkeypatch.setattr(served.server.past.history, 'ask', ask_slowly)
     try:
         page = opened(browser, served.server.url)
         holds(page, '(shadowhound.past?.count ?? 0) > 0')

@@ -91,17 +91,17 @@ def publish(robot: LiveServer, number: int) -> None:
     """A frame of 40 KB and a row of figures."""
     at = asyncio.get_running_loop().time() * 1e3
     frame = LiveItem(CAMERA, 'camera', head={'at': at}, body=JPEG + bytes([number % 256]) * (40_000 - len(JPEG)))
-    robot._on_items([frame, table_item(IMU, KINDS['sensor_msgs/msg/Imu'], [(at, {'x': float(number)})])])
+    robot.viewers.on_items([frame, table_item(IMU, KINDS['sensor_msgs/msg/Imu'], [(at, {'x': float(number)})])])
 
 
 def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It signs in with the token of a viewer; frames arrive as they were, with their times; without viewers it is gone."""
 
     async def run(robot: Page, page: LiveServer) -> None:
-        robot.server._on_graph(GRAPH)
+        robot.server.viewers.on_graph(GRAPH)
         browsers = [Browser() for _ in range(VIEWERS)]
         tasks = [asyncio.create_task(browser.run(page)) for browser in browsers]
-        await until(lambda: [one.viewer.watched for one in robot.server._viewers] == [{CAMERA, IMU}])
+        await until(lambda: [one.viewer.watched for one in robot.server.viewers.connected] == [{CAMERA, IMU}])
         await until(lambda: all('topics' in browser.newest for browser in browsers))
         number = 0
         while not all({CAMERA, IMU} <= browser.newest.keys() for browser in browsers):
@@ -114,11 +114,11 @@ def test_ten_viewers_cost_the_robot_one_stream(tmp_path: Path, monkeypatch: pyte
             figures, rows = browser.newest[IMU]
             assert figures['names'] == ['x']
             assert abs(np.frombuffer(rows, '<f8', 1)[0] - figures['at']) < 1
-        assert len(robot.server._viewers) == 1
+        assert len(robot.server.viewers.connected) == 1
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await until(lambda: not robot.server._viewers)
+        await until(lambda: not robot.server.viewers.connected)
 
     async def both() -> None:
         async with AsyncExitStack() as stack:
@@ -133,7 +133,7 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The robot would lock this address out. Whoever watches is told; the new token is taken as soon as the file has it."""
-    monkeypatch.setattr(server, 'ASK_AGAIN_S', 0.05)
+    monkeypatch.setattr(server, 'CHECK_S', 0.05)
     monkeypatch.setattr(relay, 'AGAIN_S', 0.01)
     monkeypatch.setattr(relay, 'REFUSED_S', 3600.0)
     monkeypatch.setattr(relay, 'LOOK_S', 0.01)
@@ -147,8 +147,8 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
 
     async def run() -> None:
         async with serving(tmp_path / 'robot', monkeypatch) as robot:
-            robot.server.ros_problem = ''
-            robot.server._on_graph(GRAPH)
+            robot.server.viewers.ros_problem = ''
+            robot.server.viewers.on_graph(GRAPH)
             token = tmp_path / 'thor.token'
             token.write_text(robot.token('viewer'))
             token.chmod(0o600)
@@ -160,17 +160,17 @@ def test_a_token_that_the_robot_replaced_is_not_tried_again_and_again(
                     told: str | None = browser.newest.get('topics', ({'problem': None},))[0]['problem']
                     return told
 
-                await until(lambda: problem() == '' and robot.server._viewers)
+                await until(lambda: problem() == '' and robot.server.viewers.connected)
                 make_tokens(robot.folder, anew=True)
                 await until(lambda: 'refuses the token' in (problem() or ''))
                 looks.clear()
                 await until(lambda: len(looks) > 50)
-                assert len(robot.server._access._failures['127.0.0.1']) == 1
+                assert len(robot.server.auth.access._failures['127.0.0.1']) == 1
                 token.write_text('')  # it is being replaced
                 await until(lambda: 'holds no token' in (problem() or ''))
                 token.write_text(robot.token('viewer'))
-                await until(lambda: problem() == '' and robot.server._viewers)
-                assert len(robot.server._access._failures.get('127.0.0.1', ())) == 0
+                await until(lambda: problem() == '' and robot.server.viewers.connected)
+                assert len(robot.server.auth.access._failures.get('127.0.0.1', ())) == 0
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
         assert sum('refuses the token' in text for text in caplog.messages) == 1

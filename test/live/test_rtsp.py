@@ -10,29 +10,18 @@ import shutil
 import socket
 import stat
 import subprocess
-import sys
-import threading
-import time
-from dataclasses import replace
 from hashlib import new
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import simplejpeg
-from live.test_h264 import software_encoder
-from live.test_webrtc import CAMERA, LEVELS, Robot, robot, until
+from live.test_webrtc import CAMERA, LEVELS, robot, until
 from PIL import Image
 
-from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
-from shadowhound_data_logger.live import gstreamer as module
-from shadowhound_data_logger.live import h264, rtsp, rtsp_process
+from shadowhound_data_logger.live import rtsp as module
 from shadowhound_data_logger.live.access import make_tokens, rtsp_password
-from shadowhound_data_logger.live.gstreamer import PYTHON
-from shadowhound_data_logger.live.h264 import SOFTWARE
-from shadowhound_data_logger.live.kinds import LiveItem
-from shadowhound_data_logger.live.rtsp import RtspServer, RtspUnavailable, unsuited
+from shadowhound_data_logger.live.rtsp import PYTHON, RtspServer, RtspUnavailable, unsuited
 
 PROBE = """import gi
 for name in ('Gst', 'GstRtspServer'):
@@ -98,64 +87,6 @@ def test_a_machine_without_gstreamer_says_what_to_install(monkeypatch: pytest.Mo
         said = asyncio.run(run())
         assert 'gir1.2-gst-rtsp-server-1.0' in said
         assert 'secret' not in said
-
-
-BREAKS = """import json, os, struct, sys
-def read():
-    head, body = struct.unpack('<II', sys.stdin.buffer.read(8))
-    return json.loads(sys.stdin.buffer.read(head)), sys.stdin.buffer.read(body)
-def say(**what):
-    print(json.dumps(what), flush=True)
-def play():
-    say(watched=['/big', '/small'], jpegs=[topic for topic in ('/big', '/small') if topic in served['jpegs']])
-read()
-say(port=1)
-served, _ = read()
-if served['jpegs']:
-    play()
-else:
-    play()
-    while read()[0].get('topic') != '/small':
-        pass
-    {breaks}
-    play()
-sys.stdin.buffer.read()
-"""
-
-
-@pytest.mark.parametrize(('breaks', 'jpegs', 'why'), [
-    ('say(failed="/small", why="it cannot"); served, _ = read()', {'/small'}, 'it cannot, with pictures of 64 x 48'),
-    ('os.abort()', {'/big', '/small'}, 'the process has ended, with pictures of 64 x 48'),
-], ids=['it says so', 'it crashes'])  # fmt: skip
-def test_a_camera_whose_encoder_fails_is_sent_as_jpeg(
-    breaks: str, jpegs: set[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """For a while; each is told of once. Where the whole process went with it, so are all that were encoded by it."""
-    (tmp_path / 'script.py').write_text(BREAKS.replace('{breaks}', breaks))
-    monkeypatch.setattr(rtsp, 'SCRIPT', tmp_path / 'script.py')
-    monkeypatch.setattr(rtsp, 'AGAIN_S', 0.0)
-    monkeypatch.setattr(module, 'PYTHON', Path(sys.executable))
-
-    async def run() -> None:
-        server = RtspServer('127.0.0.1', 0, 'secret', lambda: None, SOFTWARE)
-        await server.open()
-        try:
-            server.serve(['/big', '/small'])
-
-            async def is_sent() -> bool:
-                for topic, picture in (('/big', jpeg(480, 640)), ('/small', jpeg(48, 64))):
-                    server.offer(LiveItem(topic, 'camera', head={'at': 1.0}, body=picture))
-                return server._jpegs == jpegs
-
-            await until(is_sent, 'JPEG')
-            assert {topic for topic in ('/big', '/small') if 'size' not in server._head(topic, jpeg(48, 64))} == jpegs
-        finally:
-            await server.close()
-
-    asyncio.run(run())
-    told = [record.getMessage() for record in caplog.records if 'is not encoded as H.264' in record.getMessage()]
-    assert sorted(text.split()[0] for text in told) == sorted(jpegs)
-    assert why in told[-1]
 
 
 def hashed(text: str) -> str:
@@ -240,14 +171,13 @@ def tos_of_packets(url: str, password: str, count: int) -> tuple[str, set[int]]:
 
 
 @pytest.mark.long("GStreamer's RTSP server")
-@pytest.mark.parametrize('encodes', [False, True], ids=['jpeg', 'h264'])
-def test_only_who_has_the_password_is_told_anything(encodes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_who_has_the_password_is_told_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without any it is 401, as with a wrong one; packets are marked as interactive video (AF41)."""
     if not has_gstreamer():
         pytest.skip(f'no GStreamer is installed here: {INSTALL}')
 
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch, rtsp=0, h264=software_encoder() if encodes else 'none') as found:
+        async with robot(tmp_path, monkeypatch, rtsp=0) as found:
             url, password = f'{found.server.rtsp_url}{CAMERA}', (tmp_path / 'live' / 'rtsp.password').read_text().strip()
             await until_served(url)
             for wrong in (None, '', 'a wrong one'):
@@ -257,150 +187,12 @@ def test_only_who_has_the_password_is_told_anything(encodes: bool, tmp_path: Pat
                     player.close()
                     assert status in ({401} if method == 'DESCRIBE' else {401, 454, 461}), text  # no session, no transport
                     assert 'm=video' not in text
-            assert found.server._wanted == {}
+            assert found.server.viewers.wanted == {}
             described, marks = await asyncio.to_thread(tos_of_packets, url, password, 5)
-            assert ('H264/90000' if encodes else 'm=video 0 RTP/AVP 26') in described
+            assert 'm=video 0 RTP/AVP 26' in described
             assert marks == {34 << 2}
 
     asyncio.run(run())
-
-
-@pytest.mark.long("GStreamer's RTSP server")
-def test_ffmpeg_plays_the_camera_as_h264(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also pictures that RFC 2435 cannot send; a player that comes later shares the encoder."""
-    av = pytest.importorskip('av')
-    encoder = software_encoder()
-
-    def play(url: str) -> tuple[str, list[tuple[int, int, int]]]:
-        """The codec, and width, height and brightness of some frames."""
-        with av.open(url, options={'rtsp_transport': 'tcp'}, timeout=60.0) as played:
-            frames: list[tuple[int, int, int]] = []
-            for frame in played.decode(video=0):
-                pixels = frame.to_ndarray(format='rgb24')
-                frames.append((frame.width, frame.height, int(pixels[frame.height // 2, frame.width // 2, 1])))
-                if len(frames) == 6:
-                    break
-            return played.streams.video[0].codec_context.name, frames
-
-    async def publish(found: Robot) -> None:
-        """Beside the camera of 4:2:0 one that RFC 2435 does not know: 4:4:4, with odd sides."""
-        while True:
-            picture = simplejpeg.encode_jpeg(np.full((241, 323, 3), 130, np.uint8), 90, colorsubsampling='444')
-            found.server._on_items([LiveItem('/odd', 'camera', head={'at': time.monotonic() * 1e3}, body=bytes(picture))])
-            await asyncio.sleep(0.1)
-
-    async def run() -> None:
-        async with robot(tmp_path, monkeypatch, rtsp=0, h264=encoder) as found:
-            assert found.server.h264 == encoder
-            found.server._on_graph({CAMERA: COMPRESSED_IMAGE, '/odd': COMPRESSED_IMAGE})
-            odd = asyncio.create_task(publish(found))
-            password = (tmp_path / 'live' / 'rtsp.password').read_text().strip()
-            for topic in (CAMERA, '/odd'):
-                await until_served(f'{found.server.rtsp_url}{topic}')
-            urls = [
-                f'{found.server.rtsp_url}{topic}'.replace('://', f'://viewer:{password}@') for topic in (CAMERA, '/odd', CAMERA)
-            ]
-            (codec, frames), (_, odds), (_, more) = await asyncio.gather(*(asyncio.to_thread(play, url) for url in urls))
-            assert codec == 'h264'
-            for width, height, level in frames + more:
-                assert (width, height) == (320, 240)
-                assert min(abs(level - (20 + 18 * number)) for number in range(LEVELS)) < 9
-            assert {(width, height) for width, height, _ in odds} == {(322, 240)}
-            assert all(abs(level - 130) < 9 for *_, level in odds)
-
-            async def is_idle() -> bool:
-                return found.server._wanted == {}
-
-            await until(is_idle, 'nothing is read')
-            odd.cancel()
-            await asyncio.gather(odd, return_exceptions=True)
-
-    asyncio.run(run())
-
-
-@pytest.mark.long("GStreamer's RTSP server")
-def test_a_camera_that_the_encoder_takes_no_pictures_of_is_sent_as_jpeg(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Encoders in hardware have a least size. The first player is refused, those after it are not; other cameras stay H.264."""
-    encoder = software_encoder()
-    least = 'capsfilter caps="video/x-raw,width=(int)[128,4096],height=(int)[96,4096]" ! '
-    monkeypatch.setattr(h264, 'SOFTWARE', replace(SOFTWARE, launch=least + SOFTWARE.launch))
-
-    def describe(url: str, password: str) -> tuple[int, str]:
-        with contextlib.closing(Player(url, password)) as player:
-            return player.ask('DESCRIBE')
-
-    async def publish(found: Robot) -> None:
-        while True:
-            found.server._on_items([LiveItem('/small', 'camera', head={'at': time.monotonic() * 1e3}, body=jpeg(64, 64))])
-            await asyncio.sleep(0.1)
-
-    async def run() -> None:
-        async with robot(tmp_path, monkeypatch, rtsp=0, h264=encoder) as found:
-            found.server._on_graph({CAMERA: COMPRESSED_IMAGE, '/small': COMPRESSED_IMAGE})
-            small = asyncio.create_task(publish(found))
-            password = (tmp_path / 'live' / 'rtsp.password').read_text().strip()
-            urls = {topic: f'{found.server.rtsp_url}{topic}' for topic in (CAMERA, '/small')}
-            for url in urls.values():
-                await until_served(url)
-            assert (await asyncio.to_thread(describe, urls['/small'], password))[0] == 503
-
-            async def is_played() -> str:
-                status, described = await asyncio.to_thread(describe, urls['/small'], password)
-                return described if status == 200 else ''
-
-            assert 'm=video 0 RTP/AVP 26' in await until(is_played, 'JPEG')
-            status, described = await asyncio.to_thread(describe, urls[CAMERA], password)
-            assert (status, 'H264/90000' in described) == (200, True)
-            small.cancel()
-            await asyncio.gather(small, return_exceptions=True)
-
-    asyncio.run(run())
-    told = [record.getMessage() for record in caplog.records if 'is not encoded as H.264 over RTSP' in record.getMessage()]
-    assert [(text.split()[0], 'with pictures of 64 x 64' in text) for text in told] == [('/small', True)]
-
-
-@pytest.mark.long("GStreamer's RTSP server, which waits 20 s")
-@pytest.mark.parametrize('is_fed', [True, False])
-def test_a_camera_of_which_the_encoder_makes_nothing_is_sent_as_jpeg(is_fed: bool, caplog: pytest.LogCaptureFixture) -> None:
-    """One that is silent itself is not the encoder's fault."""
-    software_encoder()
-    element = replace(SOFTWARE, launch=f'valve drop=true ! {SOFTWARE.launch}')
-
-    def describe(url: str) -> tuple[int, str]:
-        with contextlib.closing(Player(url, 'secret')) as player:
-            player._socket.settimeout(60.0)
-            return player.ask('DESCRIBE')
-
-    async def publish(server: RtspServer) -> None:
-        while True:
-            server.offer(LiveItem(CAMERA, 'camera', head={'at': time.monotonic() * 1e3}, body=jpeg(480, 640)))
-            await asyncio.sleep(0.05)
-
-    async def run() -> None:
-        server = RtspServer('127.0.0.1', 0, 'secret', lambda: None, element)
-        await server.open()
-        camera = asyncio.create_task(publish(server) if is_fed else asyncio.sleep(0))
-        try:
-            server.serve([CAMERA])
-            url = f'rtsp://127.0.0.1:{server.port}{CAMERA}'
-            await until_served(url)
-            assert (await asyncio.to_thread(describe, url))[0] == 503
-            if is_fed:
-
-                async def is_played() -> str:
-                    status, described = await asyncio.to_thread(describe, url)
-                    return described if status == 200 else ''
-
-                assert 'm=video 0 RTP/AVP 26' in await until(is_played, 'JPEG')
-        finally:
-            camera.cancel()
-            await asyncio.gather(camera, return_exceptions=True)
-            await server.close()
-
-    asyncio.run(run())
-    assert ['nothing came of' in text for text in caplog.messages if 'is not encoded' in text] == [True] * is_fed
 
 
 @pytest.mark.long("GStreamer's RTSP server and client")
@@ -430,14 +222,14 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return b''.join(await said).decode()
 
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch, rtsp=0, h264='none') as found:
-            server, rtsp = found.server, found.server._rtsp
+        async with robot(tmp_path, monkeypatch, rtsp=0) as found:
+            server, rtsp = found.server, found.server.cameras.rtsp
             assert rtsp is not None
             players: list[tuple[str, ...]] = []
-            monkeypatch.setattr(rtsp, '_changed', lambda: (players.append(rtsp.players), server._rewatch()))
+            monkeypatch.setattr(rtsp, '_changed', lambda: (players.append(rtsp.players), server.viewers.rewatch()))
 
             async def is_idle() -> bool:
-                return server._wanted == {}
+                return server.viewers.wanted == {}
 
             url, password = f'{server.rtsp_url}{CAMERA}', (tmp_path / 'live' / 'rtsp.password').read_text().strip()
             await until_served(url)
@@ -459,14 +251,3 @@ def test_gstreamer_plays_the_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             await until(has_left, 'nothing is read, and nobody plays')
 
     asyncio.run(run())
-
-
-def test_a_frame_for_a_player_who_has_left_is_passed_over() -> None:
-    """It was sent to one who got JPEG; who plays now gets H.264, which is encoded in a size that such a frame does not say."""
-    cameras = object.__new__(rtsp_process.Cameras)
-    source = Mock()
-    vars(cameras).update(_lock=threading.Lock(), _sources={CAMERA: (source, Mock())}, _caps={}, _fed={}, _gst=Mock())
-    cameras.push({'topic': CAMERA, 'width': 64, 'height': 48}, b'jpeg')
-    source.emit.assert_not_called()
-    cameras.push({'topic': CAMERA, 'width': 64, 'height': 48, 'size': (64, 48)}, b'jpeg')
-    source.emit.assert_called_once()

@@ -118,7 +118,7 @@ def test_a_relay_gives_its_token_to_nobody_whom_it_cannot_trust(
         async with AsyncExitStack() as stack:
             robot = await stack.enter_async_context(secured(tmp_path, authorities['stranger'].sign('page'), monkeypatch))
             asked: list[str] = []
-            monkeypatch.setattr(robot._access, 'sign_in', lambda token, _: asked.append(token))
+            monkeypatch.setattr(robot.auth.access, 'sign_in', lambda token, _: asked.append(token))
             page = await stack.enter_async_context(tower(tmp_path, f'https://127.0.0.1:{robot.port}', tokens['viewer']))
             browser = Browser()
             task = asyncio.create_task(browser.run(page))
@@ -183,7 +183,7 @@ def test_a_store_page_relays_a_robot_that_it_trusts(
     async def run() -> None:
         async with AsyncExitStack() as stack:
             robot = await stack.enter_async_context(secured(tmp_path, certificate, monkeypatch))
-            robot._on_graph(GRAPH)
+            robot.viewers.on_graph(GRAPH)
             token = tmp_path / 'live' / 'viewer.token'
             page = await stack.enter_async_context(store_page(tmp_path, robot, token, trusted))
             browser = Browser()
@@ -193,10 +193,10 @@ def test_a_store_page_relays_a_robot_that_it_trusts(
                 while not {CAMERA, IMU} <= browser.newest.keys():
                     publish(robot, number := number + 1)
                     await asyncio.sleep(0.02)
-                assert [one.who.role for one in robot._viewers] == ['viewer']
+                assert [one.who.role for one in robot.viewers.connected] == ['viewer']
             else:
                 await until(lambda: 'certificate' in browser.newest.get('topics', ({'problem': ''},))[0]['problem'])
-                assert not robot._viewers
+                assert not robot.viewers.connected
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 

@@ -103,7 +103,7 @@ async def until(condition: Callable[[], bool], what: str, seconds: float = 60.0,
 async def robot(folder: Path) -> AsyncIterator[Robot]:
     from rclpy.node import Node
 
-    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', port=0, h264='none'))
+    server = LiveServer(LiveSettings(spool=folder / 'spool', robot='thor', tokens=folder / 'live', port=0))
     await server.open()
     node = Node('talker', start_parameter_services=False, enable_rosout=False)
     try:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import shutil
-import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,11 +13,9 @@ import numpy as np
 import pytest
 import simplejpeg
 from live.test_access import Page, serving
-from live.test_h264 import software_encoder
 
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
-from shadowhound_data_logger.live import h264
-from shadowhound_data_logger.live import server as module
+from shadowhound_data_logger.live import cameras as cameras_module
 from shadowhound_data_logger.live.kinds import LiveItem
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
@@ -76,15 +72,15 @@ class Robot:
     async def publish(self) -> None:
         while True:
             self.at.append(round(asyncio.get_running_loop().time() * 1e3, 1))
-            self.server._on_items([LiveItem(CAMERA, 'camera', head={'at': self.at[-1]}, body=picture(len(self.at) - 1))])
+            self.server.viewers.on_items([LiveItem(CAMERA, 'camera', head={'at': self.at[-1]}, body=picture(len(self.at) - 1))])
             await asyncio.sleep(0.1)
 
 
 @asynccontextmanager
 async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> AsyncIterator[Robot]:
     async with serving(folder, monkeypatch, '127.0.0.1', **settings) as page:
-        page.server.no_video = ''
-        page.server._on_graph({CAMERA: COMPRESSED_IMAGE})
+        page.server.cameras.no_video = ''
+        page.server.viewers.on_graph({CAMERA: COMPRESSED_IMAGE})
         found = Robot(page)
         task = asyncio.create_task(found.publish())
         try:
@@ -96,8 +92,7 @@ async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) 
 
 @pytest.mark.long('a Chromium')
 @pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-@pytest.mark.parametrize('codec', ['video/VP8', 'video/H264'])
-def test_two_browsers_take_the_camera_as_video(codec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_browsers_take_the_camera_as_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is encoded once for both; each frame has the time at which it came to the robot; JPEGs are not sent beside it.
 
     When a viewer goes back to JPEG it gets those, and without viewers nothing is encoded.
@@ -108,10 +103,8 @@ def test_two_browsers_take_the_camera_as_video(codec: str, tmp_path: Path, monke
     shown = """() => [document.querySelector('.camera canvas').getContext('2d').getImageData(160, 120, 1, 1).data[1],
                       shadowhound.at().camera, shadowhound.video.frames]"""
 
-    named = 'none' if codec == 'video/VP8' else software_encoder()
-
     async def run() -> None:
-        async with robot(tmp_path, monkeypatch, h264=named) as found, api.async_playwright() as playwright:
+        async with robot(tmp_path, monkeypatch) as found, api.async_playwright() as playwright:
             browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
             tabs = [await browser.new_page() for _ in range(2)]
             for tab in tabs:
@@ -120,14 +113,14 @@ def test_two_browsers_take_the_camera_as_video(codec: str, tmp_path: Path, monke
                 await tab.select_option('[data-video]', 'video')
             for tab in tabs:
                 await until(lambda tab=tab: tab.evaluate('shadowhound.video.frames > 10'), 'frames of video')
-            video = found.server._video
+            video = found.server.cameras.video
             assert video is not None
             assert len(video._peers) == 2
             assert video.topics == {CAMERA}
-            assert video._encoders.keys() == {(CAMERA, codec)}
+            assert video._encoders.keys() == {CAMERA}
             (encoder,) = video._encoders.values()
             assert encoder.encoded <= len(found.at)
-            assert all(CAMERA not in one.viewer.watched for one in found.server._viewers)
+            assert all(CAMERA not in one.viewer.watched for one in found.server.viewers.connected)
             for tab in tabs:
                 told = [await tab.evaluate(shown) for _ in range(20)]
                 for level, at, _ in told:
@@ -159,16 +152,16 @@ def test_a_page_without_the_extra_shows_jpegs_and_says_why(tmp_path: Path, monke
             browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
             tab = await browser.new_page()
             tab.set_default_timeout(90_000)
-            found.server.no_video = module.NO_WEBRTC
+            found.server.cameras.no_video = cameras_module.NO_WEBRTC
             await tab.goto(found.page.origin)
-            assert await tab.locator('[data-video]').get_attribute('title') == module.NO_WEBRTC
-            found.server.no_video = ''
+            assert await tab.locator('[data-video]').get_attribute('title') == cameras_module.NO_WEBRTC
+            found.server.cameras.no_video = ''
             await tab.reload()
             await tab.locator('select[data-video]').wait_for()
-            found.server.no_video = module.NO_WEBRTC
+            found.server.cameras.no_video = cameras_module.NO_WEBRTC
             await tab.select_option('[data-video]', 'video')
             await until(lambda: tab.evaluate('shadowhound.video.problem.value'), 'a problem')
-            assert module.NO_WEBRTC in await tab.locator('[data-video]').get_attribute('title')
+            assert cameras_module.NO_WEBRTC in await tab.locator('[data-video]').get_attribute('title')
             before = await tab.evaluate('shadowhound.count.camera')
             await until(lambda: tab.evaluate(f'shadowhound.count.camera > {before} + 5'), 'frames as JPEG')
             await browser.close()
@@ -228,10 +221,10 @@ class Receiver:
 
 
 @asynccontextmanager
-async def encoded(named: str) -> AsyncIterator[tuple[Any, list[float]]]:
+async def encoded() -> AsyncIterator[tuple[Any, list[float]]]:
     """The video of a camera of ten frames a second, and when each came, ms."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
-    video = webrtc.CameraVideo(lambda: None, await h264.find_h264(named))
+    video = webrtc.CameraVideo(lambda: None)
     at: list[float] = []
 
     async def publish() -> None:
@@ -257,143 +250,26 @@ def assert_is_of_its_time(seen: list[tuple[float, int]], at: list[float]) -> Non
         assert abs(level - (20 + 18 * (number % LEVELS))) < 9, 'the time is that of another frame'
 
 
-@pytest.mark.long("GStreamer's encoder of H.264")
-def test_viewers_of_h264_share_an_encoder_and_one_without_it_takes_vp8() -> None:
-    """Each frame has the time at which it came to the robot, in either codec; the last to go ends its encoder's process."""
-    named = software_encoder()
+def test_viewers_share_an_encoder_and_one_without_its_codec_is_refused() -> None:
+    """Each frame has the time at which it arrived at the robot; the last viewer to leave ends the encoder."""
 
     async def run() -> None:
-        async with encoded(named) as (video, at):
-            receivers = [Receiver(video, 'video/VP8', 'video/H264'), Receiver(video, 'video/H264'), Receiver(video, 'video/VP8')]
+        async with encoded() as (video, at):
+            receivers = [Receiver(video, 'video/VP8', 'video/H264'), Receiver(video, 'video/VP8')]
             for receiver in receivers:
                 assert 'answer' in await receiver.ask()
-            assert video._encoders.keys() == {(CAMERA, 'video/H264'), (CAMERA, 'video/VP8')}
-            encoder = video._encoders[CAMERA, 'video/H264']
+            assert video._encoders.keys() == {CAMERA}
+            other = Receiver(video, 'video/H264')
+            assert 'problem' in await other.ask()
             for receiver in receivers:
                 await until(receiver.has_seen, 'frames of video')
                 assert_is_of_its_time(receiver.seen, at)
-            assert encoder.encoded <= len(at)
-            pid = encoder.pid
+            assert video._encoders[CAMERA].encoded <= len(at)
             for receiver in receivers:
                 video.end(receiver)
+            for receiver in (*receivers, other):
                 await receiver.close()
             assert not video._encoders
-
-            async def is_over() -> bool:
-                try:
-                    os.kill(pid, 0)
-                except ProcessLookupError:
-                    return True
-                return False
-
-            await until(is_over, 'the process has ended')
-
-    asyncio.run(run())
-
-
-@pytest.mark.long("GStreamer's encoder of H.264")
-def test_vp8_takes_over_where_the_encoder_of_h264_is_killed() -> None:
-    """Its viewers are told to ask again, and are given VP8, as whoever comes; those of VP8 see no difference."""
-    named = software_encoder()
-
-    async def run() -> None:
-        async with encoded(named) as (video, at):
-            first, other = Receiver(video, 'video/H264', 'video/VP8'), Receiver(video, 'video/VP8')
-            for receiver in (first, other):
-                await receiver.ask()
-                await until(receiver.has_seen, 'frames of video')
-            os.kill(video._encoders[CAMERA, 'video/H264'].pid, signal.SIGKILL)
-
-            async def is_told() -> bool:
-                return 'problem' in first.told[-1]
-
-            await until(is_told, 'a problem')
-            assert first.told[-1]['again']
-            assert named in first.told[-1]['problem']
-            assert not video.has_h264(CAMERA)
-            again = Receiver(video, 'video/H264', 'video/VP8')
-            assert 'VP8' in (await again.ask())['answer']
-            assert video._encoders.keys() == {(CAMERA, 'video/VP8')}
-            await until(again.has_seen, 'frames of VP8')
-            assert_is_of_its_time(again.seen + other.seen, at)
-            assert not [what for what in other.told if 'problem' in what]
-            for receiver in (first, other, again):
-                await receiver.close()
-
-    asyncio.run(run())
-
-
-@pytest.mark.long('a Chromium')
-@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
-def test_a_browser_goes_on_with_vp8_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """When the encoder of H.264 is killed: nobody has to choose video again."""
-    api = pytest.importorskip('playwright.async_api')
-    pytest.importorskip('aiortc')
-    named = software_encoder()
-
-    async def run() -> None:
-        async with robot(tmp_path, monkeypatch, h264=named) as found, api.async_playwright() as playwright:
-            browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox', '--disable-gpu'])
-            tab = await browser.new_page()
-            tab.set_default_timeout(90_000)
-            await tab.goto(found.page.origin)
-            await tab.select_option('[data-video]', 'video')
-            await until(lambda: tab.evaluate('shadowhound.video.frames > 5'), 'frames of video')
-            video = found.server._video
-            assert video is not None
-            (encoder,) = video._encoders.values()
-            os.kill(encoder.pid, signal.SIGKILL)
-
-            async def is_vp8() -> bool:
-                return set(video._encoders) == {(CAMERA, 'video/VP8')}
-
-            await until(is_vp8, 'VP8')
-            before = await tab.evaluate('shadowhound.video.frames')
-            await until(lambda: tab.evaluate(f'shadowhound.video.frames > {before} + 5'), 'frames of VP8')
-            assert await tab.evaluate('shadowhound.video.problem.value') == ''
-            await browser.close()
-
-    asyncio.run(run())
-
-
-def test_a_viewer_that_prefers_h264_is_sent_what_was_agreed_on() -> None:
-    """Without an encoder of H.264 that is VP8, although the offer has it last; with none of both there is no video."""
-    webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
-    lines = 'a=rtpmap:97 H264/90000\na=fmtp:97 packetization-mode=1;profile-level-id=42e01f\n'
-    both = OFFER.replace('SAVPF 96', 'SAVPF 97 96').replace('a=rtpmap:96', f'{lines}a=rtpmap:96')
-    alone = OFFER.replace('SAVPF 96', 'SAVPF 97').replace('a=rtpmap:96 VP8/90000\n', lines)
-    other = both.replace('packetization-mode=1', 'packetization-mode=0')
-
-    class Encoder:
-        """In the place of a process."""
-
-        def __init__(self, *_: Any) -> None: ...
-
-        def open(self) -> None: ...
-
-        async def close(self) -> None: ...
-
-    async def taken(offer: str, element: h264.H264Element | None) -> set[str]:
-        video = webrtc.CameraVideo(lambda: None, element)
-        told: list[dict[str, Any]] = []
-        await video.take('viewer', {'topic': CAMERA, 'offer': offer}, ('127.0.0.1', '127.0.0.1'), told.append)
-        codecs = {codec for _, codec in video._encoders}
-        assert bool(codecs) is ('answer' in told[0])
-        if codecs:
-            lines = told[0]['answer'].splitlines()
-            first = next(line.split()[3] for line in lines if line.startswith('m=video'))
-            (name,) = [line.split()[1] for line in lines if line.startswith(f'a=rtpmap:{first} ')]
-            assert codecs == {f'video/{name.partition("/")[0]}'}
-        await video.close()
-        return codecs
-
-    async def run() -> None:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(webrtc, 'H264Encoder', Encoder)
-            cases = (both, 'H264', 'VP8'), (alone, 'H264', ''), (other, 'VP8', 'VP8'), (OFFER, 'VP8', 'VP8')
-            for offer, with_h264, without in cases:
-                assert await taken(offer, h264.HARDWARE[0]) == {f'video/{with_h264}'}
-                assert await taken(offer, None) == ({f'video/{without}'} if without else set())
 
     asyncio.run(run())
 

@@ -1,7 +1,6 @@
 // The live page: what the robot sees now, its data, and what is missing.
 import { batch, html, render, signal, useEffect, useRef, useState } from './vendor/preact.js';
 import { Cards, Controls, Findings, TopicTable } from './data.js';
-import { Foxglove } from './foxglove.js';
 import { Link } from './link.js';
 import { Plot, Ring } from './plots.js';
 import { busy, openRobot, past, show } from './past.js';
@@ -311,7 +310,7 @@ function App() {
         <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
         <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
       ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} />
-        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}><${Foxglove} />` : html`<p class="empty">…</p>`}</section>`}
+        <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}>` : html`<p class="empty">…</p>`}</section>`}
       <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;

@@ -85,12 +85,9 @@ export class Video {
   }
 
   // What the robot says of it.
-  async take({ answer, problem, again, narrow, rtp, at }) {
+  async take({ answer, problem, narrow, rtp, at }) {
     if (narrow) {
       this.narrow = true;
-      this.follow();
-    } else if (again) {
-      this.stop(true);
       this.follow();
     } else if (problem) this.fail(problem);
     else if (rtp !== undefined) this.clock = { rtp, at };
