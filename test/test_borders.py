@@ -34,11 +34,12 @@ ALLOWED = {
     'av': {'datasets', 'live'},
     'aiortc': {'live'},
     'daft': {'datasets', 'lake'},
+    'deltalake': {'lake'},
     'obstore': {'stores'},
     'pyarrow': {'datasets', 'lake', 'live'},
 }
-HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'obstore', 'pyarrow', 'av',
-         'cryptography', 'onnxruntime', 'securesystemslib', 'tokenizers', 'tuf')  # fmt: skip
+HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'deltalake', 'obstore',
+         'pyarrow', 'av', 'cryptography', 'onnxruntime', 'securesystemslib', 'tokenizers', 'tuf')  # fmt: skip
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
 
@@ -125,11 +126,12 @@ def test_one_file_of_the_stores_knows_obstore() -> None:
 
 
 def test_only_the_tables_of_the_spools_index_send_sql_to_it() -> None:
-    """Other modules that send SQL have a database of their own: notes of an audit, what was fetched, a bag."""
+    """Other modules that send SQL have their own database: notes of an audit, what was fetched, a bag, the lake's tables."""
     tables = {path.relative_to(ROOT).as_posix() for path in ROOT.glob('spool/*_table.py')}
     index = {'spool/index.py', 'spool/schema.py', *tables}
     own = {
-        'spool/deliveries.py', 'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'bags/contents.py', 'bags/sqlite_repair.py',
+        'spool/deliveries.py', 'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'lake/tables.py', 'bags/contents.py',
+        'bags/sqlite_repair.py',
     }  # fmt: skip
     senders = {
         path.relative_to(ROOT).as_posix() for path in MODULES for node in nodes(path)
@@ -161,7 +163,7 @@ def test_a_robot_writes_the_catalogue_without_reading_it() -> None:
     program = f"""
 import sys
 from {PACKAGE}.shipping import catalog_writer
-print([name for name in ('daft', 'obstore', 'pyarrow') if name in sys.modules])
+print([name for name in ('daft', 'deltalake', 'obstore', 'pyarrow') if name in sys.modules])
 """
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)
     assert ran.stdout.strip() == '[]'

@@ -1,0 +1,286 @@
+"""The lake's Delta tables: where they are, their schemas, and the SQL engine that reads them (docs/decisions/0025).
+
+Robots write rows; only the lake writes tables. On an S3 server with a bucket ``lake`` the tables are shared: every reader opens
+the same ones. Otherwise they are below ``SHADOWHOUND_HOME/lake/``, one folder for each store, and can be deleted at any time.
+All tables are partitioned by date (UTC) and robot, and a row is never stored twice: its identity tells it from all others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake import CommitProperties, DeltaTable, QueryBuilder, Transaction, WriterProperties, write_deltalake
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+
+from shadowhound_data_logger.core.config import home
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.formats.rows.gaps import GAPS
+from shadowhound_data_logger.formats.rows.labels import LABELS
+from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.statistics import STATISTICS
+from shadowhound_data_logger.lake.bucket import Bucket
+
+BUCKET: Final = 'lake'
+"""Of the shared tables; robots cannot write it."""
+DATE, ROBOT, PART = 'date', 'robot', 'part'
+PARTITIONS: Final = (DATE, ROBOT)
+INGEST: Final = 'ingest'
+"""The application of the Delta transactions that add rows: of two that start from the same version, one fails."""
+GROUP_ROWS: Final = 16_384
+"""Of a row group: statistics can rule out whole groups."""
+_KINDS: Final = {
+    STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC'),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """One table: its name in SQL, its columns and what tells its rows apart."""
+
+    name: str
+    schema: pa.Schema
+    identity: tuple[str, ...]
+    """Columns; a row in which all of them are equal is the same row."""
+    time: str
+    """The column by which its files are ordered."""
+    partitions: tuple[str, ...] = PARTITIONS
+
+
+def _table(name: str, of: TableSchema, identity: Sequence[str], time: str) -> Table:
+    fields = [pa.field(DATE, pa.string()), *(pa.field(column, _KINDS[kind]) for column, kind in of.columns.items())]
+    return Table(name, pa.schema(fields), tuple(identity), time)
+
+
+OBJECT_ROWS: Final = _table('objects', OBJECTS, ('bucket', 'key', 't_start_ns'), 't_start_ns')
+INGESTED: Final = Table(
+    'ingested',
+    pa.schema([
+        (DATE, pa.string()), (ROBOT, pa.string()), (PART, pa.string()), ('ingested', _KINDS[TIME]), ('rows', pa.int64()),
+        ('rejected', pa.int64()), ('why', pa.string()),
+    ]),
+    (PART,), 'ingested', (DATE,),
+)  # fmt: skip
+"""Which row files the other tables contain: a row here is committed after all rows of its file."""
+TABLES: Final[Mapping[str, Table]] = {
+    OBJECTS.folder: OBJECT_ROWS,
+    KEPT.folder: _table('kept', KEPT, ('bucket', 'key', 'where', 'bytes'), 't_start_ns'),
+    FORGOTTEN.folder: _table('forgotten', FORGOTTEN, ('bucket', 'key'), 't_start_ns'),
+    GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what'), 'to_ns'),
+    STATISTICS.folder: _table('statistics', STATISTICS, ('bucket', 'key', 't_start_ns', 'field'), 't_start_ns'),
+    LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns'),
+}
+"""By the folder of the row files in the store."""
+SCHEMAS: Final[Mapping[str, TableSchema]] = {
+    each.folder: each for each in (OBJECTS, KEPT, FORGOTTEN, GAPS, STATISTICS, LABELS)
+}  # fmt: skip
+
+
+class Conflict(Exception):
+    """Another process added rows since the table was opened: open it again and look which rows are still missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """The tables of one store. A value: every call opens what it needs.
+
+    Nothing but a LakeError or Conflict leaves it.
+    """
+
+    root: str
+    """A folder, or a URL such as ``s3://lake``."""
+    options: Mapping[str, str] | None = field(default=None, repr=False)
+    is_shared: bool = False
+    """Whether other machines read the same tables."""
+
+    @classmethod
+    def of(cls, source: Bucket) -> Tables:
+        """Those of the store of this bucket: the shared ones if the server has them. Raises LakeError."""
+        if source.settings.endpoint_url:
+            shared = cls.shared(source.settings)
+            if shared.exists(INGESTED):
+                return shared
+        return cls.local(source)
+
+    @classmethod
+    def shared(cls, settings: StoreSettings) -> Tables:
+        """Those in the bucket ``lake`` of an S3 server, whether or not they exist yet."""
+        return cls(f's3://{BUCKET}', storage_options(settings), is_shared=True)
+
+    @classmethod
+    def local(cls, source: Bucket) -> Tables:
+        """Those of this user for one bucket."""
+        place = source.settings.endpoint_url or str(source.settings.directory.absolute())
+        name = hashlib.sha256(f'{place}\n{source.name}'.encode()).hexdigest()[:16]
+        return cls(str(home(os.environ) / 'lake' / name))
+
+    def exists(self, table: Table) -> bool:
+        """False as well for a bucket that does not exist or cannot be read."""
+        try:
+            return DeltaTable.is_deltatable(self._uri(table), self._options())
+        except (DeltaError, OSError):
+            return False
+
+    def create(self) -> None:
+        """The tables that do not exist yet; the one that says that all others do comes last."""
+        with translated():
+            for table in (*TABLES.values(), INGESTED):
+                if not self.exists(table):
+                    if not self.options:
+                        Path(self._uri(table)).mkdir(parents=True, exist_ok=True)
+                    DeltaTable.create(
+                        self._uri(table), table.schema, mode='ignore', partition_by=list(table.partitions),
+                        storage_options=self._options(),
+                    )  # fmt: skip
+
+    def open(self, table: Table, as_of: datetime | int | None = None) -> DeltaTable:
+        """A table at its newest version, at that of a time, or at a version by number."""
+        with translated():
+            found = DeltaTable(self._uri(table), storage_options=self._options())
+            if as_of is not None:
+                found.load_as_version(as_of)
+            return found
+
+    def append(self, opened: DeltaTable, table: Table, rows: pa.Table) -> None:
+        """Add rows that the opened version lacks. Raises Conflict if another process added rows since it was opened."""
+        if not len(rows):
+            return
+        version = (opened.transaction_version(INGEST) or 0) + 1
+        with translated():
+            write_deltalake(
+                opened, rows, mode='append', partition_by=list(table.partitions), writer_properties=writer(),
+                commit_properties=CommitProperties(app_transactions=[Transaction(INGEST, version)]),
+            )  # fmt: skip
+
+    def delete_local(self) -> None:
+        """Local tables are derived from the store: they are made again when they are needed."""
+        if not self.is_shared:
+            shutil.rmtree(self.root, ignore_errors=True)
+
+    def _uri(self, table: Table) -> str:
+        return f'{self.root}/{table.name}'
+
+    def _options(self) -> dict[str, str] | None:
+        return dict(self.options) if self.options else None
+
+
+def storage_options(settings: StoreSettings) -> dict[str, str]:
+    """As delta-rs has them. Commits are puts that fail if the version exists, so they need no other coordination."""
+    options = {
+        'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': 'true',
+        'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
+    }  # fmt: skip
+    if settings.access_key_id and settings.secret_access_key:
+        options |= {'AWS_ACCESS_KEY_ID': settings.access_key_id, 'AWS_SECRET_ACCESS_KEY': settings.secret_access_key}
+    if settings.session_token:
+        options['AWS_SESSION_TOKEN'] = settings.session_token
+    return options
+
+
+def writer() -> WriterProperties:
+    """How all files of the tables are written."""
+    return WriterProperties(compression='ZSTD', max_row_group_size=GROUP_ROWS)
+
+
+# -- the engine ----------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def engine(views: Mapping[str, DeltaTable | pa.Table]) -> Iterator[QueryBuilder]:
+    """An engine that knows these tables; rows in memory are written to a temporary table, which takes some 4 ms."""
+    with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
+        found = QueryBuilder()
+        for name, view in views.items():
+            table = view
+            if not isinstance(table, DeltaTable):
+                write_deltalake(f'{folder}/{name}', table, writer_properties=WriterProperties(compression='UNCOMPRESSED'))
+                table = DeltaTable(f'{folder}/{name}')
+            found.register(name, table)
+        yield found
+
+
+def batches(opened: QueryBuilder, sql: str) -> Iterator[pa.RecordBatch]:
+    """The answer piece by piece, as it is computed. Raises LakeError for what is not SQL or names no column."""
+    with translated():
+        found = pa.RecordBatchReader.from_stream(opened.execute(sql))
+        schema = _plain(found.schema)
+        for batch in found:
+            yield batch.cast(schema)
+
+
+def answer(opened: QueryBuilder, sql: str) -> pa.Table:
+    """The whole answer. Raises LakeError."""
+    with translated():
+        found = pa.RecordBatchReader.from_stream(opened.execute(sql))
+        return found.read_all().cast(_plain(found.schema))
+
+
+def missing(opened: DeltaTable, table: Table, rows: pa.Table) -> pa.Table:
+    """Of these rows each once that the table does not have at the opened version."""
+    if not len(rows):
+        return rows
+    same = ' AND '.join(f'(t."{name}" IS NOT DISTINCT FROM f."{name}")' for name in (*table.partitions, *table.identity))
+    where = [among(f't."{name}"', rows[name].unique().to_pylist()) for name in table.partitions]
+    first, last = (pc.min_max(rows[table.time])[end].as_py() for end in ('min', 'max'))
+    if first is not None and not rows[table.time].null_count and isinstance(first, int):
+        where.append(f't."{table.time}" BETWEEN {first} AND {last}')
+    identity = ', '.join(f'f."{name}"' for name in (*table.partitions, *table.identity))
+    columns = ', '.join(f'"{name}"' for name in table.schema.names)
+    known = f'SELECT 1 FROM known t WHERE {" AND ".join([*where, same])}'  # noqa: S608 - identifiers and quoted literals
+    ranked = f'row_number() OVER (PARTITION BY {identity} ORDER BY f."{table.time}") AS _copy'
+    new = f'SELECT f.*, {ranked} FROM fresh f WHERE NOT EXISTS ({known})'  # noqa: S608
+    sql = f'SELECT {columns} FROM ({new}) WHERE _copy = 1'  # noqa: S608
+    with engine({'fresh': rows, 'known': opened}) as ready:
+        return answer(ready, sql).cast(table.schema)
+
+
+def among(column: str, values: Iterable[Any]) -> str:
+    """A condition in SQL: one of these texts or numbers, None among them."""
+    found = list(values)
+    known = ', '.join(literal(value) for value in found if value is not None)
+    either = ([f'{column} IN ({known})'] if known else []) + ([f'{column} IS NULL'] if None in found else [])
+    return f'({" OR ".join(either) or "false"})'
+
+
+def literal(value: str | float) -> str:
+    """A text or a number in SQL."""
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    return repr(value)
+
+
+def _plain(schema: pa.Schema) -> pa.Schema:
+    """The engine's views of texts as texts."""
+    kinds = {pa.string_view(): pa.string(), pa.binary_view(): pa.binary()}
+    return pa.schema([each.with_type(kinds.get(each.type, each.type)) for each in schema])
+
+
+@contextmanager
+def translated() -> Iterator[None]:
+    """Errors of the library as ours: Conflict for a commit that another one prevented, else LakeError."""
+    try:
+        yield
+    except CommitFailedError as error:
+        raise Conflict(str(error)) from error
+    except TableNotFoundError as error:
+        raise LakeError(f'the lake has no such table: {_text(error)}') from error
+    except (DeltaError, pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise LakeError(f'the lake cannot answer: {_text(error)}') from error
+    except OSError as error:
+        raise LakeError(f'the tables of the lake cannot be read: {_text(error)}') from error
+
+
+def _text(error: Exception) -> str:
+    return ' '.join(str(error).split())[:400]
