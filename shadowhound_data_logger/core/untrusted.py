@@ -87,13 +87,17 @@ def csv_encoding(head: bytes) -> str:
 def csv_rows(body: bytes) -> csv.DictReader[str]:
     """The rows of a CSV file with a line of names; more cells than names are under ``''``. Raises ValueError, csv.Error."""
     text = body.decode(csv_encoding(body))
-    names = text.partition('\n')[0]
-    for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
-        if mark in names and ',' not in names:
-            raise ValueError(f'its columns are separated by {name}: save it with commas')
+    check_commas(text.partition('\n')[0])
     rows = csv.DictReader(StringIO(text, newline=''), strict=True, restkey='')
     rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
     return rows
+
+
+def check_commas(names: str) -> None:
+    """Raises ValueError for the line of names of a CSV file with another separator, as spreadsheets of some languages write."""
+    for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if mark in names and ',' not in names:
+            raise ValueError(f'its columns are separated by {name}: save it with commas')
 
 
 def csv_cell(value: object) -> object:

@@ -514,7 +514,11 @@ def _values(message: Any, kind: str, fields: Sequence[str]) -> NDArray[np.float6
     paths = fields or decode.FIELDS.get(kind, ())
     if kind == _ODOMETRY:
         paths = decode.whole_odometry(paths or decode.ODOMETRY)
-    found = [np.atleast_1d(np.asarray(attrgetter(path)(message), np.float64)).ravel() for path in paths]
+    found = []
+    for path in paths:
+        values, marker = np.atleast_1d(np.asarray(attrgetter(path)(message), np.float64)).ravel(), decode.marker_of(kind, path)
+        is_unknown = marker is not None and np.atleast_1d(attrgetter(marker)(message))[0] == -1
+        found.append(np.full_like(values, np.nan) if is_unknown else values)
     return np.concatenate(found) if found else np.empty(0)
 
 

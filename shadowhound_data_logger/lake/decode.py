@@ -61,6 +61,13 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     'geometry_msgs/msg/Twist': tuple(f'{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
 }  # fmt: skip
 """Type -> fields where none are asked for; of other types all numbers. An IMU is rad/s, m/s^2 and the quaternion w x y z."""
+_UNKNOWN: Final[Mapping[str, Mapping[str, str]]] = {
+    'sensor_msgs/msg/Imu': {
+        name: f'{name}_covariance' for name in ('orientation', 'angular_velocity', 'linear_acceleration')
+    },
+    'sensor_msgs/msg/NavSatFix': dict.fromkeys(('latitude', 'longitude', 'altitude'), 'status.status'),
+}  # fmt: skip
+"""See ``marker_of``; by the comments in Imu.msg and NavSatStatus.msg."""
 
 
 class ArchiveMember(NamedTuple):
@@ -235,7 +242,7 @@ class Table:
     stamps: NDArray[np.int64]
     """ns since 1970."""
     values: NDArray[np.float64]
-    """(messages, columns); null is NaN, ``"Infinity"`` an infinity."""
+    """(messages, columns); null and values that the message marks as unknown are NaN, ``"Infinity"`` is an infinity."""
 
     @property
     def nbytes(self) -> int:
@@ -250,12 +257,17 @@ def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str]
         asked = asked or _of_type(samples, kind)
         if kind == 'nav_msgs/msg/Odometry' and samples and 'pose' in samples[0]:
             asked = whole_odometry(asked)
-        columns = [_column(samples, name) for name in asked]
+        columns = [_column(samples, name, marker_of(kind, name)) for name in asked]
         values = np.hstack(columns) if columns else np.empty((len(samples), 0))
     except (LookupError, TypeError, ValueError, RecursionError, ArithmeticError, MemoryError) as error:
         raise LakeError(f'messages of {kind} have no numbers {", ".join(asked)}: {error}') from error
     order = np.argsort(stamps, kind='stable')
     return Table(stamps[order], values[order])
+
+
+def marker_of(kind: str, field: str) -> str | None:
+    """The field of which the first element is -1 where this one has no value; None if the type has no such mark."""
+    return _UNKNOWN.get(kind, {}).get(field.partition('.')[0])
 
 
 def whole_odometry(fields: Sequence[str]) -> tuple[str, ...]:
@@ -290,10 +302,13 @@ def _is_number(value: Any) -> bool:
     return value is None or isinstance(value, (int, float)) or (isinstance(value, str) and value in INFINITE)
 
 
-def _column(samples: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
+def _column(samples: Sequence[Mapping[str, Any]], name: str, marker: str | None) -> NDArray[np.float64]:
     path = name.split('.')
-    found = np.array([_at(sample, path) for sample in samples], np.float64)
-    return found.reshape(len(samples), -1)
+    found = np.array([_at(sample, path) for sample in samples], np.float64).reshape(len(samples), -1)
+    if marker is not None:
+        marks = np.array([_at(sample, marker.split('.')) for sample in samples], np.float64).reshape(len(samples), -1)
+        found[marks[:, 0] == -1] = np.nan
+    return found
 
 
 def _at(value: Any, path: Sequence[str]) -> Any:

@@ -52,7 +52,8 @@ MOST_DOCUMENTS: Final = 1000
 AT_A_TIME: Final = 500
 MOST_BYTES: Final = 2 << 30
 _TRIES: Final = 5
-_VERSION: Final = 2
+_APPLICATION, _VERSION = 0x53484944, 2
+"""An index of another version is removed and built again from the store."""
 _SCHEMA: Final = f"""
 CREATE TABLE documents (
   id INTEGER PRIMARY KEY, kind TEXT NOT NULL, robot TEXT NOT NULL, run_id TEXT, mission_id TEXT, mission_type TEXT,
@@ -62,7 +63,7 @@ CREATE INDEX by_run ON documents (robot, run_id) WHERE kind = 'mission';
 CREATE INDEX by_label ON documents (robot, kind, since_ns) WHERE kind = 'label';
 CREATE TABLE updates (begun_ns INTEGER NOT NULL, waiting INTEGER NOT NULL);
 CREATE VIRTUAL TABLE words USING fts5(title, text, tokenize = "unicode61 remove_diacritics 2", prefix = '2 3');
-PRAGMA application_id = 1397246276;
+PRAGMA application_id = {_APPLICATION};
 PRAGMA user_version = {_VERSION};
 """
 _FOUND: Final = (
@@ -107,6 +108,8 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
     """Bring the index up to date with the store, or make it. Raises StoreError, LakeError for a file that is something else."""
     findings = Findings() if findings is None else findings
     path.parent.mkdir(parents=True, exist_ok=True)
+    if _is_outdated(path):
+        path.unlink()
     is_new = not path.exists() or path.stat().st_size == 0
     begun_ns = time.time_ns()
     with _opened(path, is_new=is_new) as db:
@@ -364,11 +367,27 @@ def _opened(path: Path, *, is_new: bool = False) -> Iterator[sqlite3.Connection]
             db.execute('PRAGMA trusted_schema = OFF')
             if is_new:
                 db.executescript(f'BEGIN; {_SCHEMA} COMMIT;')
-            elif _definitions(db) != _expected():
-                raise LakeError(f'{path} is not an index of words of this version', remedy=f'remove it: {REMEDY}')
+            elif _definitions(db) != _expected() or _marks(db) != (_APPLICATION, _VERSION):
+                remedy = REMEDY if _marks(db)[0] == _APPLICATION else f'remove it: {REMEDY}'
+                raise LakeError(f'{path} is not an index of words of this version', remedy=remedy)
             yield db
     except sqlite3.Error as error:
         raise LakeError(f'the index of words {path} cannot be used: {error}', remedy=f'remove it: {REMEDY}') from error
+
+
+def _is_outdated(path: Path) -> bool:
+    """Whether it is an index of ours, of another version."""
+    if not path.is_file():
+        return False
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path)) as db:
+        application, version = _marks(db)
+        return application == _APPLICATION and (version != _VERSION or _definitions(db) != _expected())
+    return False
+
+
+def _marks(db: sqlite3.Connection) -> tuple[int, int]:
+    (application,), (version,) = (db.execute(f'PRAGMA {name}').fetchone() for name in ('application_id', 'user_version'))
+    return application, version
 
 
 def _definitions(db: sqlite3.Connection) -> list[tuple[str, str]]:

@@ -120,9 +120,16 @@ def _named(prefix: str, values: Sequence[float]) -> Iterator[tuple[str, float]]:
 
 
 def _imu(message: Any) -> dict[str, float]:
+    """Without what the message marks as unknown, by -1 as the first element of the covariance (Imu.msg)."""
+    found: dict[str, float] = {}
     rate, force = message.angular_velocity, message.linear_acceleration
-    return dict([*_named('rpy', _turn(message.orientation)), *_named('gyro', (rate.x, rate.y, rate.z)),
-                 *_named('accel', (force.x, force.y, force.z))])  # fmt: skip
+    if message.orientation_covariance[0] != -1:
+        found.update(_named('rpy', _turn(message.orientation)))
+    if message.angular_velocity_covariance[0] != -1:
+        found.update(_named('gyro', (rate.x, rate.y, rate.z)))
+    if message.linear_acceleration_covariance[0] != -1:
+        found.update(_named('accel', (force.x, force.y, force.z)))
+    return found
 
 
 def _go2_imu(message: Any) -> dict[str, float]:

@@ -12,10 +12,12 @@ from datasets.recorded import TOPICS, House, Mission, cdr_of, x_of
 from lake.gap_parts import tell
 from lake.making import add
 from lake.training import COMPRESSED, ODOMETRY
+from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, SliceEntry, topics_of
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.datasets import series
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, Lerobot, matrix
@@ -78,3 +80,17 @@ def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
     found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
     assert (found.refused, found.waiting) == ({}, {})
     assert {each['from'] for each in found.added[0]['streams'].values()} == {'objects'}
+
+
+def test_what_an_imu_marks_as_unknown_is_nan_in_a_bag_as_well() -> None:
+    """As in an object: a set is not made of an orientation that the IMU does not measure."""
+    types = get_typestore(Stores.ROS2_HUMBLE).types
+    vector, covariance = types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0), np.zeros(9)
+    header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](1, 0), '')
+    turn = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    for mark in (-1.0, 0.0):
+        unknown = np.array([mark, *[0.0] * 8])
+        message = types['sensor_msgs/msg/Imu'](header, turn, unknown, vector, covariance, vector, covariance)
+        values = series._values(message, 'sensor_msgs/msg/Imu', ())
+        assert values[:6].tolist() == [1.0, 2.0, 3.0] * 2
+        assert np.isnan(values[6:]).all() == (mark == -1.0)

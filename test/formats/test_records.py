@@ -235,6 +235,23 @@ def test_what_is_not_finite_has_a_form_in_json_and_is_counted(ros: Any) -> None:
     assert (lowstate['samples'][0]['power_a'], lowstate['non_finite']) == ('-Infinity', 1)
 
 
+@pytest.mark.parametrize(('kind', 'values'), [
+    ('sensor_msgs/msg/Imu', {'orientation_covariance': [-1.0, *[0.0] * 8]}),
+    ('sensor_msgs/msg/NavSatFix', {'status': {'status': -1, 'service': 1}, 'latitude': 48.1, 'position_covariance_type': 0}),
+    ('sensor_msgs/msg/Temperature', {'temperature': 41.5, 'variance': 0.0}),
+    ('sensor_msgs/msg/FluidPressure', {'fluid_pressure': 101325.0, 'variance': 0.0}),
+    ('sensor_msgs/msg/RelativeHumidity', {'relative_humidity': 0.42, 'variance': 0.0}),
+    ('sensor_msgs/msg/BatteryState', {'percentage': 0.73, 'capacity': 10.0}),
+])  # fmt: skip
+def test_values_and_marks_are_those_of_the_message(ros: Any, kind: str, values: dict[str, Any]) -> None:
+    """Marks of what is unknown (REP 145: -1) and units (degrees Celsius, pascal, 0 to 1) are stored unchanged."""
+    given = {name: np.array(value) if isinstance(value, list) else value for name, value in values.items()}
+    (sample,) = document(ros.encode(kind, ros.cdr(kind, **given), sensor='imu'))['samples']
+    assert {
+        name: pytest.approx(sample[name], rel=1e-6) if isinstance(sample[name], float) else sample[name] for name in values
+    } == values
+
+
 def test_the_word_null_is_no_number(ros: Any) -> None:
     """Text that contains ``null`` counts as nothing missing."""
     batch = document(ros.encode(JOINTS, ros.cdr(JOINTS, name=['null', 'a null', ',null,'])))

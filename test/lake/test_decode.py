@@ -72,6 +72,32 @@ def test_archives_of_the_node(tmp_path: Path, kind: str) -> None:
     ]
 
 
+@pytest.mark.parametrize('unknown', ['orientation', 'angular_velocity', 'linear_acceleration'])
+def test_what_an_imu_marks_as_unknown_is_nan(unknown: str) -> None:
+    """By -1 as the first element of its covariance; the -1 of another element is a covariance, and 0 is not known to be one."""
+
+    def sample(stamp_ns: int, first: float) -> dict[str, Any]:
+        found: dict[str, Any] = {'stamp_ns': stamp_ns}
+        for name, axes in (('orientation', 'xyzw'), ('angular_velocity', 'xyz'), ('linear_acceleration', 'xyz')):
+            found[name] = dict.fromkeys(axes, 0.5)
+            found[f'{name}_covariance'] = [first if name == unknown else 0.0, *[-1.0] * 8]
+        return found
+
+    values = table([sample(1, -1.0), sample(2, 0.0)], 'sensor_msgs/msg/Imu', (), 0).values
+    columns = [name.partition('.')[0] == unknown for name in decode.FIELDS['sensor_msgs/msg/Imu']]
+    assert np.isnan(values[0]).tolist() == columns
+    assert (values[1] == 0.5).all()
+
+
+def test_a_place_without_a_fix_is_nan() -> None:
+    """A receiver that has no fix (``status.status`` -1) repeats the last place, or reports 0."""
+    samples = [{'stamp_ns': number, 'status': {'status': status}, 'latitude': 48.1, 'longitude': 11.5, 'altitude': 520.0}
+               for number, status in enumerate((-1, 0, 2))]  # fmt: skip
+    found = table(samples, 'sensor_msgs/msg/NavSatFix', ('latitude', 'longitude', 'altitude', 'status.status'), 0).values
+    assert np.isnan(found[0]).tolist() == [True, True, True, False]
+    assert found[1:].tolist() == [[48.1, 11.5, 520.0, 0.0], [48.1, 11.5, 520.0, 2.0]]
+
+
 def test_records_become_numbers() -> None:
     """Lists and nested messages are columns in order, null is NaN, texts are left out, times get their offset and an order."""
     samples = [{'stamp_ns': 20, 'a': {'b': [1, 2]}, 'c': None, 'text': 'x', 'm': [{'q': 1}, {'q': 2}]},

@@ -218,3 +218,29 @@ def test_the_index_takes_little_more_than_the_words(tmp_path: Path) -> None:
             text += len(command.encode())
             search.add(db, [search.Document(kind='mission', robot='thor', title=command, text='')])
     assert path.stat().st_size < 3 * text
+
+
+def test_an_index_of_another_version_is_built_again(lake: Bucket, tmp_path: Path) -> None:
+    """By the next update, from the store; until then a search does not use it: it has other words."""
+    path = tmp_path / 'search.db'
+    search.update(path, lake)
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute('DELETE FROM words')
+        db.execute('PRAGMA user_version = 1')
+    with pytest.raises(LakeError, match='of this version') as raised:
+        search.search(path, 'door', wanted(0))
+    assert raised.value.remedy == search.REMEDY
+    assert search.update(path, lake).missions == len(MISSIONS)
+    assert 'm0' in missions(path, 'door')
+
+
+def test_a_file_of_another_program_is_left_alone(lake: Bucket, tmp_path: Path) -> None:
+    """It may be any database."""
+    path = tmp_path / 'search.db'
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute('CREATE TABLE precious (x)')
+    before = path.read_bytes()
+    with pytest.raises(LakeError, match='not an index') as raised:
+        search.update(path, lake)
+    assert 'remove it' in raised.value.remedy
+    assert path.read_bytes() == before

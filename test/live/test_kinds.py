@@ -186,6 +186,22 @@ def test_joints_without_end_are_cut() -> None:
     assert (len(item.head['names']), max(map(len, item.head['names']))) == (MOST_NAMES, MOST_NAME)
 
 
+@pytest.mark.parametrize(('unknown', 'names'), [
+    ('orientation', ['gyro', 'accel']), ('angular_velocity', ['rpy', 'accel']), ('linear_acceleration', ['rpy', 'gyro']),
+    ('', ['rpy', 'gyro', 'accel']),
+])  # fmt: skip
+def test_what_an_imu_does_not_measure_is_not_shown(unknown: str, names: list[str]) -> None:
+    """It says so by -1 as the first element of the covariance."""
+    name, vector = 'sensor_msgs/msg/Imu', new('geometry_msgs/msg/Vector3', x=1.0, y=2.0, z=3.0)
+    given: dict[str, Any] = {'orientation': new('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+                             'angular_velocity': vector, 'linear_acceleration': vector}  # fmt: skip
+    covariances = {f'{field}_covariance': np.array([-1.0 if field == unknown else 0.0, *[0.0] * 8]) for field in given}
+    message = cdr(new(name, header=header(), **given, **covariances), name)
+    item = series('/imu', KINDS[name], name, TYPES, [(10.0, message)])
+    assert item.head is not None
+    assert item.head['names'] == [f'{part}.{axis}' for part in names for axis in 'xyz']
+
+
 def test_the_imu_of_a_go2_reads_the_same_both_ways(tmp_path: Path) -> None:
     """At once, and field by field; what is of another length or byte order goes the second way."""
     (tmp_path / 'share').mkdir()

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.core.conditions import conditions
 from shadowhound_data_logger.missions.journal import Journal
+from shadowhound_data_logger.node.recording.mission_observer import BATTERY_STATE, battery_pct, number_at
 from shadowhound_data_logger.node.recording.triggers import LATE_NS, JournalTail, Judge
 
 NOW_NS = 1_760_788_800 * 10**9
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
@@ -41,6 +45,21 @@ def test_a_number_that_trembles_triggers_once() -> None:
 def test_what_is_no_number_tells_nothing() -> None:
     """Neither that the condition holds nor that it does not."""
     assert fired('x: t:f < 20 for 3', [19, float('nan'), 19, 19]) == [3]
+
+
+def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> None:
+    """From 0 to 1: only ``battery_pct`` is converted."""
+    (condition,) = conditions(['low: battery:percentage < 0.3'])
+    judge, kind = Judge(condition), STORE.types[BATTERY_STATE]
+    stamp, none = STORE.types['builtin_interfaces/msg/Time'](0, 0), np.empty(0, np.float32)
+    told = []
+    for share in (0.73, 0.25, float('nan')):
+        header = STORE.types['std_msgs/msg/Header'](stamp, '')
+        message = kind(header, 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
+        value = number_at(message, [*condition.field])
+        assert value is not None
+        told.append((judge.look(value, 10.0 * len(told)), battery_pct(message, [*condition.field])))
+    assert told == [(False, 73.0), (True, 25.0), (False, None)]
 
 
 def test_what_an_agent_logs_is_told_once(tmp_path: Path) -> None:
