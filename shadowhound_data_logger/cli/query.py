@@ -30,6 +30,8 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.errors import LakeError, SettingError
+from shadowhound_data_logger.core.expression import STORED, parse
 from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.lake.bucket import default_source
 
@@ -49,7 +51,7 @@ _OBJECTS: Final = {'bucket', 'key'}
     epilog=examples(
         'query --sensor camera --since yesterday --near 2.0,6.5,3 --sheet kitchen.jpg',
         'query --topic /odom --limit 5 --format csv',
-        "query --where 'imu.accelerometer.2 > 15' --since 7d --json > bumps.json",
+        "query --when 'imu.accelerometer.2 > 15' --since 7d --json > bumps.json",
         'query --sensor camera --ranges bumps.json',
         'query --sensor camera --like door.jpg --limit 20 --sheet doors.jpg',
         'query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since 7d',
@@ -60,7 +62,9 @@ _OBJECTS: Final = {'bucket', 'key'}
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
-@click.option('--scan', is_flag=True, help='Of a condition on values: open objects without statistics as well.')
+@click.option('--when', metavar='EXPRESSION',
+              help="When values in the objects were so: 'imu.accelerometer.2 > 15'. The answer is times.")  # fmt: skip
+@click.option('--scan', is_flag=True, help='With --when: open objects without statistics as well.')
 @click.option('--join', 'join_s', type=click.FloatRange(0.0), metavar='S',
               help='Times at most so far apart are one  [default: 1, or two periods of a slower sensor]')  # fmt: skip
 @click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
@@ -75,7 +79,7 @@ _OBJECTS: Final = {'bucket', 'key'}
     '--map', 'ground', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw where the objects were recorded.'
 )
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str,  # noqa: PLR0913 - one an option
-          as_json: bool, with_labels: bool, scan: bool, join_s: float | None, pad_s: float, like: Path | None,
+          as_json: bool, with_labels: bool, when: str | None, scan: bool, join_s: float | None, pad_s: float, like: Path | None,
           like_text: str | None, model: Path | None, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
@@ -83,30 +87,23 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
 
     SQL knows the views objects, missions, topics, gaps and watermarks, restricted by the flags.
 
-    A --where with SENSOR.FIELD, such as 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60', asks for values: the answer is
-    times, which --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
+    --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' is about the values in the objects: the answer is times, which
+    --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
 
     --like and --like-text compare all pictures that the flags choose and answer with the likest: 1 is the same, to the model.
 
     Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
-        from shadowhound_data_logger.lake import labels, names, values  # noqa: PLC0415
+        from shadowhound_data_logger.lake import labels, names  # noqa: PLC0415
 
-        if values.is_about_values(flags.get('where', '')):
+        if when is not None:
             if sql or sheet or ground or order or limit or with_labels or kind not in {'table', 'json'}:
-                raise BadUsage('a condition on values answers with times, as a table or JSON',
-                               'write them to a file with --json, and ask again with --ranges FILE')  # fmt: skip
-            source, left_out = default_source(the_store_settings()), quietly()
-            others = {name: value for name, value in flags.items() if name != 'where'}
-            found = values.ranges(flags['where'], source, scan=scan, join_s=join_s,
-                                  pad_s=pad_s, findings=left_out, **others)  # fmt: skip
-            if not found.objects:
-                names.check_names(source, left_out, **{'sensor': values.sensor_of(flags['where']), **others})
-            if found.fields:
-                names.check_name_of('field', values.field_of(flags['where'], found.fields), found.fields)
-            _print_times(flags['where'], found, is_json=as_json or kind == 'json')
-            return tell_left_out(left_out)
+                raise BadUsage('--when answers with times, as a table or JSON',
+                               'write them to a file with --json, and query again with --ranges FILE')  # fmt: skip
+            return _times(when, flags, scan=scan, join_s=join_s, pad_s=pad_s, is_json=as_json or kind == 'json')
+        if scan or join_s is not None or pad_s:
+            raise BadUsage('--scan, --join and --pad are about the times that --when finds', 'add --when, or leave them out')
         if sql and with_labels:
             raise BadUsage('--labels adds a column to objects, not to SQL', 'SQL has a view of its own: SELECT * FROM labels')
         source, left_out = default_source(the_store_settings()), quietly()
@@ -117,7 +114,10 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
             found = likest(source, like, like_text, model, limit or SHOWN, left_out, flags)
             limit = limit or SHOWN
         else:
-            found = _found(source, sql, flags, order, limit, left_out)
+            try:
+                found = _found(source, sql, flags, order, limit, left_out)
+            except LakeError as error:
+                raise _with_hint(error, flags.get('where')) from error
             if flags and not len(found if not sql else _found(source, None, flags, None, 1, left_out)):
                 names.check_names(source, left_out, **flags)
         if with_labels:
@@ -141,10 +141,33 @@ def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | 
         return (frame.limit(limit) if limit else frame).to_arrow()
 
 
+def _with_hint(error: LakeError, where: str | None) -> LakeError:
+    """The error of a ``--where`` that is no SQL over the columns, with what to do if it is about values."""
+    try:
+        parse(where or '', 'where', STORED)
+    except SettingError:
+        return error
+    return LakeError(error.what, remedy=f'--where is SQL over the columns; for values in the objects: --when {where!r}')
+
+
+def _times(when: str, flags: Mapping[str, Any], *, scan: bool, join_s: float | None, pad_s: float, is_json: bool) -> ExitCode:
+    """When values in the objects were so."""
+    from shadowhound_data_logger.lake import names, values  # noqa: PLC0415
+
+    source, left_out = default_source(the_store_settings()), quietly()
+    found = values.ranges(when, source, scan=scan, join_s=join_s, pad_s=pad_s, findings=left_out, **flags)
+    if not found.objects:
+        names.check_names(source, left_out, **{'sensor': values.sensor_of(when), **flags})
+    if found.fields:
+        names.check_name_of('field', values.field_of(when, found.fields), found.fields)
+    _print_times(when, found, is_json=is_json)
+    return tell_left_out(left_out)
+
+
 def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
     if is_json:
         fresh = [with_dates({**asdict(each), 'fresh_ns': each.fresh_ns}) for each in found.fresh]
-        print_json({'where': condition, **asdict(found), 'ranges': [with_dates(asdict(each)) for each in found.ranges],
+        print_json({'when': condition, **asdict(found), 'ranges': [with_dates(asdict(each)) for each in found.ranges],
                     'fresh': fresh})  # fmt: skip
         return
     table = plain_table('', ('robot', 'from (UTC)', 'to (UTC)', 'lasts', 'messages'), ('robot', 'from (UTC)', 'to (UTC)'))

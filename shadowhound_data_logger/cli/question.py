@@ -23,7 +23,7 @@ ranges_option = click.option(
     type=click.File('rb'),
     metavar='FILE.json',
     callback=lambda _, __, file: _ranges(file),
-    help='In one of these times: the answer of `query --where SENSOR.FIELD... --json`; - is stdin.',
+    help='In one of these times: the answer of `query --when ... --json`; - is stdin.',
 )
 FLAGS: Final = {
     'robot': click.option('--robot', metavar='NAME', help='Only of this robot.'),
@@ -43,11 +43,11 @@ FLAGS: Final = {
         '--succeeded', 'success', flag_value=True, type=bool, default=None, help='Only of missions that succeeded.'
     ),
     'policy': click.option('--policy', metavar='NAME[@7]', help='Only of missions in which this policy was active.'),
-    'where': click.option('--where', metavar='SQL', help="A condition, such as 'battery_pct < 30'."),
+    'where': click.option('--where', metavar='SQL', help="SQL over the columns, such as 'battery_pct < 30'."),
     'label': click.option('--label', metavar='NAME', help='With this label, or of a time that has it.'),
     'ranges': ranges_option,
 }
-_RANGES: Final = 'it is what `query --where SENSOR.FIELD... --json` prints'
+_RANGES: Final = 'it is what `query --when ... --json` prints'
 NAMES: Final = (
     'robot',
     'sensor',

@@ -12,8 +12,8 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core.conditions import conditions
 from shadowhound_data_logger.core.errors import NameRefused, SettingError
+from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.keys import KeyTemplate, check_name
 from shadowhound_data_logger.core.options import (
     ARCHIVES,

@@ -19,7 +19,7 @@ from shadowhound_data_logger.formats.rows.schema import UNDATED
 DAY: Final = timedelta(days=1)
 LONGEST_BATCH_NS: Final = 3600 * SECOND
 """A batch that began so long before a time can reach into it (``sensor.batch_s``)."""
-RANGES: Final = 'the ranges of `shadowhound-data query --where ... --json`: since_ns and until_ns in ns since 1970, and robot'
+RANGES: Final = 'the ranges of `shadowhound-data query --when ... --json`: since_ns and until_ns in ns since 1970, and robot'
 MOST_FOLDERS: Final = 400
 """Dates that are asked for by name; for a longer time the folders that there are are listed first."""
 

@@ -10,13 +10,12 @@ opened, and what they say counts: the answer is that of a loop over all messages
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -24,8 +23,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
-from shadowhound_data_logger.core.conditions import COMPARISONS, NUMBER
 from shadowhound_data_logger.core.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
+from shadowhound_data_logger.core.expression import MAX_SHOWN, STORED, Comparison, Expression, Joined, comparisons
+from shadowhound_data_logger.core.expression import parse as parse_expression
 from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
 from shadowhound_data_logger.formats.image import of_jpeg
 from shadowhound_data_logger.formats.pointcloud import of_points
@@ -50,10 +50,6 @@ from shadowhound_data_logger.lake.reading import Only, narrow, tables
 from shadowhound_data_logger.lake.scan import catalogue_rows, folders, planned
 from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, wanted
 
-ALLOWED: Final = (
-    "comparisons such as 'imu.accelerometer.2 > 15' or 'max(states.foot_force) > 200': sensor.field, or one of first last min "
-    'max mean count nan_count of it, then < <= > >= = != and a number; joined by and, or and parentheses'
-)
 MIN_JOIN_S: Final = 1.0
 """What is no further apart is one range, unless the sensor is slower."""
 MAX_JOIN_S: Final = 60.0
@@ -61,22 +57,9 @@ MAX_JOIN_S: Final = 60.0
 JOIN_PERIODS: Final = 2
 """A sampler keeps the first message of each period: two in a row are up to two periods apart."""
 OPENED_AT_A_TIME: Final = 64
-MOST_LEAVES: Final = 32
-MOST_TEXT: Final = 10_000
-"""Of a condition."""
-MOST_SHOWN: Final = 200
-"""Of one that is refused."""
-_PATH: Final = r'[A-Za-z_][\w-]*(?:\.(?:\w+|\*))+'
-_COMPARISON: Final = re.compile(
-    rf'\s*(?:(?P<function>{"|".join(NUMBERS)})\s*\(\s*(?P<inner>{_PATH})\s*\)|(?P<plain>{_PATH}))'
-    rf'\s*(?P<sign><=|>=|==|!=|<>|<|>|=)\s*(?P<number>{NUMBER})(?![\w.])', re.ASCII,
-)  # fmt: skip
-_WORD: Final = re.compile(r'\s*(and\b|or\b|\(|\)|$)', re.ASCII | re.IGNORECASE)
-_IS_VALUE: Final = re.compile(rf'(?<![\w.]){_PATH}', re.ASCII)
-_TEXT: Final = re.compile(r"'[^']*'")
+MAX_COMPARISONS: Final = 32
 _TINY: Final = 2.0**-140
 """Beyond what separates the least float32 from its decimal."""
-_SIGNS: Final = {'=': '==', '<>': '!='}
 _JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
 _KEY: Final = ('bucket', 'key', 't_start_ns')
 _SEEN: Final = ('sensor', 'topic', 't_start_ns', 't_end_ns')
@@ -86,30 +69,6 @@ _STATISTIC: Final = ('t_start_ns', 'field', *NUMBERS)
 _BY_QUERY: Final = ('near', 'mission', 'mission_type', 'success', 'policy', 'where')
 """Flags for which Daft is needed."""
 Mask = NDArray[np.bool_]
-
-
-class Comparison(NamedTuple):
-    """A field of a sensor against a number; ``function`` is empty where it is about each message."""
-
-    function: str
-    sensor: str
-    field: str
-    sign: str
-    number: float
-
-    def holds(self, values: Any) -> Any:
-        """Of a number or an array; NaN never does."""
-        return COMPARISONS[self.sign](values, self.number) & (values == values)  # noqa: PLR0124 - false for NaN alone
-
-
-class Joined(NamedTuple):
-    """Expressions, of which all must hold (``and``) or any (``or``)."""
-
-    word: str
-    parts: tuple[Comparison | Joined, ...]
-
-
-Expression = Comparison | Joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,63 +116,17 @@ class ValueAnswer:
     """Where a field is in no object: those that are there."""
 
 
-def is_about_values(text: str) -> bool:
-    """Whether a ``--where`` is a condition on values, and not SQL over the columns of the catalogue, which have no dots."""
-    return _IS_VALUE.search(_TEXT.sub('', text)) is not None
-
-
 def parse(text: str) -> Expression:
-    """Raises SettingError."""
-    if len(text) > MOST_TEXT:
-        raise SettingError('where', f'{text[:80]}...', f'at most {MOST_TEXT:,} letters')
-    found, at = _any(text, 0, 0)
-    if text[at:].strip():
-        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
-    asked = leaves(found)
-    if len(asked) > MOST_LEAVES:
-        raise SettingError('where', text[:MOST_SHOWN], f'at most {MOST_LEAVES} comparisons')
-    sensors = {each.sensor for each in asked}
+    """The condition of ``--when``: about the values of one sensor. Raises SettingError."""
+    found = parse_expression(text, 'when', STORED)
+    asked = comparisons(found)
+    if len(asked) > MAX_COMPARISONS:
+        raise SettingError('when', text[:MAX_SHOWN], f'at most {MAX_COMPARISONS} comparisons')
+    sensors = {each.source for each in asked}
     if len(sensors) > 1:
-        raise SettingError('where', text[:MOST_SHOWN], f'one sensor at a time, not {" and ".join(sorted(sensors))}: write the '
-                           'ranges of one with --json to a file, and ask for the other with --ranges')  # fmt: skip
+        raise SettingError('when', text[:MAX_SHOWN], f'one sensor at a time, not {" and ".join(sorted(sensors))}: write the '
+                           'ranges of one with --json to a file, and query the other with --ranges')  # fmt: skip
     return found
-
-
-def leaves(expression: Expression) -> list[Comparison]:
-    """All comparisons, from left to right."""
-    if isinstance(expression, Comparison):
-        return [expression]
-    return [leaf for part in expression.parts for leaf in leaves(part)]
-
-
-def _any(text: str, at: int, depth: int) -> tuple[Expression, int]:
-    return _joined('or', text, at, depth)
-
-
-def _joined(word: str, text: str, at: int, depth: int) -> tuple[Expression, int]:
-    parts: list[Expression] = []
-    while True:
-        part, at = _joined('and', text, at, depth) if word == 'or' else _one(text, at, depth)
-        parts.append(part)
-        after = _WORD.match(text, at)
-        if after is None or after[1].lower() != word or len(parts) >= MOST_LEAVES:
-            return parts[0] if len(parts) == 1 else Joined(word, tuple(parts)), at
-        at = after.end()
-
-
-def _one(text: str, at: int, depth: int) -> tuple[Expression, int]:
-    if found := _COMPARISON.match(text, at):
-        sensor, _, name = (found['inner'] or found['plain']).partition('.')
-        sign = _SIGNS.get(found['sign'], found['sign'])
-        return Comparison(found['function'] or '', sensor, name, sign, float(found['number'])), found.end()
-    bracket = _WORD.match(text, at)
-    if bracket is None or bracket[1] != '(' or depth >= MOST_LEAVES:
-        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
-    inner, at = _any(text, bracket.end(), depth + 1)
-    close = _WORD.match(text, at)
-    if close is None or close[1] != ')':
-        raise SettingError('where', text[:MOST_SHOWN], ALLOWED)
-    return inner, close.end()
 
 
 # -- the question --------------------------------------------------------------------------------------------------------------
@@ -227,7 +140,7 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     slower sensor), and each gets ``pad_s`` before and after it. Raises SettingError, LakeError for a wrong question, StoreError.
     """
     expression = parse(condition)
-    sensor = leaves(expression)[0].sensor
+    sensor = comparisons(expression)[0].source
     if flags.get('sensor', sensor) != sensor:
         raise SettingError('sensor', flags['sensor'], f'{sensor}, of which the condition is; leave it out')
     findings = Findings() if findings is None else findings
@@ -250,12 +163,12 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
 
 def sensor_of(condition: str) -> str:
     """Which sensor a condition is about. Raises SettingError."""
-    return leaves(parse(condition))[0].sensor
+    return comparisons(parse(condition))[0].source
 
 
 def field_of(condition: str, there: Sequence[str]) -> str:
     """The first field of a condition that is not among those there are. Raises SettingError."""
-    asked = [leaf.field for leaf in leaves(parse(condition))]
+    asked = [leaf.path for leaf in comparisons(parse(condition))]
     return next((field for field in asked if not any(covers(field, name) for name in there)), asked[0])
 
 
@@ -292,7 +205,7 @@ class _Question:
             )
         if pad_ns:
             found = _joined_spans(found + np.array([-pad_ns, pad_ns, 0]), 0)
-        sensor = leaves(self._expression)[0].sensor
+        sensor = comparisons(self._expression)[0].source
         return ValueAnswer(
             tuple(Range(self._robot, sensor, *each) for each in found.tolist()), seen.objects, len(to_open), unknown,
             tuple(self._freshness(seen)), () if len(found) or unknown else tuple(self._fields_instead(seen)),
@@ -319,9 +232,9 @@ class _Question:
             rows, seen = self._rows(chosen, np.setdiff1d(known, repeated, assume_unique=True))
         stamps = _stamps(rows)
         if not _is_among(stamps, known).all() or len(repeated):  # by their times alone they cannot be told apart
-            statistics = self._statistics(leaves(self._expression), stamps, _KEY)
+            statistics = self._statistics(comparisons(self._expression), stamps, _KEY)
             return rows, _Told(rows, statistics, _KEY, self._findings), seen
-        others = [leaf for leaf in leaves(self._expression) if leaf not in leads]
+        others = [leaf for leaf in comparisons(self._expression) if leaf not in leads]
         tables = [wholes.filter(pa.array(_is_among(_stamps(wholes), stamps))), *(table for table, _ in found)]
         if others:
             tables.append(self._statistics(others, stamps))
@@ -363,21 +276,21 @@ class _Question:
             return _by_statistics(lead, values)[0] | _contradictory(values)
 
         def is_worth_reading(table: pa.Table) -> Mask:
-            return _named(table, [lead.field]) & (may_hold(table) | np.isnan(_numbers(table, 'min')))
+            return _named(table, [lead.path]) & (may_hold(table) | np.isnan(_numbers(table, 'min')))
 
         found = [narrow(_STATISTIC, STATISTICS).empty_table()]
         exact = [np.zeros(0, np.int64)]
-        for table, kept in self._of_fields([lead.field], _STATISTIC, None if with_exact else Only(first, is_worth_reading)):
+        for table, kept in self._of_fields([lead.path], _STATISTIC, None if with_exact else Only(first, is_worth_reading)):
             found.append(_filtered(table, kept & may_hold(table)))
             if with_exact:
-                exact.append(_stamps(table)[kept & _are(table['field'], lead.field)])
+                exact.append(_stamps(table)[kept & _are(table['field'], lead.path)])
         return pa.concat_tables(found), np.concatenate(exact)
 
     def _statistics(self, of: Sequence[Comparison], stamps: NDArray[np.int64], key: Sequence[str] = ()) -> pa.Table:
         """The rows at these times of the fields that are asked for, and with a ``key`` those of the objects as a whole, too."""
         columns = tuple(dict.fromkeys((*key, *_STATISTIC)))
         only = Only(('t_start_ns',), lambda table: _is_among(_stamps(table), stamps))
-        names = [*([ALL] if key else []), *sorted({each.field for each in of})]
+        names = [*([ALL] if key else []), *sorted({each.path for each in of})]
         found = (_filtered(table, kept) for table, kept in self._of_fields(names, columns, only))
         return pa.concat_tables([narrow(columns, STATISTICS).empty_table(), *found]).combine_chunks()
 
@@ -405,7 +318,7 @@ class _Question:
             is_new = kept & (_stamps(table) >= seen.newest_ns - LONGEST_BATCH_NS)
             found.update(pc.unique(_filtered(table, is_new)['field']).to_pylist())
         found -= {ALL}
-        if not all(any(covers(leaf.field, name) for name in found) for leaf in leaves(self._expression)):
+        if not all(any(covers(leaf.path, name) for name in found) for leaf in comparisons(self._expression)):
             yield from found
 
     def _freshness(self, seen: _Sieve) -> Iterator[Freshness]:
@@ -477,6 +390,7 @@ def _leads(expression: Expression) -> list[Comparison]:
     """Comparisons of which at least one must hold for the expression to hold: as few as there are."""
     if isinstance(expression, Comparison):
         return [expression]
+    assert isinstance(expression, Joined)
     found = [_leads(part) for part in expression.parts]
     return min(found, key=len) if expression.word == 'and' else [lead for part in found for lead in part]
 
@@ -544,6 +458,7 @@ class _Told:
         if isinstance(expression, Comparison):
             may, must, unknown = self._leaf(expression)
             return may | unknown, must, may
+        assert isinstance(expression, Joined)
         join = np.logical_and if expression.word == 'and' else np.logical_or
         parts = [self.judged(part) for part in expression.parts]
         may, must, known = (reduce(join, each) for each in zip(*parts, strict=True))
@@ -554,8 +469,8 @@ class _Told:
         return np.isin(self._fields, codes)
 
     def _leaf(self, leaf: Comparison) -> tuple[Mask, Mask, Mask]:
-        chosen = self._of(lambda name: name != ALL and covers(leaf.field, name)) & ~self._false
-        is_exact = self._of(lambda name: name == leaf.field)
+        chosen = self._of(lambda name: name != ALL and covers(leaf.path, name)) & ~self._false
+        is_exact = self._of(lambda name: name == leaf.path)
         is_scalar = ~self._of(lambda name: '*' in name.split('.'))
         rows = self._rows[chosen]
         some, every = _by_statistics(leaf, {name: values[chosen] for name, values in self._values.items()})
@@ -573,7 +488,7 @@ class _Told:
 
 def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) -> tuple[Mask, Mask]:
     """Whether it holds for some of the numbers, and for all; of a statistic both are one, but for a mean that is near."""
-    low, high, number = values['min'], values['max'], leaf.number
+    low, high, number = values['min'], values['max'], leaf.value
     if leaf.function and leaf.function != 'mean':
         found: Mask = leaf.holds(values[leaf.function])
         return found, found
@@ -696,21 +611,23 @@ def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
         join = np.logical_and if expression.word == 'and' else np.logical_or
         found: Mask = reduce(join, [_met(part, messages) for part in expression.parts])
         return found
+    assert isinstance(expression, Comparison)
     if expression.function:
-        return np.full(len(messages), _met_by(expression, _collected(messages, (expression.field,)), None))
-    return np.array([any(map(expression.holds, values_of(each, expression.field))) for each in messages], bool)
+        return np.full(len(messages), _met_by(expression, _collected(messages, (expression.path,)), None))
+    return np.array([any(map(expression.holds, values_of(each, expression.path))) for each in messages], bool)
 
 
 def _met_by(expression: Expression, found: Mapping[str, Statistic], points: NDArray[Any] | None) -> bool:
     """Of an object of one message, or of a statistic."""
     if isinstance(expression, Joined):
         return (all if expression.word == 'and' else any)(_met_by(part, found, points) for part in expression.parts)
-    named = [(name, each) for name, each in found.items() if name != ALL and covers(expression.field, name)]
+    assert isinstance(expression, Comparison)
+    named = [(name, each) for name, each in found.items() if name != ALL and covers(expression.path, name)]
     if expression.function:
         values = [getattr(each, expression.function) for _, each in named]
         return any(value is not None and bool(expression.holds(float(value))) for value in values)
-    if points is not None and expression.sign == '==' and expression.field in (points.dtype.names or ()):
-        return bool(expression.holds(points[expression.field].astype(np.float64)).any())
+    if points is not None and expression.sign == '==' and expression.path in (points.dtype.names or ()):
+        return bool(expression.holds(points[expression.path].astype(np.float64)).any())
     ends = [value for _, each in named for value in (each.min, each.max) if value is not None]
     return any(bool(expression.holds(value)) for value in ends)
 

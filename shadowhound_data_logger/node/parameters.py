@@ -12,9 +12,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from shadowhound_data_logger.core.conditions import conditions
 from shadowhound_data_logger.core.config import NOT_SETTINGS, Settings
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
+from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import GROUPS
 from shadowhound_data_logger.core.rules import read_rule
 
@@ -179,7 +179,7 @@ def _check_topics(node: Node, settings: Settings) -> None:
         if topic:
             _resolve(node, 'events.topics', topic, list(settings.events.topics))
     for condition in conditions(settings.events.conditions):
-        _resolve(node, 'events.conditions', condition.topic, condition.text)
+        _resolve(node, 'events.conditions', condition.test.source, condition.test.text)
     for name, text in (
         ('upload.when', settings.upload.when),
         ('keep.when', settings.keep.when),

@@ -51,13 +51,13 @@ def told(home: Path, *arguments: str) -> Any:
 
 def test_an_answer_by_value_says_what_was_opened_what_is_unknown_and_up_to_when_it_is_fresh(home: Path) -> None:
     """The watermark, where that is before the newest object; as JSON with all of it."""
-    found = run(home, 'query', '--where', 's.a > 10')
+    found = run(home, 'query', '--when', 's.a > 10')
     assert found.output.splitlines()[1:] == [
         'thor   2026-10-28 12:07:00.400  2026-10-28 12:07:00.400  0.0 s         1', '',
         '1 time. 1 of 10 objects opened (10 %).', '2 objects without statistics may hold more: --scan opens them.',
         'thor /s: fresh up to 2026-10-28 12:07:00.000.',
     ]  # fmt: skip
-    found = told(home, 'query', '--where', 's.a > 10', '--scan')
+    found = told(home, 'query', '--when', 's.a > 10', '--scan')
     assert (len(found['ranges']), found['opened'], found['unknown']) == (3, 3, 0)
     assert found['fresh'][0]['fresh'] == '2026-10-28T12:07:00.000000000Z'
 
@@ -65,7 +65,7 @@ def test_an_answer_by_value_says_what_was_opened_what_is_unknown_and_up_to_when_
 def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Path) -> None:
     """By times of an answer, by object, with a box, from a CSV and from COCO; as a filter and a column of ``query``."""
     ranges = tmp_path / 'high.json'
-    ranges.write_text(run(home, 'query', '--where', 's.a > 10', '--json').output, encoding='utf-8')
+    ranges.write_text(run(home, 'query', '--when', 's.a > 10', '--json').output, encoding='utf-8')
     assert told(home, 'label', 'add', 'high', '--ranges', str(ranges))['added'] == 1
     assert told(home, 'label', 'add', 'person', '--key', LAST, '--box', '1,2,3,4')['added'] == 1
     table = tmp_path / 'labels.csv'
@@ -88,7 +88,7 @@ def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Pat
     labelled = [(row['key'], row['labels']) for row in told(home, 'query', '--labels') if row['labels']]
     assert labelled == [('thor/s/20261028/000000_s.json', ['first']), ('thor/s/20261028/000007_s.json', ['high']),
                         (LAST, ['mug', 'person'])]  # fmt: skip
-    assert told(home, 'query', '--where', 's.a >= 0', '--label', 'first')['objects'] == 1
+    assert told(home, 'query', '--when', 's.a >= 0', '--label', 'first')['objects'] == 1
     assert told(home, 'label', 'remove', '--label', 'mug')['removed'] == 1
     (first,) = (each['id'] for each in told(home, 'label', 'list', '--label', 'first'))
     assert run(home, 'label', 'remove', first, 'none').return_value == 1
@@ -112,15 +112,15 @@ def test_a_label_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str
     assert told(home, 'label', 'remove', given)['removed'] == 1
 
 
-@pytest.mark.parametrize(('where', 'remedy'), [
+@pytest.mark.parametrize(('when', 'remedy'), [
     ('s.aa > 1', "is it 'a'?"), ('z.a > 1', 'there are s'), ('s.a > 1 and s.aa > 1', "is it 'a'?"),
     ('max(s.aa) > 1 or s.aa < 0', "is it 'a'?"),
 ])  # fmt: skip
-def test_a_field_that_nothing_has_is_wrong_usage(tmp_path: Path, where: str, remedy: str) -> None:
+def test_a_field_that_nothing_has_is_wrong_usage(tmp_path: Path, when: str, remedy: str) -> None:
     """Wherever in the condition it is."""
     filled(tmp_path, BATCHES, [True] * 10)
     with pytest.raises(BadUsage) as raised:
-        run(tmp_path, 'query', '--where', where)
+        run(tmp_path, 'query', '--when', when)
     assert raised.value.remedy.startswith(remedy)
 
 

@@ -17,8 +17,8 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Claims, Held, Ring
-from shadowhound_data_logger.core.conditions import conditions
 from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import EventSettings
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -33,7 +33,7 @@ class EventConsumer(Consumer):
     """Hands messages to the ring and the conditions; it counts nothing and copies nothing."""
 
     def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: Claims) -> None:
-        watched = [(node.resolve_topic_name(each.topic), each) for each in conditions(settings.conditions)]
+        watched = [(node.resolve_topic_name(each.test.source), each) for each in conditions(settings.conditions)]
         named = [node.resolve_topic_name(topic) for topic in settings.topics if topic]
         self.inbox = Inbox(watched)
         self.wanted_topics = TopicChoice(settings, [*named, *self.inbox.conditions])

@@ -17,8 +17,8 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.bags.recorder import Answer
 from shadowhound_data_logger.core.clock import SECOND, Clock
-from shadowhound_data_logger.core.conditions import Condition
 from shadowhound_data_logger.core.errors import Rejected
+from shadowhound_data_logger.core.expression import Condition
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -55,7 +55,7 @@ class Inbox:
         for topic, condition in watched:
             self.conditions.setdefault(topic, []).append(condition)
         self._heard: dict[str, deque[tuple[float, str, Taken]]] = {topic: deque(maxlen=2 * SEEN) for topic in self.conditions}
-        self._fewest = {topic: all(each.hold_s for each in found) for topic, found in self.conditions.items()}
+        self._fewest = {topic: all(each.test.hold_s for each in found) for topic, found in self.conditions.items()}
 
     def put(self, topic: str, type_name: str, taken: Sequence[Taken], now_s: float) -> None:
         """A condition that has to hold for a time is content with one message of a drain."""
@@ -93,12 +93,12 @@ class Judge:
         """Whether this number, of that time by the monotonic clock, triggers. NaN triggers nothing."""
         if not math.isfinite(value):
             return False
-        if self.condition.holds(value) is not self._armed:
+        if bool(self.condition.test.holds(value)) is not self._armed:
             self._since_s = None
             return False
         if self._since_s is None:
             self._since_s = now_s
-        hold_s = self.condition.hold_s if self._armed else max(self.condition.hold_s, REARM_S)
+        hold_s = self.condition.test.hold_s if self._armed else max(self.condition.test.hold_s, REARM_S)
         if now_s - self._since_s < hold_s:
             return False
         self._armed, self._since_s = not self._armed, None
@@ -189,11 +189,12 @@ class EventWatch:
             return
         for judge in judges:
             condition = judge.condition
-            value = number_at(message, list(condition.field))
+            test = condition.test
+            value = number_at(message, test.path.split('.'))
             if value is None:
-                self._tell(condition.name, f'{type_name} has no number {".".join(condition.field)} ({condition.text})')
+                self._tell(condition.name, f'{type_name} has no number {test.path} ({test.text})')
             elif judge.look(value, now_s):
-                self._trigger(condition.name, CONDITION, f'{condition.text}: {value:g}', 0.0)
+                self._trigger(condition.name, CONDITION, f'{test.text}: {value:g}', 0.0)
 
     def _follow(self) -> None:
         """Read what agents logged; the journal of a mission that is over once more."""

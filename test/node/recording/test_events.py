@@ -16,7 +16,7 @@ from clocks import Clocks
 from e2e.reading import STRING
 
 from shadowhound_data_logger.bags.ring import Held, Ring
-from shadowhound_data_logger.core.conditions import conditions
+from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import EventSettings
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -145,7 +145,7 @@ class Watched:
     def __init__(self, home: Path, *texts: str, log_event: str = '.*') -> None:
         clock = Clocks()
         clock.set(NOON_NS)
-        self.inbox = Inbox([(condition.topic, condition) for condition in conditions(texts)])
+        self.inbox = Inbox([(condition.test.source, condition) for condition in conditions(texts)])
         self.triggered: list[tuple[str, str, str]] = []
         self.watch = EventWatch(self.inbox, MessageTypes(), home, clock, log_event, self._trigger)
 
@@ -167,7 +167,7 @@ def test_a_condition_triggers(tmp_path: Path) -> None:
     watched = Watched(tmp_path, 'low: /x:data < 20')
     for value in (30.0, 19.5, 18.0):
         watched.say(float64(value))
-    assert watched.triggered == [('low', 'condition', 'low: /x:data < 20: 19.5')]
+    assert watched.triggered == [('low', 'condition', '/x:data < 20: 19.5')]
 
 
 @pytest.mark.parametrize(('text', 'cdr', 'said'), [

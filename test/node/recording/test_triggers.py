@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.core.conditions import conditions
+from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.node.recording.mission_observer import BATTERY_STATE, battery_pct, number_at
 from shadowhound_data_logger.node.recording.triggers import LATE_NS, JournalTail, Judge
@@ -56,9 +56,9 @@ def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> No
     for share in (0.73, 0.25, float('nan')):
         header = STORE.types['std_msgs/msg/Header'](stamp, '')
         message = kind(header, 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
-        value = number_at(message, [*condition.field])
+        value = number_at(message, condition.test.path.split('.'))
         assert value is not None
-        told.append((judge.look(value, 10.0 * len(told)), battery_pct(message, [*condition.field])))
+        told.append((judge.look(value, 10.0 * len(told)), battery_pct(message, condition.test.path.split('.'))))
     assert told == [(False, 73.0), (True, 25.0), (False, None)]
 
 
