@@ -29,8 +29,8 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
+from shadowhound_data_logger.missions.pictures import NAMES
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running

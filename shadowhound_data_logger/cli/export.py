@@ -325,7 +325,7 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
 @_arm
 @_times
 @click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, help='Samples a second.')
-@click.option('--joints', default='', metavar='NAMES', help="Of qpos, in their order  [default: ALOHA's fourteen]")
+@click.option('--joints', default='', metavar='NAMES', help='Of qpos, in their order  [default: joint_0, joint_1, ...]')
 @as_json
 def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
                        as_json: bool) -> ExitCode:  # fmt: skip

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.pictures import NAMES
 from shadowhound_data_logger.missions.story import Story
 from shadowhound_data_logger.missions.values import MAX_PARAM
 

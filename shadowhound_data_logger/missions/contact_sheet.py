@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from PIL import Image, ImageDraw, ImageFont
 
@@ -21,6 +21,7 @@ LINE: Final = 20
 QUALITY: Final = 88
 INK: Final = '#22303c'
 PALE: Final = '#6b7884'
+_Item = TypeVar('_Item')
 
 
 class LoggedFrame(NamedTuple):
@@ -43,8 +44,7 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
     """
     if not frames:
         raise ValueError('no camera frame was sampled')
-    count = min(MOST, len(frames))
-    chosen = [frames[round(place * (len(frames) - 1) / max(1, count - 1))] for place in range(count)]
+    chosen = evenly(frames, MOST)
     columns = _columns(len(chosen))
     width = (WIDTH - GAP) // columns - GAP
     thumbs, broken = _thumbs(chosen, width)
@@ -68,6 +68,12 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
         _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
     sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)
     return f'{broken} of {len(chosen)} frames are not pictures' if broken else ''
+
+
+def evenly(items: Sequence[_Item], most: int) -> list[_Item]:
+    """At most so many of them, evenly chosen; the first and the last are among them."""
+    count = min(most, len(items))
+    return [items[round(place * (len(items) - 1) / max(1, count - 1))] for place in range(count)]
 
 
 def _columns(count: int) -> int:

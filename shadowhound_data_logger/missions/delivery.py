@@ -22,13 +22,12 @@ from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared
-from shadowhound_data_logger.missions.batch import send
-from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
 from shadowhound_data_logger.missions.objects import Spooler
+from shadowhound_data_logger.missions.pictures import Pictures, nothing
 from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, run_request, summary_of
-from shadowhound_data_logger.missions.tracking import Tracking
+from shadowhound_data_logger.missions.tracking import Tracking, send
 from shadowhound_data_logger.missions.values import MAX_TAG
 
 log = logging.getLogger(__name__)

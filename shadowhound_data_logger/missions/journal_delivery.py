@@ -14,10 +14,10 @@ from typing import Any, Final
 from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
-from shadowhound_data_logger.missions.batch import MOST_POINTS
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
 from shadowhound_data_logger.missions.objects import Item, objects_of
 from shadowhound_data_logger.missions.story import Point, Story
+from shadowhound_data_logger.missions.tracking import MOST_POINTS
 from shadowhound_data_logger.missions.values import MAX_KEYS
 
 TRIES: Final = 3

@@ -33,10 +33,10 @@ from shadowhound_data_logger.core.errors import DataLoggerError, TrackingRefused
 from shadowhound_data_logger.core.retry import backoff
 from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.overview import LOCK, STATE
+from shadowhound_data_logger.missions.pictures import Drawing
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.spool import clock_record
 

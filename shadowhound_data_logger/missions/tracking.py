@@ -12,7 +12,7 @@ import os
 import posixpath
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -54,6 +54,10 @@ OF_PATH: Final = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errn
 """The same of a folder."""
 RUN_GONE: Final = 'RUN_GONE'
 """``data['code']`` of the refusal of everything that belongs to a run that somebody deleted."""
+MOST_POINTS: Final = 1000
+"""MLflow's limit of a batch."""
+_Batch = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
+"""Points, params and tags."""
 S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
 _USER: Final = re.compile(r'//[^/\s]*@')
 
@@ -296,6 +300,33 @@ def _without(module: str) -> Iterator[None]:
         yield
     finally:
         del sys.modules[module]
+
+
+def send(tracking: Tracking, run_id: str, batch: _Batch, refused: Callable[[Exception], None]) -> None:
+    """Send a batch; what the server refuses is found by halving, reported to ``refused`` and skipped. Raises TrackingError."""
+    points, params, tags = batch
+    if not (points or params or tags):
+        return
+    try:
+        tracking.log(run_id, points, params, tags)
+    except TrackingRefused as error:
+        if error.data.get('code') == RUN_GONE:
+            raise
+        parts = _parts(points, params, tags)
+        for each in parts:
+            send(tracking, run_id, each, refused)
+        if not parts:
+            refused(error)
+
+
+def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[_Batch]:
+    """What a refused batch is split into; empty for a single item."""
+    if len(points) + len(params) + len(tags) <= 1:
+        return []
+    half = len(points) // 2
+    halves: list[_Batch] = [(points[:half], {}, {}), (points[half:], {}, {})]
+    singles: list[_Batch] = [([], {name: value}, {}) for name, value in params.items()]
+    return [*halves, *singles, *(([], {}, {name: value}) for name, value in tags.items())]
 
 
 def remedy_for(code: str) -> str:
