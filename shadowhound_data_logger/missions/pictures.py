@@ -25,19 +25,19 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.untrusted import check_commas, csv_encoding
 from shadowhound_data_logger.missions.folder import MissionFolder, read_json, write_json
-from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE, named
+from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE, named
 
 log = logging.getLogger(__name__)
 
 NS_SECONDS: Final = 1e17
-"""A timestamp above it is in nanoseconds: in seconds it would lie three billion years from now."""
+"""A timestamp above it is in nanoseconds: in seconds it would be three billion years from now."""
 MOST_STATES: Final = 20_000
 SHEET, TRAJECTORY, CHARGE = NAMES = ('camera_summary.jpg', 'trajectory.png', 'battery.png')
 PROGRAM: Final = 'shadowhound_data_logger.missions.pictures'
 DEADLINE_S: Final = 60.0
 """After it the process is killed."""
 Pictures = Callable[[MissionFolder, str], 'Mapping[str, str] | None']
-"""What became of the pictures of a mission with this title; None while they are being made."""
+"""Notes about the pictures of a mission with this title; None while they are being made."""
 
 
 class Drawing:
@@ -57,7 +57,7 @@ class Drawing:
         return self._process is not None
 
     def of(self, folder: MissionFolder, title: str) -> Mapping[str, str] | None:
-        """What became of a mission's pictures, None while they are being made. Raises OSError where no process can be started."""
+        """Notes about a mission's pictures, None while they are being made. Raises OSError if no process can be started."""
         if self._process is None:
             if notes := _notes(folder):
                 return notes
@@ -70,13 +70,13 @@ class Drawing:
             ended = True
         if not ended or self._folder is None:
             return None
-        said, self._process = self._process.returncode, None
+        code, self._process = self._process.returncode, None
         if not _notes(self._folder):
-            write_json(self._folder.pictures, dict.fromkeys(NAMES, f'the process that makes them ended with {said}'))
+            write_json(self._folder.pictures, dict.fromkeys(NAMES, f'the process that makes them exited with {code}'))
         return _notes(folder) if folder == self._folder else None
 
     def close(self) -> None:
-        """What is being made is made to its end, by itself."""
+        """A running process finishes on its own."""
         if self._process is not None:
             self._process.poll()
             self._process = None
@@ -98,12 +98,12 @@ def _notes(folder: MissionFolder) -> dict[str, str]:
 
 @dataclass(slots=True)
 class Material:
-    """What the pictures are made of."""
+    """The data for the pictures."""
 
     start_ns: int = 0
     frames: list[tuple[int, int, Path]] = field(default_factory=list)
     states: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {BATTERY: [], TEMPERATURE: []})
-    """Of each metric: seconds since the start, and the value."""
+    """For each metric: seconds since the start, and the value."""
     trajectory: Path | None = None
     policies: list[str | None] = field(default_factory=list)
 
@@ -124,7 +124,7 @@ class Material:
 
 
 def material_of(folder: MissionFolder) -> Material:
-    """From the agent's journal, and from the node's what the agent did not log. Raises OSError."""
+    """From the agent's journal, and from the node's if the agent did not log it. Raises OSError."""
     found, node = Material(), Material()
     for line in folder.lines():
         found.add(line.record or {}, folder.files)
@@ -141,7 +141,7 @@ def material_of(folder: MissionFolder) -> Material:
 
 
 def make(folder: MissionFolder, title: str) -> dict[str, str]:
-    """Make what can be made; each name with '' or what there is to say about it."""
+    """Make the pictures; each name with '' or a note about it."""
     from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet  # noqa: PLC0415 - the sender needs no Pillow
 
     material = material_of(folder)
@@ -154,7 +154,7 @@ def make(folder: MissionFolder, title: str) -> dict[str, str]:
 
 
 def read_path(path: Path) -> list[tuple[float, float, float]]:
-    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines that have no such numbers are left out.
+    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines without such numbers are skipped.
 
     Raises OSError, or ValueError for a file without these columns.
     """
@@ -177,12 +177,12 @@ def read_path(path: Path) -> list[tuple[float, float, float]]:
 
 
 def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
-    """Draw it; what there is to say about it. A file appears under its name only when it is whole."""
+    """Draw a picture; returns a note about it. The file gets its name only when it is complete."""
     part = target.with_name(f'.{os.getpid()}.{target.name}')
     try:
         note = draw(part) or ''
         os.replace(part, target)
-    except ValueError as error:  # there is nothing to show
+    except ValueError as error:  # there is nothing to draw
         note = f'not made: {error}'
     except ImportError as error:
         note = f'not made: {error} (pip install shadowhound_data_logger[missions])'
@@ -196,7 +196,7 @@ def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
 def _trajectory(material: Material, floor: Path, title: str, target: Path) -> None:
     if material.trajectory is None:
         raise ValueError('no trajectory was logged')
-    import numpy as np  # noqa: PLC0415 - nobody else here needs it
+    import numpy as np  # noqa: PLC0415 - unused elsewhere
 
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - a second, and not installed everywhere
 
@@ -223,7 +223,7 @@ def _seconds(text: str) -> float:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Make the pictures of the mission whose folder is given."""
+    """Make the pictures of the mission in the given folder."""
     folder = MissionFolder(Path(arguments[0]))
     write_json(folder.pictures, make(folder, arguments[1]))
     return 0

@@ -66,7 +66,7 @@ def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None
     folder.floor.write_bytes(b'no array')
     notes = make(folder, 'patrol_1')
     assert notes == {
-        'camera_summary.jpg': '1 of 3 frames are not pictures', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
+        'camera_summary.jpg': '1 of 3 frames are not images', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
     }  # fmt: skip
     assert notes['trajectory.png'].startswith('not made: ')
     assert sorted(path.name for path in folder.files.iterdir() if path.name in NAMES) == ['battery.png', 'camera_summary.jpg']
@@ -151,7 +151,7 @@ def test_a_process_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
     now[0] = pictures.DEADLINE_S + 1
     notes = until(lambda: here.of(folder, 'patrol_1'), 'it is given up')
     assert set(notes) == set(NAMES)
-    assert 'the process that makes them ended with' in notes['battery.png']
+    assert 'the process that makes them exited with' in notes['battery.png']
     assert not here.busy
 
 
