@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.errors import SpoolError, StoreUnavailable
 from shadowhound_data_logger.core.model import Binding, DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
 from shadowhound_data_logger.missions.state import BUCKET, TRAJECTORIES
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
@@ -111,7 +111,7 @@ class Spooler:
         self._used_s = 0.0
         self._node_drains = False
         self._is_new = True
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, clock, monotonic)
+        self._catalogue = CatalogWriter(settings.spool_path, settings.catalog, settings.robot, clock, monotonic)
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:
@@ -150,9 +150,9 @@ class Spooler:
         except SpoolError:
             return True
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         """Write the rows of the catalog soon: a mission has ended."""
-        self._catalogue.hasten()
+        self._catalogue.expedite()
 
     def drain(self) -> None:
         """Deliver for up to ``SLICE_S`` if no node does. Raises StoreError, SettingError or SpoolError."""
@@ -180,10 +180,10 @@ class Spooler:
         """Raises SpoolError."""
         if self.pending():
             return True
-        if self._spool is None or not self._settings.catalogue.enabled:
+        if self._spool is None or not self._settings.catalog.enabled:
             return False
         with self._using(self._spool) as spool:
-            return spool.has_uncatalogued()
+            return spool.has_uncataloged()
 
     def _drain(self, spool: Spool) -> None:
         with delivering(spool, self._settings, SLICE_S) as (uploader, writer):

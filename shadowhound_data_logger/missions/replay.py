@@ -121,7 +121,7 @@ class Replay:
         tried = [gate for gate in self.gates.values() if gate.is_open]
         for delivery in self._newest_first():
             if self._work(delivery):
-                self._spooler.hasten()
+                self._spooler.expedite()
                 self._settled.add(delivery.folder.mission_id)
                 del self._deliveries[delivery.folder.mission_id]
             if self._progress and self._monotonic() - began_s > SLICE_S:
@@ -163,9 +163,9 @@ class Replay:
         for gate in self.gates.values():
             gate.retry_now()
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         """The agent has exited: write the last rows of the catalog soon."""
-        self._spooler.hasten()
+        self._spooler.expedite()
 
     def close(self) -> None:
         self._spooler.close()
@@ -330,7 +330,7 @@ def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
         if parent.gone:
             if not replay.owes or time.monotonic() - worked_s > LINGER_S:
                 return
-            replay.hasten()
+            replay.expedite()
         woken = parent.wait(LOOK_EVERY_S)
 
 

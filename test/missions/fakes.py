@@ -89,7 +89,7 @@ class FakeSpooler:
     def drain(self) -> None:
         pass
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         pass
 
     def close(self) -> None:
