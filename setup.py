@@ -41,8 +41,8 @@ setup(
         'simplejpeg>=1.8',
     ],
     extras_require={
-        'datasets': ['av>=15', 'daft>=0.7.26,<0.8', 'deltalake>=1.6,<2', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],
-        'lake': ['daft>=0.7.26,<0.8', 'deltalake>=1.6,<2', 'matplotlib>=3.6', 'obstore>=0.11', 'pyarrow>=16'],
+        'datasets': ['av>=15', 'deltalake>=1.6,<2', 'h5py>=3.8', 'obstore>=0.11', 'pyarrow>=16'],
+        'lake': ['deltalake>=1.6,<2', 'matplotlib>=3.6', 'obstore>=0.11', 'pyarrow>=16'],
         'policies': [
             'cryptography>=48',
             'onnx>=1.16',

@@ -1,4 +1,4 @@
-"""A catalog of one-minute parts on the embedded Tower, asked before and after compaction; and ``fetch`` beside rclone and aws.
+"""A catalogue of one-minute parts on the embedded Tower, asked before and after compaction; and ``fetch`` beside rclone and aws.
 
 Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows.
 A question is for the camera frames near a point while the battery was low, on one day; importing Daft is not in it. The fetches
@@ -130,9 +130,10 @@ def ask(source: Any, day: int) -> tuple[float, list[str]]:
     """Seconds, and the keys of the frames near the door that day with the battery below 30 %."""
     since = datetime.fromtimestamp(FIRST_NS // SECOND, timezone.utc) + timedelta(days=day)
     began = time.perf_counter()
-    frame = query.objects(source, since=since, until=since + timedelta(days=1), sensor='camera', near=(3.2, 1.5, 2.0),
+    found = query.objects(source, columns=('key', 't_start', 'x', 'y', 'battery_pct'), since=since,
+                          until=since + timedelta(days=1), sensor='camera', near=(3.2, 1.5, 2.0),
                           where='battery_pct < 30')  # fmt: skip
-    keys = frame.select('key', 't_start', 'x', 'y', 'battery_pct').to_pydict()['key']
+    keys = found['key'].to_pylist()
     return time.perf_counter() - began, sorted(keys)
 
 
@@ -157,7 +158,6 @@ def questions(settings: StoreSettings, days: int) -> tuple[list[Bar], dict[str, 
     }
     day, expected = days // 2, oracle(days // 2)
     source = Counting(Bucket(settings, schema.BUCKET))
-    query.objects(source, robot='nobody').collect()  # Daft's threads and its first plan are part of importing it
     before = [_right(ask(source, day), expected) for _ in range(ROUNDS)]
     only = (
         list(source.dates) == [f'date={utc(FIRST_NS + day * DAY_NS):%Y-%m-%d}'] and sum(source.dates.values()) == ROUNDS * MINUTES

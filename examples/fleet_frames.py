@@ -1,4 +1,4 @@
-"""The sharp frames of a fleet, found by several worker processes: the catalog asked, the frames fetched, decoded and judged.
+"""The sharp frames of a fleet, found by several worker processes: the catalogue asked, the frames fetched, decoded and judged.
 
     python examples/fleet_frames.py --since yesterday --near=-0.6,3.1,2 --workers 4
     python examples/fleet_frames.py --since yesterday --runner ray --address ray://HEAD:10001 --workers 64
@@ -26,7 +26,9 @@ from shadowhound_data_logger.lake import decode, query
 from shadowhound_data_logger.lake.prefetch import Place, Prefetch
 from shadowhound_data_logger.lake.track import Object
 
-import daft  # isort: skip - after query, which turns its telemetry off
+os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # otherwise Daft reports each run to its makers
+os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
+import daft  # isort: skip
 from daft import DataType, Series, col  # isort: skip
 
 THREADS = 8
@@ -59,17 +61,18 @@ class Judge:
 
 def judged(pixels: Any) -> dict[str, float | None]:
     """Sharpness and mean brightness of an image, by its green, which most of what the eye takes for light is."""
-    gray = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
-    inner = gray[1:-1, 1:-1]
-    laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
-    return {'sharpness': float(np.var(laplacian)), 'brightness': float(gray.mean())}
+    grey = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return {'sharpness': float(np.var(laplacian)), 'brightness': float(grey.mean())}
 
 
 def frames(place: Place, workers: int, least: float, **flags: Any) -> daft.DataFrame:
     """A lazy frame: the rows of the sharp frames and how sharp they are, the sharpest first."""
     judge = daft.cls(Judge, use_process=True, max_concurrency=workers)(place)
-    rows = query.objects(sensor='camera', **flags).where(col('content_type').is_in(['image/jpeg', 'image/png']))
-    told = rows.select('robot', 'bucket', 'key', 't_start', 'x', 'y', 'bytes', 'sha256').into_batches(ROWS)
+    columns = ('robot', 'bucket', 'key', 't_start', 'x', 'y', 'bytes', 'sha256', 'content_type')
+    rows = daft.from_arrow(query.objects(sensor='camera', columns=columns, **flags))
+    told = rows.where(col('content_type').is_in(['image/jpeg', 'image/png'])).into_batches(ROWS)
     made = told.with_column('judged', judge.judge(col('bucket'), col('key'), col('bytes'), col('sha256')))
     plain = made.select('robot', 'key', 't_start', 'x', 'y', col('judged').get('sharpness').alias('sharpness'),
                         col('judged').get('brightness').alias('brightness'))  # fmt: skip

@@ -33,12 +33,11 @@ ALLOWED = {
     'tokenizers': {'lake'},
     'av': {'datasets', 'live'},
     'aiortc': {'live'},
-    'daft': {'datasets', 'lake'},
     'deltalake': {'lake'},
     'obstore': {'stores'},
     'pyarrow': {'datasets', 'lake', 'live'},
 }
-HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'daft', 'deltalake', 'obstore',
+HEAVY = ('rclpy', 'aiohttp', 'boto3', 'botocore', 'mlflow', 'numpy', 'PIL', 'sqlite3', 'deltalake', 'obstore',
          'pyarrow', 'av', 'cryptography', 'onnxruntime', 'securesystemslib', 'tokenizers', 'tuf')  # fmt: skip
 LATE = ('import_module', '__import__')
 MODULES = sorted(ROOT.rglob('*.py'))
@@ -158,12 +157,12 @@ def test_one_file_of_the_doctor_knows_ros() -> None:
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['ros_watch.py']
 
 
-def test_a_robot_writes_the_catalog_without_reading_it() -> None:
+def test_a_robot_writes_the_catalogue_without_reading_it() -> None:
     """What the node runs imports none of the packages that only the extra ``lake`` brings."""
     program = f"""
 import sys
 from {PACKAGE}.shipping import catalog_writer
-print([name for name in ('daft', 'deltalake', 'obstore', 'pyarrow') if name in sys.modules])
+print([name for name in ('deltalake', 'obstore', 'pyarrow') if name in sys.modules])
 """
     ran = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=60)
     assert ran.stdout.strip() == '[]'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import functools
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -15,7 +15,7 @@ import click
 from rich.console import RenderableType
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, store_hint, the_store_settings
-from shadowhound_data_logger.cli.likeness import model_option, most_similar
+from shadowhound_data_logger.cli.likeness import likest, model_option
 from shadowhound_data_logger.cli.output import (
     counted,
     duration,
@@ -28,7 +28,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
     with_dates,
 )
-from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, report_skipped
+from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.expression import STORED, parse
@@ -42,9 +42,10 @@ SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
 COLUMNS: Final = ('likeness', 't_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
 """Of a table of objects; the other formats have all."""
-MAX_POSES: Final = 20_000
-MAX_TIMES: Final = 100
+MOST_POSES: Final = 20_000
+MOST_TIMES: Final = 100
 _OBJECTS: Final = {'bucket', 'key'}
+_ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 
 
 @click.command(
@@ -72,6 +73,7 @@ _OBJECTS: Final = {'bucket', 'key'}
               help='The pictures that are most like this one, by vectors that `lake embed` made.')  # fmt: skip
 @click.option('--like-text', metavar='TEXT', help='The pictures that are most like these words; needs --model.')
 @model_option
+@click.option('--as-of', metavar='TIME', help='Answer from the tables of the lake as they were at this time.')
 @click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels of each object.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
@@ -80,7 +82,8 @@ _OBJECTS: Final = {'bucket', 'key'}
 )
 def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, kind: str,  # noqa: PLR0913 - one an option
           as_json: bool, with_labels: bool, when: str | None, scan: bool, join_s: float | None, pad_s: float, like: Path | None,
-          like_text: str | None, model: Path | None, sheet: Path | None, ground: Path | None) -> ExitCode:  # fmt: skip
+          like_text: str | None, model: Path | None, as_of: str | None, sheet: Path | None,
+          ground: Path | None) -> ExitCode:  # fmt: skip
     """Search what is stored, by flags or SQL.
 
     An object must match all flags; times are UTC.
@@ -90,9 +93,9 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' is about the values in the objects: the answer is times, which
     --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
 
-    --like and --like-text compare all images that the flags select, and list the most similar first; 1 is identical to the model.
+    --like and --like-text compare all pictures that the flags choose and answer with the likest: 1 is the same, to the model.
 
-    Exit code 1 when files of the catalog are damaged: they are left out, and named on standard error.
+    Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import labels, names  # noqa: PLC0415
@@ -109,13 +112,13 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         source, left_out = default_source(the_store_settings()), quietly()
         if like or like_text or model:
             if sql or order or bool(like) is bool(like_text):
-                raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the most similar first',
+                raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the likest first',
                                'leave out the other one, SQL and --order')  # fmt: skip
-            found = most_similar(source, like, like_text, model, limit or SHOWN, left_out, flags)
+            found = likest(source, like, like_text, model, limit or SHOWN, left_out, flags)
             limit = limit or SHOWN
         else:
             try:
-                found = _found(source, sql, flags, order, limit, left_out)
+                found = _found(source, sql, flags, order, limit, left_out, as_of)
             except LakeError as error:
                 raise _with_hint(error, flags.get('where')) from error
             if flags and not len(found if not sql else _found(source, None, flags, None, 1, left_out)):
@@ -128,17 +131,19 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         if sheet or ground:
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
     _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
-    return report_skipped(left_out)
+    return tell_left_out(left_out)
 
 
-def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, left_out: Any) -> Any:
-    from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - Daft takes half a second
+def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, left_out: Any,
+           as_of: str | None = None) -> Any:  # fmt: skip
+    from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - the extra lake
 
-    ask = functools.partial(lake.sql, sql) if sql else lake.objects
-    frame = ask(source, findings=left_out, **flags)
-    with lake.answering(order or '', {'': frame}):
-        frame = _ordered(frame, order or ('t_start_ns' if not sql else None))
-        return (frame.limit(limit) if limit else frame).to_arrow()
+    if order is not None and not all(_ORDER.fullmatch(part.strip()) for part in order.split(',')):
+        raise BadUsage(f'--order {order!r} is not a column', "--order 't_start desc' is one, in descending order")
+    if not sql:
+        return lake.objects(source, findings=left_out, order=order or 't_start_ns', limit=limit, as_of=as_of, **flags)
+    found = lake.sql(sql, source, findings=left_out, as_of=as_of, **flags)
+    return lake.ordered(found, order, limit) if order or limit else found
 
 
 def _with_hint(error: LakeError, where: str | None) -> LakeError:
@@ -161,7 +166,7 @@ def _times(when: str, flags: Mapping[str, Any], *, scan: bool, join_s: float | N
     if found.fields:
         names.check_name_of('field', values.field_of(when, found.fields), found.fields)
     _print_times(when, found, is_json=is_json)
-    return report_skipped(left_out)
+    return tell_left_out(left_out)
 
 
 def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
@@ -172,7 +177,7 @@ def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
         return
     table = plain_table('', ('robot', 'from (UTC)', 'to (UTC)', 'lasts', 'messages'), ('robot', 'from (UTC)', 'to (UTC)'))
     table.title = None
-    for each in found.ranges[:MAX_TIMES]:
+    for each in found.ranges[:MOST_TIMES]:
         lasts = duration((each.until_ns - each.since_ns) / SECOND)
         table.add_row(plain(each.robot), shown_time(each.since_ns), shown_time(each.until_ns), lasts, number(each.messages))
     parts: list[RenderableType] = [table, ''] if found.ranges else []
@@ -184,7 +189,7 @@ def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
     if not found.objects:
         yield plain(f'There are no such objects.{store_hint()}')
         return
-    more = f'; the first {MAX_TIMES} are shown (--json has all)' if len(found.ranges) > MAX_TIMES else ''
+    more = f'; the first {MOST_TIMES} are shown (--json has all)' if len(found.ranges) > MOST_TIMES else ''
     percent = 100 * found.opened / found.objects
     share = f'{percent:.{0 if percent >= 10 else 2}{"f" if percent >= 10 else "g"}} %' if found.opened else 'none'
     opened = f'{number(found.opened)} of {counted(found.objects, "object")} opened ({share})'
@@ -196,15 +201,6 @@ def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
     for each in found.fresh:
         until = f'up to {shown_time(each.fresh_ns)}' if each.fresh_ns is not None else 'up to a time that is not known'
         yield plain(f'{each.robot} {each.topic}: fresh {until}.')
-
-
-def _ordered(frame: Any, order: str | None) -> Any:
-    if order is None:
-        return frame
-    columns = [part.split() for part in order.split(',')]
-    if not all(len(words_) in (1, 2) and words_[-1].lower() in {words_[0].lower(), 'asc', 'desc'} for words_ in columns):
-        raise BadUsage(f'--order {order!r} is not a column', "--order 't_start desc' is one, in descending order")
-    return frame.sort([words_[0] for words_ in columns], desc=[words_[-1].lower() == 'desc' for words_ in columns])
 
 
 def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: bool) -> None:
@@ -273,8 +269,8 @@ def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str
         click.echo(f'Wrote {sheet}', err=True)
     if ground:
         around = {name: flags[name] for name in ('robot', 'since', 'until') if name in flags}
-        poses = lake.objects(source, findings=left_out, **around, where='x IS NOT NULL').select('x', 'y').to_pydict()
+        poses = lake.objects(source, findings=left_out, columns=('x', 'y'), where='x IS NOT NULL', **around).to_pydict()
         path = list(zip(poses['x'], poses['y'], strict=True))
         near = wanted(0, near=flags.get('near')).near
-        pictures.ground(rows, path[:: len(path) // MAX_POSES + 1], near, question_text(flags), ground)
+        pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, question_text(flags), ground)
         click.echo(f'Wrote {ground}', err=True)

@@ -43,10 +43,9 @@ from shadowhound_data_logger.lake.gaps import OBJECTS, Known, downsampled_times,
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.reading import narrow
+from shadowhound_data_logger.lake.tables import among
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
-
-from daft import col  # isort: skip
 
 BEFORE_NS: Final = 10 * SECOND
 """So long before its start what a mission's first tick may still hold was published."""
@@ -169,8 +168,7 @@ class EpisodePlan:
 
 def chosen(source: Bucket, flags: Mapping[str, Any], findings: Findings) -> list[ChosenMission]:
     """In the order of their begin. Raises LakeError, SettingError, StoreError."""
-    with query.answering():
-        rows = query.missions(source, findings=findings, **flags).sort(['first', 'mission_id']).to_pylist()
+    rows = query.missions(source, findings=findings, **flags).to_pylist()
     return sorted(map(_mission, rows), key=lambda each: (each.begin_ns, each.mission_id))
 
 
@@ -244,12 +242,11 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     parts = [STATE_PARTS[word] for word in options.state]
     actions = [COMMAND, DERIVED] if action == 'auto' else [ACTIONS[action]]
     sensors = [*options.cameras, *(part.sensor for part in parts), *(part.sensor for part in actions if part)]
-    rows = query.objects(
-        source, findings=findings, robot=mission.robot, since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000)
-    )
-    used = col('sensor').is_in(sorted({*sensors, *RECORDED})) | col('type').is_in(sorted(DETECTIONS))
-    with query.answering():
-        found = rows.where(used & col('t_start').not_null()).select(*NEEDED, 'topic').to_pylist()
+    used = f'{among("sensor", sorted({*sensors, *RECORDED}))} OR {among("type", sorted(DETECTIONS))}'
+    found = query.objects(
+        source, findings=findings, columns=(*NEEDED, 'topic'), where=used, robot=mission.robot,
+        since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000),
+    ).to_pylist()  # fmt: skip
     seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
     tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS], mission)
     bags = tuple(bags_of(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
@@ -293,12 +290,12 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     topics = {sensor: f'/{options.arm}/{name}' for sensor, name in ARM_TOPICS.items()}
 
     def tracks(begin: int, end: int, *sensors: str) -> dict[str, Track]:
-        rows = query.objects(source, findings=findings, since=utc(begin - LONGEST_BATCH_NS), until=utc(end + 1000))
         wanted = [topics[sensor] for sensor in sensors]
-        owners = sorted({mission.robot, options.arm})
-        with query.answering():
-            mine = col('topic').is_in(wanted) & col('robot').is_in(owners) & col('t_start').not_null()
-            found = rows.where(mine).select(*NEEDED, 'topic').to_pylist()
+        mine = f'{among("topic", wanted)} AND {among("robot", sorted({mission.robot, options.arm}))}'
+        found = query.objects(
+            source, findings=findings, columns=(*NEEDED, 'topic'), where=mine, since=utc(begin - LONGEST_BATCH_NS),
+            until=utc(end + 1000),
+        ).to_pylist()  # fmt: skip
         told = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
         return {sensor: _track_of(some, begin, end) for sensor, some in told.items() if some}
 

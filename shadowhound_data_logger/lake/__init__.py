@@ -1,9 +1,9 @@
-"""The lake: what is stored, as a catalogue of Parquet files beside the objects themselves, and how to ask it.
+"""The lake: what is stored, as Delta tables made of the rows that robots write, and how to query it (docs/lake.md).
 
-``lake.objects(sensor='camera', since='yesterday')`` is a Daft DataFrame (docs/lake.md), ``lake.MissionDataset`` what to train on,
-``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what nobody knows;
-``lake.log_dataset(run, DIR)`` says in MLflow what a model was trained on.
-The names below load Daft when they are used: a robot, which writes the catalogue, needs none of it.
+``lake.objects(sensor='camera', since='yesterday')`` is a pyarrow table, ``lake.MissionDataset`` what to train on,
+``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what is unknown;
+``lake.log_dataset(run, DIR)`` records in MLflow what a model was trained on.
+The names below load deltalake when they are used: a robot, which writes the rows, needs none of it.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class MissionDataset:
 
         Raises SettingError, StoreError, LakeError.
         """
-        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
+        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no tables
 
         if 'sensor' in flags:
             raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
@@ -134,7 +134,7 @@ class MissionDataset:
 
         A folder of ``shadowhound-data fetch`` has none. Raises StoreError.
         """
-        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no Daft
+        from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no tables
 
         tracks = zip(self._selection.anchors, self._chosen, strict=True)
         return selecting.labels_of(

@@ -12,7 +12,6 @@ import time
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final, NamedTuple
@@ -27,10 +26,10 @@ from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
 from shadowhound_data_logger.formats.rows.schema import BUCKET, UNDATED
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket
+from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days, robots
-from shadowhound_data_logger.lake.reading import arrow_schema, tables
+from shadowhound_data_logger.lake.tables import answer, literal, quoted
+from shadowhound_data_logger.lake.views import views
 
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 SINKS: Final = (OBJECTS, BAGS, EVENTS)
@@ -42,8 +41,12 @@ RECEIVED_ONLY: Final = 'received-only'
 MOST_CAUSES: Final = 64
 """Of a topic, by name; all further ones are one, ``MORE_CAUSES``. Ours are some twenty; a part may have one for each row."""
 MORE_CAUSES: Final = '(more)'
-FOLD_ROWS: Final = 200_000
-"""Statements that are read before those that newer ones replace are dropped: some 40 MB."""
+_NEWEST: Final = (
+    f'SELECT {", ".join(map(quoted, GAPS.columns))} FROM (SELECT *, row_number() OVER (PARTITION BY robot, id '  # noqa: S608
+    'ORDER BY revision DESC, what ASC, to_ns DESC, from_ns DESC) AS _place FROM all_gaps WHERE {}) WHERE _place = 1 '
+    'ORDER BY robot, id'
+)
+"""The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
 _ORDER: Final = [('robot', 'ascending'), ('id', 'ascending'), ('revision', 'descending'), ('what', 'ascending')]
 _FIRST: Final = [*_ORDER, *((name, 'descending') for name in GAPS.columns if name not in dict(_ORDER))]
 """The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
@@ -164,24 +167,17 @@ def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str
            since_ns: int | None = None, findings: Findings | None = None) -> pa.Table:  # fmt: skip
     """The statements that count, about times from then on or none, with the columns of ``catalogue.gaps.GAPS``.
 
-    In memory are at most twice as many as count, and ``FOLD_ROWS``. Raises StoreError.
+    Raises StoreError, LakeError.
     """
     source = source or Bucket(store_settings(os.environ, home(os.environ)), BUCKET)
     findings = Findings() if findings is None else findings
     first = '' if since_ns is None else f'{utc(max(since_ns, 0)):%Y-%m-%d}'
-    named = [robot] if robot else robots(source)
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = days(source, named, None, pool, findings, lambda date: date >= first or date == UNDATED, GAPS)
-    entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
-    rows = []
-    for table in tables(source, entries, tuple(GAPS.columns), findings, of=GAPS):
-        for name, value in (('topic', topic), ('sink', sink)):
-            if value is not None:
-                table = table.filter(pc.equal(table[name], value))  # noqa: PLW2901
-        rows.append(table)
-        if sum(map(len, rows)) > max(FOLD_ROWS, 2 * len(rows[0])):
-            rows = [folded(pa.concat_tables(rows))]
-    return folded(pa.concat_tables([arrow_schema(GAPS).empty_table(), *rows]))
+    conditions = [f'(date >= {literal(first)} OR date = {literal(UNDATED)})'] if first else []
+    conditions += [f'{name} = {literal(value)}' for name, value in (('topic', topic), ('sink', sink)) if value is not None]
+    conditions += [] if robot is None else [f'robot = {literal(robot)}']
+    has_date = (lambda date: date >= first or date == UNDATED) if first else None
+    with views(source, [GAPS], findings, robot=robot, has_date=has_date) as ready:
+        return answer(ready, _NEWEST.format(' AND '.join(conditions) or 'true'))
 
 
 def folded(rows: pa.Table) -> pa.Table:

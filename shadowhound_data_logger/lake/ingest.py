@@ -118,29 +118,38 @@ def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[R
 
 def pending(opened: DeltaTable, files: Sequence[RowFile]) -> list[RowFile]:
     """Of these row files those that a version of ``ingested`` does not name. Raises LakeError."""
-    known = {part for _, part in _known(opened, {file.date for file in files})} if files else set()
-    return [file for file in files if file.entry.key not in known]
+    known = {(each.part, each.etag) for each in known_files(opened, {file.date for file in files})} if files else set()
+    return [file for file in files if (file.entry.key, file.entry.etag) not in known]
 
 
-def gone(opened: DeltaTable, files: Sequence[RowFile], scope: Scope) -> bool:
-    """Whether the tables have rows of a file in this scope that is no longer in the store. Raises LakeError."""
-    there = {file.entry.key for file in files}
-    prefixes = tuple(each.folder for each in scope.tables)
-    return any(
-        part not in there
-        and (scope.has_date is None or scope.has_date(date))
-        and any(each in part.split('/', 2)[:2] for each in prefixes)
-        and (scope.robot is None or scope.robot in part.split('/', 2)[:2])
-        for date, part in _known(opened)
-    )
+class KnownFile(NamedTuple):
+    """A row file that was ingested."""
+
+    date: str
+    part: str
+    """Its key."""
+    etag: str
+    rejected: int
+    """Rows that were rejected; 1 for a file that is not one."""
+    why: str | None
+
+    def is_in(self, scope: Scope) -> bool:
+        """Whether a query with this scope needs it."""
+        folders = self.part.split('/', 2)[:2]
+        return (
+            any(each.folder in folders for each in scope.tables)
+            and (scope.robot is None or scope.robot in folders)
+            and (scope.has_date is None or scope.has_date(self.date))
+        )
 
 
-def _known(opened: DeltaTable, dates: Collection[str] = ()) -> Iterator[tuple[str, str]]:
-    """(date, key) of the row files that a version of ``ingested`` names."""
-    where = f'date BETWEEN {literal(min(dates))} AND {literal(max(dates))}' if dates else 'true'
+def known_files(opened: DeltaTable, dates: Collection[str] = (), where: str = 'true') -> Iterator[KnownFile]:
+    """The row files that a version of ``ingested`` names. Raises LakeError."""
+    among_dates = f'date BETWEEN {literal(min(dates))} AND {literal(max(dates))}' if dates else 'true'
+    columns = ', '.join(KnownFile._fields)
     with engine({'ingested': opened}) as ready:
-        found = answer(ready, f'SELECT date, part FROM ingested WHERE {where}')  # noqa: S608
-    yield from zip(found[DATE].to_pylist(), found[PART].to_pylist(), strict=True)
+        found = answer(ready, f'SELECT {columns} FROM ingested WHERE {among_dates} AND {where}')  # noqa: S608
+    yield from map(KnownFile._make, zip(*(column.to_pylist() for column in found.columns), strict=True))
 
 
 def fresh(source: Bucket, files: Sequence[RowFile], opened: DeltaTable, of: TableSchema, findings: Findings) -> pa.Table:
@@ -226,8 +235,10 @@ def _commit(tables: Tables, found: Sequence[_Read]) -> Ingested:
     now = datetime.now(timezone.utc)
     columns = {
         DATE: [each.file.date for each in found], ROBOT: [each.file.robot for each in found],
-        PART: [each.file.entry.key for each in found], 'ingested': [now] * len(found), 'rows': [len(each.rows) for each in found],
-        'rejected': [each.rejected for each in found], 'why': [each.why for each in found],
+        PART: [each.file.entry.key for each in found],
+        'etag': [each.file.entry.etag for each in found], 'ingested': [now] * len(found),
+        'rows': [len(each.rows) for each in found], 'rejected': [each.rejected for each in found],
+        'why': [each.why for each in found],
     }  # fmt: skip
     _add(tables, INGESTED, pa.table(columns, schema=INGESTED.schema))
     return done
@@ -303,10 +314,9 @@ def _merge(tables: Tables, table: Table, today: str) -> int:
 def _expire(source: Bucket, tables: Tables, findings: Findings, before: datetime) -> tuple[int, int]:
     """Delete row files without rejected rows that were ingested before then: how many were, and how many could not be."""
     listed = row_files(source, findings, Scope())
-    with engine({'ingested': tables.open(INGESTED)}) as ready:
-        stamp = literal(before.strftime('%Y-%m-%dT%H:%M:%S.%fZ'))
-        known = answer(ready, f'SELECT part FROM ingested WHERE rejected = 0 AND ingested < {stamp}')  # noqa: S608
-    parts = set(known[PART].to_pylist())
+    stamp = literal(before.strftime('%Y-%m-%dT%H:%M:%S.%fZ'))
+    known = known_files(tables.open(INGESTED), where=f'rejected = 0 AND ingested < {stamp}')
+    parts = {each.part for each in known}
     old = [file for file in listed if file.entry.key in parts]
 
     def delete(file: RowFile) -> bool:

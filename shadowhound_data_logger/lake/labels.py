@@ -12,7 +12,6 @@ import hashlib
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
@@ -28,11 +27,10 @@ from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_si
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MOST_TEXT, REMOVED
 from shadowhound_data_logger.formats.rows.schema import BUCKET, Row
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
+from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days, robots
-from shadowhound_data_logger.lake.reading import tables
 from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within
+from shadowhound_data_logger.lake.views import rows_of
 from shadowhound_data_logger.stores.base import ObjectStore
 
 MOST_IN_LAYER: Final = 50_000
@@ -115,16 +113,11 @@ def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is
 def read(source: Bucket, robot: str | None = None, *, label: str | None = None, findings: Findings | None = None) -> list[Label]:
     """The labels that stand, of one robot or of all, in the order of their times. Raises StoreError."""
     findings = Findings() if findings is None else findings
-    named = [robot] if robot else robots(source)
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = days(source, named, None, pool, findings, of=LABELS)
-    entries = [entry for day in sorted(found, key=lambda day: day.robot) for entry in day.entries]
     newest: dict[tuple[str, str], Row] = {}
-    for table in tables(source, entries, tuple(LABELS.columns), findings, of=LABELS):
-        for row in table.to_pylist():
-            name = row['robot'], row['id']
-            if name not in newest or (row['made_ns'], row['what']) > (newest[name]['made_ns'], newest[name]['what']):
-                newest[name] = row
+    for row in rows_of(source, LABELS, findings, robot=robot).to_pylist():
+        name = row['robot'], row['id']
+        if name not in newest or (row['made_ns'], row['what']) > (newest[name]['made_ns'], newest[name]['what']):
+            newest[name] = row
     standing = (row for row in newest.values() if row['what'] == LABEL and label in {None, row['label']})
     labels = (Label(**{name: row[name] for name in FIELDS if row[name] is not None}) for row in standing)
     return sorted(labels, key=lambda each: (each.robot, each.since_ns, each.label, each.id))
@@ -249,7 +242,8 @@ def timed(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[l
         return list(found), []
     times: dict[tuple[str, str], tuple[int, int]] = {}
     for robot in sorted({each.robot for each in found}):
-        rows = query.objects(source, findings=findings, robot=robot).select('bucket', 'key', 't_start_ns', 't_end_ns').to_arrow()
+        columns = ('bucket', 'key', 't_start_ns', 't_end_ns')
+        rows = query.objects(source, findings=findings, robot=robot, columns=columns)
         rows = rows.filter(
             pc.is_in(rows['key'].cast(pa.string()), value_set=pa.array([key for _, key in wanted_keys], pa.string()))
         )

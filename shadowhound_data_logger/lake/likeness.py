@@ -68,7 +68,7 @@ class Likeness:
     """The pictures of an answer, by how like they are."""
 
     rows: pa.Table
-    """Those of the catalogue, the most similar first, with a column ``likeness``: the cosine between the vectors, -1 to 1."""
+    """Those of the catalogue, the likest first, with a column ``likeness``: the cosine between the vectors, -1 to 1."""
     pictures: int
     without: int
     """So many of them have no vector of this model."""
@@ -144,10 +144,8 @@ def nearest(vectors: NDArray[np.float16], wanted: Vectors, limit: int) -> tuple[
     return order, scores[order]
 
 
-def pictures(frame: Any) -> pa.Table:
-    """The rows of pictures whose content is known, with all columns."""
-    with query.answering():
-        rows = frame.to_arrow()
+def pictures(rows: pa.Table) -> pa.Table:
+    """The rows of pictures whose content is known."""
     lower = pc.utf8_lower(rows['key'])
     is_image = pc.match_substring_regex(lower, '(' + '|'.join(IMAGES).replace('.', r'\.') + ')$')
     is_known = pc.fill_null(pc.match_substring_regex(rows['sha256'], _SHA256), fill_value=False)

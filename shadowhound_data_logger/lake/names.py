@@ -63,7 +63,7 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
     ``kept`` are rows of what robots keep: names in them exist as well. It reads the names of all objects of the robot: call it
     only after an empty answer. Raises StoreError, LakeError.
     """
-    from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - Daft takes half a second
+    from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - which needs it
 
     robot = flags.get('robot')
     if robot:
@@ -72,8 +72,7 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
     if flags.get('mission'):
         columns += ['mission_id', 'run_id']
     if columns:
-        with query.answering():
-            found = query.objects(source, findings=findings, robot=robot).select(*columns).distinct().to_pydict()
+        found = query.objects(source, findings=findings, robot=robot, columns=columns, distinct=True).to_pydict()
         known: dict[str, list[str | None]] = {
             name: [*found[name], *(kept[name].to_pylist() if kept is not None else ())] for name in columns
         }
@@ -87,8 +86,7 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
     if flags.get('label'):
         check_name_of('label', flags['label'], (each.label for each in labels.read(source, robot, findings=findings)))
     if flags.get('policy'):
-        with query.answering():
-            told = query.missions(source, findings=findings, robot=robot).select('policy', 'policies').to_pydict()
+        told = query.missions(source, findings=findings, robot=robot).select(['policy', 'policies']).to_pydict()
         ids = [name for text in (*told['policy'], *told['policies']) for name in (text or '').split(', ')]
         versions = [each.partition('#')[0] for each in ids if each]
         if not any('#' in flags['policy'] and each.startswith(flags['policy']) for each in ids if each):

@@ -1,56 +1,58 @@
-"""Catalogue and gap journal as Daft DataFrames, and as SQL over ``objects missions topics gaps watermarks``.
+"""What is stored, as Arrow tables: by flags, or by SQL over ``objects missions topics gaps watermarks labels forgotten``.
 
-A frame is lazy: it looks which parts there are when it is computed, and of other days than the asked ones not even for the names.
+The engine is that of the tables (lake/tables.py): what a query restricts by flags or in SQL is never read into this process.
 """
 
 from __future__ import annotations
 
-import asyncio
-import os
 import re
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
-from operator import and_
-from typing import Any, Final, TypeVar
+from datetime import datetime, timezone
+from itertools import groupby
+from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from deltalake import QueryBuilder
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, PolicyRefused, StoreError
 from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
+from shadowhound_data_logger.formats.rows.schema import COLUMNS, FORGOTTEN, OBJECTS
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.lake.gaps import newest, watermarks
 from shadowhound_data_logger.lake.names import misspelled
-from shadowhound_data_logger.lake.reading import arrow_schema, narrow
-from shadowhound_data_logger.lake.scan import PartGroup, catalogue_rows, planned
-from shadowhound_data_logger.lake.select import Wanted, wanted
+from shadowhound_data_logger.lake.select import Wanted, date_of, wanted
+from shadowhound_data_logger.lake.tables import TABLES, among, answer, batches, engine, literal, quoted
+from shadowhound_data_logger.lake.views import rows_of, views
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, parse_manifest, split_id
 from shadowhound_data_logger.policies.registry import BUCKET as POLICIES
 from shadowhound_data_logger.policies.registry import PREFIX
 
-os.environ.setdefault('DAFT_ANALYTICS_ENABLED', '0')  # else it tells its makers of each run, over the network
-os.environ.setdefault('DAFT_PROGRESS_BAR', '0')
-
-import daft
-from daft import DataFrame, Expression, col, lit
-from daft.io.pushdowns import Pushdowns
-from daft.io.source import DataSource, DataSourceTask
-from daft.recordbatch import RecordBatch
-
-_Answer = TypeVar('_Answer')
-
+ALL: Final = 'all_objects'
+"""The view of the table; ``objects`` is restricted by the flags."""
+_TOPICS: Final = (
+    'CREATE VIEW topics AS SELECT robot, topic, sensor, type, count(key) AS objects, sum(bytes) AS bytes, '
+    'sum("count") AS messages, min(t_start) AS first, max(t_end) AS last FROM objects WHERE topic IS NOT NULL '
+    'GROUP BY robot, topic, sensor, type'
+)
+_MISSION_ROWS: Final = (
+    'SELECT robot, mission_id, max(run_id) AS run_id, max(mission_type) AS mission_type, count(key) AS objects, '
+    'sum(bytes) AS bytes, min(t_start) AS first, max(t_end) AS last FROM {} WHERE mission_id IS NOT NULL AND {} '
+    'GROUP BY robot, mission_id ORDER BY first, mission_id'
+)
 _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
 _LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
 _FORGOTTEN: Final = re.compile(r'\bforgotten\b', re.IGNORECASE)
@@ -76,8 +78,8 @@ _UNSEEN_OF_LABELS: Final = {'what', 'made', 'format_version'}
 _WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
 LONGEST_NS: Final = 24 * 3600 * SECOND
 """For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
-PIECE_BYTES: Final = 4 << 20
-"""Of parts that are one frame of several; some 50,000 compacted rows."""
+_TIMES: Final = ('robot', 'bucket', 'key', 't_start_ns', 't_end_ns')
+"""What says whether an object is in a time that was chosen."""
 _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
     'command': ('mission_command', pa.string()),
     'started': ('start', pa.string()),
@@ -95,116 +97,181 @@ _SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """A query, and where it reports what it leaves out."""
+    """A query, where it reports what it leaves out, and the time as of which it sees the tables."""
 
     source: Bucket
     findings: Findings
+    as_of: datetime | None = None
 
     @classmethod
-    def of(cls, source: Bucket | None, findings: Findings | None) -> _Asked:
-        return cls(source or default_source(), Findings() if findings is None else findings)
+    def of(cls, source: Bucket | None, findings: Findings | None, as_of: str | datetime | None = None) -> _Asked:
+        """Raises SettingError for what is not a time."""
+        found = Findings() if findings is None else findings
+        if isinstance(as_of, str):
+            as_of = datetime.fromtimestamp(moment('as_of', as_of, time.time_ns()) / SECOND, timezone.utc)
+        return cls(source or default_source(), found, as_of)
 
 
-def objects(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """One row an object, with the columns of ``formats/rows/schema.py``.
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Which columns of the rows, in which order, and how many at most."""
 
-    ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``.
-    Without a source, of the store that the environment names. Parts that are none are left out: ``findings`` has them once
-    the frame is computed, in this process; without it the log warns. Raises SettingError, LakeError for what is not a question.
+    columns: Sequence[str] = tuple(COLUMNS)
+    order: str | None = None
+    limit: int | None = None
+    is_distinct: bool = False
+
+    def sql(self, of: str, condition: str = 'true') -> str:
+        columns = ', '.join(map(quoted, self.columns))
+        order = f' ORDER BY {self.order}' if self.order else ''
+        limit = f' LIMIT {self.limit}' if self.limit is not None else ''
+        return f'SELECT {"DISTINCT " * self.is_distinct}{columns} FROM {of} WHERE {condition}{order}{limit}'  # noqa: S608
+
+
+def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLUMNS), order: str | None = None,
+            limit: int | None = None, distinct: bool = False, as_of: str | datetime | None = None,
+            findings: Findings | None = None, **flags: Any) -> pa.Table:  # fmt: skip
+    """One row per object, with the columns of ``formats/rows/schema.py``.
+
+    ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``;
+    ``order`` is SQL, such as ``t_start_ns DESC``. Without a source, of the store that the environment names. With ``as_of`` it
+    answers from the tables as of that time. Rows and files that are invalid are left out: ``findings`` names them; without it
+    the log warns. Raises SettingError, LakeError for an invalid query, StoreError.
     """
-    return _objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
+    lake = _Asked.of(source, findings, as_of)
+    return _objects(lake, wanted(time.time_ns(), **flags), Shape(columns, order, limit, distinct))
 
 
-def objects_in_pieces(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> Iterator[DataFrame]:
-    """The rows of ``objects`` in several frames: Daft holds all that one has in memory, and more than once."""
+def object_batches(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLUMNS), findings: Findings | None = None,
+                   **flags: Any) -> Iterator[pa.Table]:  # fmt: skip
+    """The rows of ``objects`` piece by piece, for more of them than memory should hold."""
     lake = _Asked.of(source, findings)
     asked, condition = _understood(lake, wanted(time.time_ns(), **flags))
-    piece: list[PartGroup] = []
-    for parts in (*planned(lake.source, asked, lake.findings), None):
-        if parts is not None:
-            piece.append(parts)
-        if piece and (parts is None or sum(entry.size for each in piece for entry in each.entries) > PIECE_BYTES):
-            yield _where(_Catalogue(lake.source, asked, lake.findings, piece), asked, condition)
-            piece = []
+    with _opened(lake, asked) as ready:
+        shape = Shape(columns) if not asked.chosen else Shape([*dict.fromkeys((*columns, *_TIMES))])
+        for batch in batches(ready, shape.sql(ALL, condition)):
+            yield within_chosen(pa.Table.from_batches([batch]), asked).select(columns)
 
 
-def missions(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """One row a mission that has objects among the wanted ones, and how it ended. Reads catalogue and summaries at once."""
-    return _missions(_Asked.of(source, findings), wanted(time.time_ns(), **flags))
+def missions(source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
+             **flags: Any) -> pa.Table:  # fmt: skip
+    """One row per mission that has objects among the wanted ones, and how it ended."""
+    return _missions(_Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags))
 
 
-def topics(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
-    """One row a robot and topic: how many objects, bytes and messages, from when to when."""
-    return _topics(_objects(_Asked.of(source, findings), wanted(time.time_ns(), **flags)))
+def topics(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> pa.Table:
+    """One row per robot and topic: how many objects, bytes and messages, from when to when."""
+    return sql('SELECT * FROM topics', source, findings=findings, **flags)
 
 
-def sql(query: str, source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> DataFrame:
+def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
+        **flags: Any) -> pa.Table:  # fmt: skip
     """SQL over the views, each restricted by the flags. Raises LakeError for what is not SQL or names no column."""
-    chosen, asked = _Asked.of(source, findings), wanted(time.time_ns(), **flags)
-    rows = _objects(chosen, asked)
-    views = {'objects': rows, 'topics': _topics(rows)}
-    if _MISSIONS.search(query):  # it has to look first
-        views['missions'] = _missions(chosen, asked)
+    lake, asked = _Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags)
+    more: dict[str, pa.Table] = {}
+    if _MISSIONS.search(query):
+        more['missions'] = _missions(lake, asked)
     if _LABELS.search(query):
-        views['labels'] = _labels(chosen, asked)
+        more['labels'] = _labels(lake, asked)
     if _FORGOTTEN.search(query):
-        views['forgotten'] = _forgotten(chosen, asked)
+        more['forgotten'] = _forgotten(lake, asked)
     if _GAPS.search(query):
-        views.update(_gaps(chosen, asked))
-    with answering(query, views):
-        return daft.sql(query, register_globals=False, **views)
+        more |= _gaps(lake, asked)
+    asked, condition = _understood(lake, asked)
+    names = {'objects', 'topics', *more, *COLUMNS, *(name for view in more.values() for name in view.column_names)}
+    with answering(query, names):
+        if asked.chosen:
+            with engine({'objects': _objects(lake, asked, Shape()), **more}) as ready:
+                answer(ready, _TOPICS)
+                return answer(ready, query)
+        with _opened(lake, asked, more) as ready:
+            answer(ready, f'CREATE VIEW objects AS {Shape().sql(ALL, condition)}')
+            answer(ready, _TOPICS)
+            return answer(ready, query)
 
 
 def chosen(rows: pa.Table, where: str) -> pa.Table:
     """The rows for which a condition holds. Raises LakeError for what is not SQL or names no column."""
-    frame = daft.from_arrow(rows)
-    with answering(where, {'': frame}):
-        return frame.where(daft.sql_expr(where)).to_arrow()
+    with engine({'rows': rows}) as ready, answering(where, rows.column_names):
+        return answer(ready, f'SELECT * FROM rows WHERE ({where}\n)')  # noqa: S608 - the condition is the caller's own SQL
+
+
+def ordered(rows: pa.Table, order: str | None, limit: int | None) -> pa.Table:
+    """The first rows of an answer in an order, such as ``t_start DESC``. Raises LakeError for a column that it does not have."""
+    with engine({'rows': rows}) as ready, answering(order or '', rows.column_names):
+        return answer(ready, Shape(rows.column_names, order, limit).sql('rows'))
 
 
 @contextmanager
-def answering(query: str = '', views: Mapping[str, DataFrame] | None = None) -> Iterator[None]:
-    """Raises LakeError for what Daft cannot answer, with the nearest names in the views; use it around computing a frame, too."""
+def answering(query: str, known: Iterable[str]) -> Iterator[None]:
+    """A LakeError about a name gets the nearest of the known names as its remedy."""
     try:
         yield
-    except Exception as error:  # Daft's error for SQL has no name that could be imported
-        if type(error).__module__ != 'daft.exceptions':
-            raise
-        text, views = ' '.join(str(error).split()), views or {}
-        known = {*filter(None, views), *(name for view in views.values() for name in view.column_names)}
-        raise LakeError(f'the query cannot be answered: {text}', remedy=misspelled(query, text, known)) from error
+    except LakeError as error:
+        remedy = misspelled(query, error.what, set(known))
+        raise LakeError(error.what, remedy=remedy or error.remedy) from error
 
 
-def _objects(lake: _Asked, asked: Wanted) -> DataFrame:
+@contextmanager
+def _opened(lake: _Asked, asked: Wanted, more: Mapping[str, pa.Table] | None = None) -> Iterator[QueryBuilder]:
+    has_date = asked.has_date if asked.since_ns is not None or asked.until_ns is not None else None
+    with views(lake.source, [OBJECTS], lake.findings, robot=asked.robot, has_date=has_date, as_of=lake.as_of, more=more) as ready:
+        yield ready
+
+
+def _objects(lake: _Asked, asked: Wanted, shape: Shape) -> pa.Table:
     asked, condition = _understood(lake, asked)
-    return _where(_Catalogue(lake.source, asked, lake.findings), asked, condition)
+    with _opened(lake, asked) as ready, answering(f'{asked.where or ""} {shape.order or ""}', COLUMNS):
+        if not asked.chosen:
+            return answer(ready, shape.sql(ALL, condition))
+        wide = Shape() if shape.order else Shape([*dict.fromkeys((*shape.columns, *_TIMES))])
+        found = within_chosen(answer(ready, wide.sql(ALL, condition)), asked)
+    if not (shape.order or shape.limit is not None or shape.is_distinct):
+        return found.select(shape.columns)
+    with engine({'rows': found}) as ready:
+        return answer(ready, shape.sql('rows'))
 
 
-def _where(catalog: _Catalogue, asked: Wanted, condition: Expression) -> DataFrame:
-    rows = catalog.read()
-    with answering(asked.where or '', {'': rows}):
-        return rows.where(condition)
+def within_chosen(table: pa.Table, asked: Wanted) -> pa.Table:
+    """The rows that are in all that was chosen."""
+    if not asked.chosen:
+        return table
+    first = pc.fill_null(table['t_start_ns'], -1).to_numpy()
+    last = np.maximum(first, pc.fill_null(table['t_end_ns'], -1).to_numpy())
+    kept = np.ones(len(table), bool)
+    for some in asked.chosen:
+        found = np.zeros(len(table), bool)
+        for robot, each in groupby(some.spans, lambda span: span.robot):
+            since, until = np.array([span[1:] for span in each], np.int64).T
+            place = np.searchsorted(until, first)
+            inside = (place < len(until)) & (since[np.minimum(place, len(until) - 1)] <= last)
+            is_its = pc.fill_null(pc.equal(table['robot'], robot), fill_value=False).to_numpy() if robot else True
+            found |= inside & is_its
+        if some.keys:
+            pairs = zip(table['bucket'].to_pylist(), table['key'].to_pylist(), strict=True)
+            found |= np.fromiter((pair in some.keys for pair in pairs), bool, len(table))
+        kept &= found
+    return table.filter(pa.array(kept))
 
 
-def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, Expression]:
-    """What is asked for as the catalogue can tell it, and the condition for a row."""
+def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, str]:
+    """What is asked for as the tables can tell it, and the condition for a row in SQL."""
     asked = labels.labelled(lake.source, asked, lake.findings)
-    with answering():
-        conditions = list(_conditions(asked))
-        if asked.mission is not None:
-            runs = {} if '_' in asked.mission else _runs(lake, asked)  # no id of a run has one, every one of a mission
-            of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
-            conditions.append(col('mission_id').startswith(asked.mission) | col('mission_id').is_in(of_run or ['']))
-        if asked.success is not None or asked.policy is not None:
-            ids = _missions_of(lake, asked)
-            conditions.append(col('mission_id').is_in(ids) if ids else lit(False))
-    return asked, reduce(and_, conditions, lit(True))
+    conditions = list(_conditions(asked))
+    if asked.mission is not None:
+        runs = {} if '_' in asked.mission else _runs(lake, asked)  # no id of a run has one, every one of a mission
+        of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
+        begins = f'starts_with(mission_id, {literal(asked.mission)})'
+        conditions.append(f'({begins} OR {among("mission_id", of_run)})' if of_run else begins)
+    if asked.success is not None or asked.policy is not None:
+        conditions.append(among('mission_id', _missions_of(lake, asked)))
+    return asked, ' AND '.join(conditions) or 'true'
 
 
 def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
     """The missions that ended so, and in which that policy was active."""
     columns = ('mission_id', 'success', 'policy', 'policies')
-    found = _missions(lake, replace(asked, success=None, policy=None)).select(*columns).to_pydict()
+    found = _missions(lake, replace(asked, success=None, policy=None)).select(columns).to_pydict()
     return [mission for mission, success, policy, policies in zip(*(found[name] for name in columns), strict=True)
             if asked.success in {None, success}
             and (asked.policy is None or _has_policy(policies or policy or '', asked.policy))]  # fmt: skip
@@ -219,42 +286,34 @@ def _has_policy(names: str, wanted: str) -> bool:
     return False
 
 
-def _conditions(asked: Wanted) -> Iterator[Expression]:
+def _conditions(asked: Wanted) -> Iterator[str]:
     for name in ('robot', 'sensor', 'topic', 'mission_type'):
         if (value := getattr(asked, name)) is not None:
-            yield col(name) == lit(value)
-    if asked.since_ns is not None or asked.until_ns is not None:
-        yield col('t_start').not_null()
+            yield f'{name} = {literal(value)}'
     if asked.since_ns is not None:
-        yield col('t_start_ns') >= lit(asked.since_ns)
+        yield f't_start IS NOT NULL AND t_start_ns >= {asked.since_ns} AND date >= {literal(date_of(asked.since_ns))}'
     if asked.until_ns is not None:
-        yield col('t_start_ns') < lit(asked.until_ns)
+        yield f't_start IS NOT NULL AND t_start_ns < {asked.until_ns} AND date <= {literal(date_of(asked.until_ns - 1))}'
     if asked.near is not None:
         x, y, radius = asked.near
         for name, middle in (('x', x), ('y', y)):  # a box first: statistics can rule parts of a file out by it
-            yield (col(name) >= lit(middle - radius)) & (col(name) <= lit(middle + radius))
-        east, north = col('x') - lit(x), col('y') - lit(y)
-        yield east * east + north * north <= lit(radius * radius)
+            yield f'{name} BETWEEN {middle - radius!r} AND {middle + radius!r}'
+        east, north = f'(x - {x!r})', f'(y - {y!r})'
+        yield f'{east} * {east} + {north} * {north} <= {radius * radius!r}'
     if asked.where is not None:
-        yield daft.sql_expr(asked.where)
+        yield f'({asked.where}\n)'  # what a comment in it hides ends with its line
 
 
-def _topics(rows: DataFrame) -> DataFrame:
-    known = rows.where(col('topic').not_null())
-    return known.groupby('robot', 'topic', 'sensor', 'type').agg(
-        col('key').count().alias('objects'), col('bytes').sum().alias('bytes'), col('count').sum().alias('messages'),
-        col('t_start').min().alias('first'), col('t_end').max().alias('last'),
-    )  # fmt: skip
-
-
-def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
-    """Which there are by the catalogue; how they ended by their summaries, which lie under the id of the run."""
-    rows = _objects(lake, asked).where(col('mission_id').not_null())
-    with answering():
-        found = rows.groupby('robot', 'mission_id').agg(
-            col('run_id').max(), col('mission_type').max(), col('key').count().alias('objects'),
-            col('bytes').sum().alias('bytes'), col('t_start').min().alias('first'), col('t_end').max().alias('last'),
-        ).sort('first').to_arrow()  # fmt: skip
+def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
+    """Which there are by their objects; how they ended by their summaries, which lie under the id of the run."""
+    asked, condition = _understood(lake, asked)
+    if asked.chosen:
+        rows = _objects(lake, asked, Shape())
+        with engine({'objects': rows}) as ready:
+            found = answer(ready, _MISSION_ROWS.format('objects', 'true'))
+    else:
+        with _opened(lake, asked) as ready:
+            found = answer(ready, _MISSION_ROWS.format(ALL, condition))
     runs = found['run_id'].to_pylist()
     if None in runs:
         known = _runs(lake, asked)
@@ -269,7 +328,7 @@ def _missions(lake: _Asked, asked: Wanted) -> DataFrame:
         found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
     policies = found['policy'].to_pylist()
     datasets = {each: _dataset_of(lake.source, each) for each in {*policies} - {None}}
-    return daft.from_arrow(found.append_column('policy_dataset', pa.array(map(datasets.get, policies), pa.string())))
+    return found.append_column('policy_dataset', pa.array(map(datasets.get, policies), pa.string()))
 
 
 def _dataset_of(source: Bucket, policy: str) -> str | None:
@@ -289,40 +348,37 @@ def _dataset_of(source: Bucket, policy: str) -> str | None:
     return None
 
 
-def _labels(lake: _Asked, asked: Wanted) -> DataFrame:
+def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
     """Those that reach into the time."""
     found = labels.read(lake.source, asked.robot, label=asked.label, findings=lake.findings)
     since_ns, until_ns = asked.since_ns or 0, (1 << 63) - 1 if asked.until_ns is None else asked.until_ns
     rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
     names = [name for name in LABELS.columns if name not in _UNSEEN_OF_LABELS]
-    return daft.from_arrow(pa.Table.from_pylist(rows, schema=narrow(names, LABELS)))
+    return pa.Table.from_pylist(rows, schema=pa.schema([TABLES[LABELS.folder].schema.field(name) for name in names]))
 
 
-def _forgotten(lake: _Asked, asked: Wanted) -> DataFrame:
+def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:
     """What was deleted on purpose, by its own time."""
     if refused := [name for name in (*_OF_OBJECTS, 'mission') if getattr(asked, name) is not None]:
         raise LakeError(f'forgotten cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since or until')  # fmt: skip
-    rows = forgotten(lake.source, asked.robot, lake.findings)
-    for name in ('sensor', 'topic'):
-        if (value := getattr(asked, name)) is not None:
-            rows = rows.filter(pc.equal(rows[name], value))
-    if asked.since_ns is not None:
-        rows = rows.filter(pc.greater_equal(rows['t_start_ns'], asked.since_ns))
-    if asked.until_ns is not None:
-        rows = rows.filter(pc.less(rows['t_start_ns'], asked.until_ns))
-    return daft.from_arrow(rows.select([name for name in rows.column_names if name != 'format_version']))
+    conditions = [f'{name} = {literal(getattr(asked, name))}' for name in ('sensor', 'topic') if getattr(asked, name) is not None]
+    conditions += [] if asked.since_ns is None else [f't_start_ns >= {asked.since_ns}']
+    conditions += [] if asked.until_ns is None else [f't_start_ns < {asked.until_ns}']
+    columns = [name for name in FORGOTTEN.columns if name != 'format_version']
+    where = ' AND '.join(conditions) or 'true'
+    rows = rows_of(lake.source, FORGOTTEN, lake.findings, robot=asked.robot, where=where, columns=columns)
+    return rows.sort_by([('t_start_ns', 'ascending'), ('forgotten_ns', 'ascending')])
 
 
-def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:
+def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
     """The newest statements about gaps that reach into the time, and how far they are complete. Reads the journal at once."""
     if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
         raise LakeError(f'gaps and watermarks cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
     rows = newest(lake.source, robot=asked.robot, topic=asked.topic, since_ns=asked.since_ns, findings=lake.findings)
     if asked.sensor is not None:
-        with answering():
-            topics = _objects(lake, asked).select('topic').distinct().to_pydict()['topic']
+        topics = _objects(lake, asked, Shape(['topic'], is_distinct=True))['topic'].to_pylist()
         rows = rows.filter(pc.is_in(rows['topic'], value_set=pa.array(topics, pa.string())))
     if asked.since_ns is not None:
         rows = rows.filter(pc.greater_equal(rows['to_ns'], asked.since_ns))
@@ -332,17 +388,17 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, DataFrame]:
     gaps = rows.filter(pc.equal(rows['what'], GAP))
     if asked.mission is not None:
         gaps = gaps.filter(pc.starts_with(gaps['mission_id'], asked.mission))
-    return {'gaps': daft.from_arrow(gaps.select(_GAP_COLUMNS)), 'watermarks': daft.from_arrow(marks.select(_WATERMARK_COLUMNS))}
+    return {'gaps': gaps.select(_GAP_COLUMNS), 'watermarks': marks.select(_WATERMARK_COLUMNS)}
 
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     """The run of each mission of that time, by whichever object knows it: one that came before there was a run does not."""
     until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
-    rows = _Catalogue(lake.source, Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns), lake.findings).read()
-    with answering():
-        known = rows.where(col('mission_id').not_null() & col('run_id').not_null())
-        found = known.groupby('mission_id').agg(col('run_id').max()).to_pydict()
-    return dict(zip(found['mission_id'], found['run_id'], strict=True))
+    of_time = Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns)
+    where = ' AND '.join((*_conditions(of_time), 'mission_id IS NOT NULL', 'run_id IS NOT NULL'))
+    with _opened(lake, of_time) as ready:
+        found = answer(ready, f'SELECT mission_id, max(run_id) AS run_id FROM {ALL} WHERE {where} GROUP BY mission_id')  # noqa: S608
+    return dict(zip(found['mission_id'].to_pylist(), found['run_id'].to_pylist(), strict=True))
 
 
 def _summary(source: Bucket, robot: str, run_id: str | None) -> dict[str, Any]:
@@ -363,78 +419,3 @@ def _value(value: Any, kind: pa.DataType) -> Any:
     if kind == pa.string():  # half a surrogate pair is not text
         return value.encode(errors='replace').decode() if isinstance(value, str) else None
     return value if isinstance(value, bool) else None
-
-
-# -- the catalogue as a source of Daft's ---------------------------------------------------------------------------------------
-
-
-class _Catalogue(DataSource):
-    """Reads the rows of one bucket's catalogue that may match a query.
-
-    Stateless, except for what it leaves out: each run lists anew.
-    """
-
-    def __init__(
-        self, source: Bucket, wanted: Wanted, findings: Findings, parts: Sequence[PartGroup] | None = None,
-    ) -> None:  # fmt: skip
-        """``parts``: those to read, where they are known already."""
-        self._source = source
-        self._wanted = wanted
-        self._findings = findings
-        self._planned = parts
-        self._schema = daft.Schema.from_pyarrow_schema(arrow_schema())
-
-    @property
-    def name(self) -> str:
-        return f'the catalogue in {self._source.describe()}'
-
-    @property
-    def schema(self) -> daft.Schema:
-        return self._schema
-
-    async def get_tasks(self, pushdowns: Pushdowns) -> AsyncIterator[DataSourceTask]:
-        columns = _columns(pushdowns)
-        every = self._planned
-        if every is None:
-            every = await _apart(lambda: list(planned(self._source, self._wanted, self._findings)))
-        for parts in every:
-            yield _Parts(self._source, parts, columns, self._wanted, self._findings)
-
-
-class _Parts(DataSourceTask):
-    """Parts that are read together, from the store to batches of the columns that are needed."""
-
-    def __init__(self, source: Bucket, parts: PartGroup, columns: Sequence[str], wanted: Wanted, findings: Findings) -> None:
-        self._source = source
-        self._parts = parts
-        self._columns = tuple(columns)
-        self._wanted = wanted
-        self._findings = findings
-
-    @property
-    def schema(self) -> daft.Schema:
-        return daft.Schema.from_pyarrow_schema(narrow(self._columns))
-
-    async def read(self) -> AsyncIterator[RecordBatch]:
-        found = catalogue_rows(self._source, self._parts, self._columns, self._wanted, self._findings)
-        try:
-            while (table := await _apart(lambda: next(found, None))) is not None:
-                for batch in table.to_batches():
-                    yield RecordBatch.from_arrow_record_batches([batch], batch.schema)
-        finally:
-            found.close()
-
-
-async def _apart(work: Callable[[], _Answer]) -> _Answer:
-    """In a thread of its own, which ends with it: Daft's loop serves all tasks."""
-    with ThreadPoolExecutor(1) as pool:
-        return await asyncio.get_running_loop().run_in_executor(pool, work)
-
-
-def _columns(pushdowns: Pushdowns) -> tuple[str, ...]:
-    """In the order of the schema: those of the answer, and those that a filter looks at."""
-    names = arrow_schema().names
-    if pushdowns.columns is None:
-        return tuple(names)
-    needed = {*pushdowns.columns, *pushdowns.filter_required_column_names()}
-    return tuple(name for name in names if name in needed)

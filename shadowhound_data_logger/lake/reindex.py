@@ -87,7 +87,7 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
 
     What was added until then stays. Objects that are gone or damaged are in the ``findings``.
     """
-    from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - Daft takes half a second
+    from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - the extra lake
 
     check_name(robot, 'the robot name')
     findings, found = Findings() if findings is None else findings, Reindexed()
@@ -95,9 +95,8 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
     every = tables(source, entries, (*KEY, 'field'), findings, of=STATISTICS)
     told_of = (rows.filter(pc.equal(rows['field'], ALL)) for rows in every)
     known = {pair for rows in told_of for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
-    asked = query.objects(source, findings=findings, robot=robot).select(
-        'robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns'
-    )
+    columns = ('robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns')
+    asked = query.objects(source, findings=findings, robot=robot, columns=columns)
     rows = [row for row in asked.to_pylist() if row['topic'] is not None and (row['bucket'], row['key']) not in known]
     found.listed = len(rows)
 

@@ -75,8 +75,8 @@ class Wanted:
             return True
         if date == UNDATED:
             return False
-        first = '' if self.since_ns is None else _date(self.since_ns)
-        return first <= date and (self.until_ns is None or date <= _date(self.until_ns - 1))
+        first = '' if self.since_ns is None else date_of(self.since_ns)
+        return first <= date and (self.until_ns is None or date <= date_of(self.until_ns - 1))
 
     def dates(self, now_ns: int) -> list[str] | None:
         """Those folders, where they can be named; None where it is shorter to look which there are."""
@@ -156,5 +156,6 @@ def _circle(given: tuple[float, float, float] | str) -> tuple[float, float, floa
     return x, y, radius
 
 
-def _date(stamp_ns: int) -> str:
+def date_of(stamp_ns: int) -> str:
+    """The UTC date of a time."""
     return f'{utc(stamp_ns):%Y-%m-%d}'

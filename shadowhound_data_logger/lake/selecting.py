@@ -15,17 +15,15 @@ from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.untrusted import MOST_MEMBERS
 from shadowhound_data_logger.formats.rows.schema import SENSOR
-from shadowhound_data_logger.lake import labels, query  # first: it turns Daft's telemetry off
+from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.pull import bring
-from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
+from shadowhound_data_logger.lake.tables import OBJECT_ROWS, among
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
-
-from daft import col  # isort: skip
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +74,7 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
-    found = _rows(query.objects_in_pieces(source, findings=findings, sensor=anchor, **flags))
+    found = _rows(query.object_batches(source, columns=NEEDED, findings=findings, sensor=anchor, **flags))
     ends = pc.utf8_lower(pc.replace_substring_regex(found['key'], r'^.*\.([^./]*)$', r'\1'))
     found = _kept(found, pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
     anchors = tracks_of(_possible(found, findings))
@@ -94,8 +92,8 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     longest_ns = 3600 * SECOND  # a batch that began so long before can reach into the time (sensor.batch_s)
     since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
     until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
-    pieces = query.objects_in_pieces(source, findings=findings, since=since, until=until)
-    found = _rows(piece.where(col('sensor').is_in(list(aligned))) for piece in pieces)
+    where = among('sensor', aligned)
+    found = _rows(query.object_batches(source, columns=NEEDED, findings=findings, since=since, until=until, where=where))
     for name in aligned:
         kinds = {*pc.unique(found.filter(pc.equal(found['sensor'], name))['type']).to_pylist()}
         if not kinds:
@@ -114,11 +112,11 @@ def _near(track: Track, anchors: list[Track], reach: int) -> Track:
     return track.only(track.within(first, last))
 
 
-def _rows(frames: Iterable[Any]) -> pa.Table:
-    """Packed frame by frame: what Daft has of a million rows takes 0.5 GB."""
-    with query.answering():
-        found = [packed(frame.where(col('t_start').not_null()).select(*NEEDED).to_arrow()) for frame in frames]
-    return pa.concat_tables([packed(narrow(NEEDED).empty_table()), *found])
+def _rows(batches: Iterable[pa.Table]) -> pa.Table:
+    """Packed batch by batch: unpacked, a million rows take 0.5 GB."""
+    found = [packed(batch.filter(pc.is_valid(batch['t_start']))) for batch in batches]
+    empty = pa.schema([OBJECT_ROWS.schema.field(name) for name in NEEDED]).empty_table()
+    return pa.concat_tables([packed(empty), *found])
 
 
 def _possible(rows: pa.Table, findings: Findings) -> pa.Table:

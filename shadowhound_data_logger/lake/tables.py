@@ -24,7 +24,7 @@ from deltalake import CommitProperties, DeltaTable, QueryBuilder, Transaction, W
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from shadowhound_data_logger.core.config import home
-from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, LakeError
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
@@ -35,6 +35,8 @@ from shadowhound_data_logger.lake.bucket import Bucket
 
 BUCKET: Final = 'lake'
 """Of the shared tables; robots cannot write it."""
+LOG: Final = '_delta_log'
+"""The folder that makes a folder a table."""
 DATE, ROBOT, PART = 'date', 'robot', 'part'
 PARTITIONS: Final = (DATE, ROBOT)
 INGEST: Final = 'ingest'
@@ -68,17 +70,17 @@ OBJECT_ROWS: Final = _table('objects', OBJECTS, ('bucket', 'key', 't_start_ns'),
 INGESTED: Final = Table(
     'ingested',
     pa.schema([
-        (DATE, pa.string()), (ROBOT, pa.string()), (PART, pa.string()), ('ingested', _KINDS[TIME]), ('rows', pa.int64()),
-        ('rejected', pa.int64()), ('why', pa.string()),
+        (DATE, pa.string()), (ROBOT, pa.string()), (PART, pa.string()), ('etag', pa.string()),
+        ('ingested', _KINDS[TIME]), ('rows', pa.int64()), ('rejected', pa.int64()), ('why', pa.string()),
     ]),
-    (PART,), 'ingested', (DATE,),
+    (PART, 'etag'), 'ingested', (DATE,),
 )  # fmt: skip
 """Which row files the other tables contain: a row here is committed after all rows of its file."""
 TABLES: Final[Mapping[str, Table]] = {
     OBJECTS.folder: OBJECT_ROWS,
     KEPT.folder: _table('kept', KEPT, ('bucket', 'key', 'where', 'bytes'), 't_start_ns'),
     FORGOTTEN.folder: _table('forgotten', FORGOTTEN, ('bucket', 'key'), 't_start_ns'),
-    GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what'), 'to_ns'),
+    GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what', 'from_ns', 'to_ns'), 'to_ns'),
     STATISTICS.folder: _table('statistics', STATISTICS, ('bucket', 'key', 't_start_ns', 'field'), 't_start_ns'),
     LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns'),
 }
@@ -96,18 +98,21 @@ class Conflict(Exception):
 class Tables:
     """The tables of one store. A value: every call opens what it needs.
 
-    Nothing but a LakeError or Conflict leaves it.
+    Nothing but a StoreError, LakeError or Conflict leaves it.
     """
 
     root: str
     """A folder, or a URL such as ``s3://lake``."""
-    options: Mapping[str, str] | None = field(default=None, repr=False)
-    is_shared: bool = False
-    """Whether other machines read the same tables."""
+    server: StoreSettings | None = field(default=None, repr=False)
+    """The S3 server of tables that are shared with other machines."""
+
+    @property
+    def is_shared(self) -> bool:
+        return self.server is not None
 
     @classmethod
     def of(cls, source: Bucket) -> Tables:
-        """Those of the store of this bucket: the shared ones if the server has them. Raises LakeError."""
+        """Those of the store of this bucket: the shared ones if the server has them. Raises StoreError."""
         if source.settings.endpoint_url:
             shared = cls.shared(source.settings)
             if shared.exists(INGESTED):
@@ -117,7 +122,7 @@ class Tables:
     @classmethod
     def shared(cls, settings: StoreSettings) -> Tables:
         """Those in the bucket ``lake`` of an S3 server, whether or not they exist yet."""
-        return cls(f's3://{BUCKET}', storage_options(settings), is_shared=True)
+        return cls(f's3://{BUCKET}', settings)
 
     @classmethod
     def local(cls, source: Bucket) -> Tables:
@@ -127,10 +132,13 @@ class Tables:
         return cls(str(home(os.environ) / 'lake' / name))
 
     def exists(self, table: Table) -> bool:
-        """False as well for a bucket that does not exist or cannot be read."""
-        try:
-            return DeltaTable.is_deltatable(self._uri(table), self._options())
-        except (DeltaError, OSError):
+        """False as well for a bucket that does not exist or may not be read. Raises StoreError."""
+        if self.server is None:
+            return Path(self._uri(table), LOG).is_dir()
+        bucket, _, prefix = f'{self.root.removeprefix("s3://")}/'.partition('/')
+        try:  # DeltaTable.is_deltatable() holds the interpreter's lock while it waits
+            return LOG in Bucket(self.server, bucket).folders(f'{prefix}{table.name}/')
+        except (AccessDenied, BucketMissing):
             return False
 
     def create(self) -> None:
@@ -138,7 +146,7 @@ class Tables:
         with translated():
             for table in (*TABLES.values(), INGESTED):
                 if not self.exists(table):
-                    if not self.options:
+                    if not self.is_shared:
                         Path(self._uri(table)).mkdir(parents=True, exist_ok=True)
                     DeltaTable.create(
                         self._uri(table), table.schema, mode='ignore', partition_by=list(table.partitions),
@@ -173,7 +181,7 @@ class Tables:
         return f'{self.root}/{table.name}'
 
     def _options(self) -> dict[str, str] | None:
-        return dict(self.options) if self.options else None
+        return None if self.server is None else storage_options(self.server)
 
 
 def storage_options(settings: StoreSettings) -> dict[str, str]:
@@ -181,6 +189,7 @@ def storage_options(settings: StoreSettings) -> dict[str, str]:
     options = {
         'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': 'true',
         'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
+        'connect_timeout': '5s', 'timeout': '60s', 'retry_timeout': '60s',
     }  # fmt: skip
     if settings.access_key_id and settings.secret_access_key:
         options |= {'AWS_ACCESS_KEY_ID': settings.access_key_id, 'AWS_SECRET_ACCESS_KEY': settings.secret_access_key}
@@ -261,6 +270,11 @@ def literal(value: str | float) -> str:
     return repr(value)
 
 
+def quoted(name: str) -> str:
+    """The name of a column in SQL."""
+    return '"' + name.replace('"', '""') + '"'
+
+
 def _plain(schema: pa.Schema) -> pa.Schema:
     """The engine's views of texts as texts."""
     kinds = {pa.string_view(): pa.string(), pa.binary_view(): pa.binary()}
@@ -277,7 +291,7 @@ def translated() -> Iterator[None]:
     except TableNotFoundError as error:
         raise LakeError(f'the lake has no such table: {_text(error)}') from error
     except (DeltaError, pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise LakeError(f'the lake cannot answer: {_text(error)}') from error
+        raise LakeError(f'the query cannot be answered: {_text(error)}') from error
     except OSError as error:
         raise LakeError(f'the tables of the lake cannot be read: {_text(error)}') from error
 

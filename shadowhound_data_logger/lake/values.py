@@ -245,10 +245,9 @@ class _Question:
         sieve = _Sieve(self._asked, chosen, known)
         found = [narrow(_OBJECT).empty_table()]
         if any(self._flags.get(name) is not None for name in _BY_QUERY):
-            from shadowhound_data_logger.lake import query  # noqa: PLC0415 - Daft takes half a second
+            from shadowhound_data_logger.lake import query  # noqa: PLC0415 - the extra lake
 
-            with query.answering():
-                table = query.objects(self._source, findings=self._findings, **self._flags).select(*_OBJECT).to_arrow()
+            table = query.objects(self._source, findings=self._findings, columns=_OBJECT, **self._flags)
             table = table.cast(narrow(_OBJECT)).combine_chunks()
             found.append(table.filter(pa.array(sieve(table))))
         else:

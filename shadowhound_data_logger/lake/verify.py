@@ -43,9 +43,7 @@ _SAID: Final = (*_KEY, 'bytes', 'sha256')
 
 def rows(source: Bucket, findings: Findings, **flags: Any) -> Rows:
     """Of one catalogue; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
-    with query.answering():
-        found: pa.Table = query.objects(source, findings=findings, **flags).select(*_SAID).distinct().to_arrow()
-    return Rows(found)
+    return Rows(query.objects(source, findings=findings, columns=_SAID, distinct=True, **flags))
 
 
 @dataclass(frozen=True, slots=True)

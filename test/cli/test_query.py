@@ -87,8 +87,8 @@ def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
     assert found.exit_code == 0, found.output
     with Image.open(sheet) as image:
         assert image.width == 800
-        colors = [image.convert('RGB').getpixel((x, 100)) for x in range(image.width)]
-        assert sum(color[0] < 20 and 110 < color[1] < 140 for color in colors) > 400  # type: ignore[index, operator]
+        colours = [image.convert('RGB').getpixel((x, 100)) for x in range(image.width)]
+        assert sum(colour[0] < 20 and 110 < colour[1] < 140 for colour in colours) > 400  # type: ignore[index, operator]
     with Image.open(ground) as image:
         assert image.width == 800
     assert 'no image' in run(home, '--sensor', 'odom', '--sheet', str(sheet)).output
@@ -145,7 +145,7 @@ def test_a_csv_for_a_pipe_that_is_not_utf_8(spoken: Path, encoding: str, cells: 
 @pytest.mark.long('a process of its own')
 def test_a_robot_has_no_library_for_it(home: Path, tmp_path: Path) -> None:
     """Without Daft it says what to install, as bad usage."""
-    (tmp_path / 'daft.py').write_text("raise ModuleNotFoundError('no', name='daft')\n", encoding='utf-8')
+    (tmp_path / 'deltalake.py').write_text("raise ModuleNotFoundError('no', name='deltalake')\n", encoding='utf-8')
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'query']
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'PYTHONPATH': f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}'}
     ran = subprocess.run(command, env=environ, capture_output=True, text=True, check=False, timeout=60)

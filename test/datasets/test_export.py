@@ -265,7 +265,7 @@ def test_labels_are_a_column_and_choose_validation(tmp_path: Path) -> None:
     mission = place.record(Mission('one', seconds=2, sensors=('camera', 'odom')))
     place.record(Mission('two', begin_s=50, seconds=2, sensors=('camera', 'odom')))
     stairs = Label(robot='thor', label='stairs; "up"', since_ns=mission.begin_ns + SECOND, until_ns=mission.begin_ns + 2 * SECOND)
-    picture = query.objects(place.source, sensor='camera', mission='two').sort('t_start_ns').to_pylist()[-1]
+    picture = query.objects(place.source, sensor='camera', mission='two').sort_by('t_start_ns').to_pylist()[-1]
     box = Label(robot='thor', label='person', since_ns=picture['t_start_ns'], until_ns=picture['t_end_ns'], bucket='sensor-data',
                 key=picture['key'], x=1, y=2, width=3, height=4)  # fmt: skip
     with closing(open_store(place.settings, UploadSettings())) as store:

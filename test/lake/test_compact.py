@@ -72,7 +72,7 @@ def files(settings: StoreSettings, date: str = '2026-10-28') -> list[str]:
 
 
 def answer(settings: StoreSettings, **flags: Any) -> list[str]:
-    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
+    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags)['key'].to_pylist())
 
 
 @pytest.fixture

@@ -203,7 +203,7 @@ def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path:
             client.create_bucket(Bucket=name)
     client.close()
     source, robot = Bucket(settings, schema.BUCKET), f'r{tmp_path.name.replace("_", "-")}'[:40].rstrip('-')
-    tables = Tables(f's3://lake/{robot}', Tables.shared(settings).options, is_shared=True)
+    tables = Tables(f's3://lake/{robot}', settings)
     tables.create()
     rows = [row('camera', NOON_NS + second * SECOND, robot) for second in range(3)]
     with closing(open_store(settings, UploadSettings())) as store:

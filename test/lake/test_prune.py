@@ -111,7 +111,7 @@ def _stored(settings: StoreSettings, *sensors: str) -> list[str]:
 
 
 def _answer(settings: StoreSettings) -> list[str]:
-    return sorted(lake.objects(_source(settings)).select('key').to_pydict()['key'])
+    return sorted(lake.objects(_source(settings))['key'].to_pylist())
 
 
 def _check(settings: StoreSettings) -> None:

@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, 
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.query import answering
+from shadowhound_data_logger.lake.tables import Tables
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoreSettings, list
 
 
 def found(source: Any, **flags: Any) -> list[str]:
-    return sorted(lake.objects(source, **flags).select('key').to_pydict()['key'])
+    return sorted(lake.objects(source, columns=['key'], **flags)['key'].to_pylist())
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_flags_mean_what_they_say(
 def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[schema.Row]]) -> None:
     """Names, order and values; times in UTC."""
     settings, rows = world
-    answer = lake.objects(Bucket(settings, schema.BUCKET), sensor='camera').sort('t_start_ns').limit(1).to_pylist()
+    answer = lake.objects(Bucket(settings, schema.BUCKET), sensor='camera', order='t_start_ns', limit=1).to_pylist()
     first = min((row for row in rows if row['sensor'] == 'camera'), key=lambda row: row['t_start_ns'])
     assert list(answer[0]) == list(schema.COLUMNS)
     times = {'t_start', 't_end'}
@@ -88,26 +88,27 @@ def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, l
     assert answer[0]['t_start'].timestamp() * 1e6 == first['t_start']
 
 
-def test_only_the_asked_days_are_asked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
-    """Of another day not even the names; making a frame asks for nothing at all."""
-    settings, _ = world
-    source = watched(settings)
-    frame = lake.objects(source, **DAY)
-    assert source.asked == []
-    frame.collect()
-    assert {verb for verb, _ in source.asked} == {'folders', 'list', 'get'}
-    assert [key for verb, key in source.asked if verb == 'folders'] == ['', '_forgotten/thor/']
+def test_only_the_asked_days_are_asked_for(tmp_path: Path) -> None:
+    """Of other days not even the names; what is in the tables is not read again."""
+    fill(folder_store(tmp_path), tmp_path / 'tmp')
+    source = watched(folder_store(tmp_path))
+    assert len(lake.objects(source, robot='thor', **DAY)) == 192
     assert {key for verb, key in source.asked if verb == 'list'} == {'thor/_catalog/date=2026-10-28/'}
     assert all(key.startswith('thor/_catalog/date=2026-10-28/') for verb, key in source.asked if verb == 'get')
     assert len({key for verb, key in source.asked if verb == 'get'}) == 24
+    source.asked.clear()
+    assert len(lake.objects(source, robot='thor', **DAY)) == 192
+    assert 'get' not in {verb for verb, _ in source.asked}
 
 
-def test_a_robot_that_is_named_is_not_looked_for(world: tuple[StoreSettings, list[schema.Row]]) -> None:
-    """One listing of one folder, and whether anything was forgotten; then its parts."""
-    source = watched(world[0])
-    lake.objects(source, robot='thor', **DAY).collect()
-    assert [verb for verb, _ in source.asked].count('list') == 1
-    assert [key for verb, key in source.asked if verb == 'folders'] == ['_forgotten/thor/']
+def test_rows_of_a_store_that_was_replaced_are_forgotten(tmp_path: Path) -> None:
+    """A folder, or the address of a server, that now holds something else."""
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp', days=(0,))
+    assert len(found(Bucket(settings, schema.BUCKET))) == 192
+    shutil.rmtree(settings.directory)
+    rows = fill(settings, tmp_path / 'tmp', days=(1,), hours=(11,))
+    assert found(Bucket(settings, schema.BUCKET)) == keys(rows)
 
 
 def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> None:
@@ -147,7 +148,7 @@ def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -
     rows = fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
     gone = settings.directory / schema.BUCKET / 'thor/_catalog/date=2026-10-28/gone.parquet'
     gone.symlink_to(tmp_path / 'nowhere')
-    assert lake.objects(Bucket(settings, schema.BUCKET)).count_rows() == len(rows)
+    assert len(lake.objects(Bucket(settings, schema.BUCKET))) == len(rows)
 
 
 def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:
@@ -158,7 +159,7 @@ def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> N
     source.delete(f'thor/missions/run-{FAILED}/summary.json')
     store = open_store(settings, UploadSettings())
     add(store, tmp_path / 'tmp', 'thor/missions/run-x/summary.json', b'{broken')
-    told = lake.missions(source).sort('mission_id').to_pydict()
+    told = lake.missions(source).sort_by('mission_id').to_pydict()
     assert told['mission_id'] == [FAILED, FINISHED]
     assert told['success'] == [None, True]
     assert told['duration_s'] == [None, 600.0]
@@ -180,7 +181,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
     shutil.copytree(packed, settings.directory / 'lerobot' / 'policies' / 'go2' / 'go2_patrol_v7')
     failed = lake.sql('SELECT policy, policy_dataset FROM missions WHERE NOT success', source).to_pylist()
     assert failed == [{'policy': manifest.id, 'policy_dataset': 64 * 'd'}]
-    assert lake.missions(source).where("mission_id = 'mfinished'").to_pydict()['policy_dataset'] == [None]
+    assert lake.missions(source, mission=FINISHED)['policy_dataset'].to_pylist() == [None]
     own, every = found(source, mission=FAILED), found(source, where='mission_id IS NOT NULL')
     for wanted, expected in (('go2_patrol', every), ('go2_patrol@7', every), (manifest.id, own), (manifest.id[:-3], own),
                              ('go2_patrol@', []), ('go2', []), ('go2_patrol@70', []), ('other', [])):  # fmt: skip
@@ -192,7 +193,7 @@ def test_which_policy_was_active_and_what_it_was_trained_on(tmp_path: Path) -> N
     source.delete(key)
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', key, json.dumps(told).encode())
-    assert lake.missions(source).sort('mission_id').to_pydict()['policies'] == [None, others]
+    assert lake.missions(source).sort_by('mission_id').to_pydict()['policies'] == [None, others]
     assert found(source, policy='go2_stairs@3') == found(source, mission=FINISHED)
     assert found(source, policy='none') == []
     with pytest.raises(LakeError, match='cannot be selected by policy'):
@@ -211,14 +212,14 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
     frames = sorted(each['key'] for each in rows if each['sensor'] == 'camera' and each['mission_id'] == FAILED)
     assert found(source, sensor='camera', success=False) == frames
     assert found(source, sensor='camera', mission='run-mfail', **DAY) == found(source, sensor='camera', mission=FAILED) == frames
-    told = lake.missions(source, sensor='camera', **DAY).sort('mission_id').to_pydict()
+    told = lake.missions(source, sensor='camera', **DAY).sort_by('mission_id').to_pydict()
     assert (told['run_id'], told['success']) == ([f'run-{FAILED}', f'run-{FINISHED}'], [False, True])
 
 
 @pytest.mark.parametrize(
     'ask',
     [
-        lambda source: lake.objects(source, where='no_such_column < 3').collect(),
+        lambda source: lake.objects(source, where='no_such_column < 3'),
         lambda source: lake.objects(source, where='<<'),
         lambda source: lake.sql('SELEC 1', source),
         lambda source: lake.sql('SELECT key FROM nothing', source),
@@ -228,8 +229,8 @@ def test_what_was_delivered_before_its_mission_had_a_run_belongs_to_it(tmp_path:
 def test_what_is_no_question_is_one_kind_of_error(
     world: tuple[StoreSettings, list[schema.Row]], ask: Callable[[Any], object]
 ) -> None:
-    """A LakeError that says what Daft could not make sense of."""
-    with pytest.raises(LakeError, match='cannot be answered'), answering():
+    """A LakeError that says what the engine could not make sense of."""
+    with pytest.raises(LakeError, match='cannot be answered'):
         ask(Bucket(world[0], schema.BUCKET))
 
 
@@ -265,8 +266,7 @@ def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Pat
         front.targets = []
         settings = through(front, seaweed)
         source = Watched(Bucket(settings, schema.BUCKET))
-        frame = lake.objects(source, **DAY, robot='thor', near=(3.0, 1.5, 2.0), where='battery_pct < 62')
-        answer = frame.select('key').to_pydict()['key']
+        answer = lake.objects(source, **DAY, robot='thor', near=(3.0, 1.5, 2.0), where='battery_pct < 62')['key'].to_pylist()
         dated = [target for target in front.targets if 'date' in target]
         assert len(dated) == 25
         assert all('date%3D2026-10-28' in target or 'date=2026-10-28' in target for target in dated)
@@ -276,7 +276,7 @@ def test_a_real_server_is_asked_for_that_day_alone(seaweed: Tower, tmp_path: Pat
     ]  # fmt: skip
     assert sorted(answer) == keys(expected)
     assert expected
-    shown = f'{source.inner!r} {source.describe()} {frame}'
+    shown = f'{source.inner!r} {source.describe()} {Tables.shared(settings)!r}'
     assert settings.secret_access_key not in shown
     assert settings.access_key_id not in shown
 
@@ -287,7 +287,7 @@ def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None
     plain = seaweed.store_settings()
     wrong = StoreSettings(endpoint_url=plain.endpoint_url, access_key_id=plain.access_key_id, secret_access_key='not the secret')
     with pytest.raises(CredentialsRejected) as caught:
-        lake.objects(Bucket(wrong, schema.BUCKET)).collect()
+        lake.objects(Bucket(wrong, schema.BUCKET))
     assert plain.access_key_id not in str(caught.value)
     assert 'not the secret' not in str(caught.value)
     assert 'AWS_SECRET_ACCESS_KEY' in str(caught.value)

@@ -51,7 +51,7 @@ def run(settings: StoreSettings, robot: str = 'thor') -> library.Reindexed:
 
 
 def answer(settings: StoreSettings, **flags: Any) -> list[str]:
-    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags).select('key').to_pydict()['key'])
+    return sorted(lake.objects(Bucket(settings, schema.BUCKET), **flags)['key'].to_pylist())
 
 
 def test_a_lost_catalogue_is_made_again(settings: StoreSettings) -> None:
@@ -82,7 +82,7 @@ def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, t
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')
         assert answer(settings) == ALL
-        assert len(lake.objects(Bucket(settings, schema.BUCKET), sensor='camera').collect()) == len(TIMES)
+        assert len(lake.objects(Bucket(settings, schema.BUCKET), sensor='camera')) == len(TIMES)
         source = Bucket(settings, schema.BUCKET)
         for now in (datetime(2026, 10, 30, tzinfo=timezone.utc), LATER):
             list(compact(source, store, before='2026-10-30', now=lambda now=now: now))  # type: ignore[misc]

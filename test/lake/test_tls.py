@@ -78,7 +78,7 @@ def test_a_private_authority_is_trusted(
         monkeypatch.setattr(scan, 'SMALL_BYTES', 0)
     with secured(filled, authorities['authority'], 'good') as front:
         source = Bucket(towards(front.url), 'sensor-data')
-        assert len(lake.objects(source, robot=ROBOT).select('key').to_pydict()['key']) == OBJECTS
+        assert len(lake.objects(source, robot=ROBOT)['key'].to_pylist()) == OBJECTS
         told = run('fetch', '--robot', ROBOT, '--to', str(tmp_path / 'data'), '--json')
         assert json.loads(told.stdout)['moved'] == OBJECTS
         verified = run('lake', 'verify', '--robot', ROBOT, '--deep', '--json')

@@ -1,0 +1,90 @@
+"""What a query sees: every row exactly once, from the tables at one version and the row files that this version lacks.
+
+On a shared lake rows that are not ingested yet are read from their files and joined to the tables for this query alone. Without
+one, a query first ingests what it needs into the tables of this user. With ``as_of`` it sees the tables as of that time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from typing import Any
+
+import pyarrow as pa
+from deltalake import QueryBuilder
+
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.ingest import Scope, fresh, ingest, known_files, pending, row_files
+from shadowhound_data_logger.lake.tables import INGESTED, TABLES, Tables, answer, engine, literal
+
+_TABLE, _FRESH = '_table', '_fresh'
+
+
+@contextmanager
+def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robot: str | None = None,
+          has_date: Callable[[str], bool] | None = None, as_of: datetime | None = None,
+          more: Mapping[str, pa.Table] | None = None) -> Iterator[QueryBuilder]:  # fmt: skip
+    """An engine with a view of each of these tables, such as ``all_objects``, and ``more`` tables.
+
+    ``robot`` and ``has_date`` say which rows are needed: there may be others. ``all_objects`` omits what was deleted on purpose.
+    Raises StoreError, LakeError.
+    """
+    of = tuple(dict.fromkeys((*of, FORGOTTEN))) if OBJECTS in of else tuple(of)
+    tables, scope = Tables.of(source), Scope(of, robot, has_date)
+    if not tables.is_shared and as_of is None:
+        _catch_up(source, tables, scope, findings)
+    ingested = tables.open(INGESTED)
+    opened = {each: tables.open(TABLES[each.folder], as_of) for each in of}
+    for bad in known_files(ingested, where='rejected > 0'):
+        if bad.is_in(scope):
+            findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
+    found: dict[str, Any] = {f'{TABLES[each.folder].name}{_TABLE}': table for each, table in opened.items()}
+    empty = {each for each, table in opened.items() if not table.file_uris()}
+    if tables.is_shared and as_of is None:
+        files = pending(ingested, row_files(source, findings, scope))
+        for each in {file.of for file in files}:
+            rows = fresh(source, files, opened[each], each, findings)
+            if len(rows):
+                found[f'{TABLES[each.folder].name}{_FRESH}'] = rows
+                empty.discard(each)
+    with engine({**found, **(more or {})}) as ready:
+        for each in of:
+            answer(ready, _view(TABLES[each.folder].name, found, is_pruned=each is OBJECTS and FORGOTTEN not in empty))
+        yield ready
+
+
+def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str | None = None,
+            has_date: Callable[[str], bool] | None = None, where: str = 'true',
+            columns: Sequence[str] = ()) -> pa.Table:  # fmt: skip
+    """The rows of one table for which a condition holds, with the columns of its schema. Raises StoreError, LakeError."""
+    table = TABLES[of.folder]
+    names = ', '.join(f'"{name}"' for name in columns or of.columns)
+    of_robot = 'true' if robot is None else f'robot = {literal(robot)}'
+    with views(source, [of], findings, robot=robot, has_date=has_date) as ready:
+        return answer(ready, f'SELECT {names} FROM all_{table.name} WHERE {of_robot} AND ({where})')  # noqa: S608 - our own words
+
+
+def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> None:
+    """Ingest what this user's tables lack; if the store lost files that they contain, it is another store: begin again."""
+    tables.create()
+    opened = tables.open(INGESTED)  # before the listing: what another process ingests after it is not missing there
+    files = row_files(source, findings, scope)
+    there = {(file.entry.key, file.entry.etag) for file in files}
+    if any(each.is_in(scope) and (each.part, each.etag) not in there for each in known_files(opened)):
+        tables.delete_local()
+        tables.create()
+        opened = tables.open(INGESTED)
+    ingest(source, tables, findings, pending(opened, files))
+
+
+def _view(name: str, found: Mapping[str, Any], *, is_pruned: bool) -> str:
+    parts = [f'SELECT * FROM {each}' for each in (f'{name}{_TABLE}', f'{name}{_FRESH}') if each in found]  # noqa: S608
+    rows = ' UNION ALL '.join(parts)
+    if is_pruned:
+        same = ' AND '.join(f'f.{column} = o.{column}' for column in ('date', 'robot', 'bucket', 'key'))
+        known = [f'SELECT 1 FROM {each} f WHERE {same}' for each in found if each.startswith('forgotten')]  # noqa: S608
+        rows = f'SELECT * FROM ({rows}) o WHERE ' + ' AND '.join(f'NOT EXISTS ({each})' for each in known)  # noqa: S608
+    return f'CREATE VIEW all_{name} AS {rows}'
