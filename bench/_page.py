@@ -296,7 +296,7 @@ def _ask(figures: Figures) -> str:
                f'{row["opened"]:,} of {row["objects"]:,} ({show(100 * row["opened"] / row["objects"])} %)')
               for row in figures['values']]  # fmt: skip
     words = [(f'`{row["question"]}`', *took(row), f'{row["found"]:,}') for row in figures['words']]
-    sizes = f'{figures["catalogue_bytes"] / 1e6:.0f} MB of catalogue, {figures["statistics_bytes"] / 1e6:.0f} MB of statistics'
+    sizes = f'{figures["catalog_bytes"] / 1e6:.0f} MB of catalog, {figures["statistics_bytes"] / 1e6:.0f} MB of statistics'
     return '\n\n'.join((
         _table((f'by value, {figures["objects"]:,} objects', *head, 'times', 'objects opened'), values),
         _table((f'by words, {figures["missions"]:,} missions', *head, 'documents, at most 20'), words), f'{sizes}.',

@@ -1,4 +1,4 @@
-"""Ten questions about what was in the data and what was said of it, on a compacted catalogue of a million rows.
+"""Ten questions about what was in the data and what was said of it, on a compacted catalog of a million rows.
 
 Run it as ``python bench/ask.py [--objects 1000000] [--missions 100000] [--folder F] [--json]``. The objects are batches of an
 IMU of one second; a few of them hold a bump, and only those lie in the store, a folder: all others are never opened.
@@ -67,7 +67,7 @@ def batch(number: int) -> list[dict[str, Any]]:
 
 
 def fill(store: ObjectStore, folder: Path, objects: int) -> tuple[int, int]:
-    """The compacted parts of all days; bytes of the catalogue and of the statistics."""
+    """The compacted parts of all days; bytes of the catalog and of the statistics."""
     sizes = [0, 0]
     for start in range(0, objects, DAY):
         numbers = np.arange(start, min(start + DAY, objects))
@@ -173,7 +173,7 @@ def measure(options: argparse.Namespace) -> Report:
     folder.mkdir(parents=True)
     settings = StoreSettings(directory=folder / 'store')
     with closing(open_store(settings, UploadSettings())) as store:
-        catalogue_bytes, statistics_bytes = fill(store, folder, options.objects)
+        catalog_bytes, statistics_bytes = fill(store, folder, options.objects)
     source = Bucket(settings, BUCKET)
     bumps = sum(number % EVERY == EVERY // 2 for number in range(options.objects))
     asked: dict[str, tuple[Callable[[], values.ValueAnswer], int | None]] = {
@@ -186,7 +186,7 @@ def measure(options: argparse.Namespace) -> Report:
         'imu.temperature > 49.99': (lambda: values.ranges('imu.temperature > 49.99', source), None),
     }  # fmt: skip
     bars: list[Bar] = []
-    figures: dict[str, Any] = {'objects': options.objects, 'catalogue_bytes': catalogue_bytes,
+    figures: dict[str, Any] = {'objects': options.objects, 'catalog_bytes': catalog_bytes,
                                'statistics_bytes': statistics_bytes, 'values': [], 'words': []}  # fmt: skip
     for text, (ask, expected) in asked.items():
         took, answer = _timed(ask)
@@ -198,7 +198,7 @@ def measure(options: argparse.Namespace) -> Report:
         figures['values'].append({'question': text, 's': took, 'opened': answer.opened, 'objects': answer.objects,
                                   'times': len(answer.ranges)})  # fmt: skip
     first = next(iter(asked))
-    figures['values'][0]['command_s'] = _command_s(folder, 'query', '--where', first)
+    figures['values'][0]['command_s'] = _command_s(folder, 'query', '--when', first)
     path = folder / 'search.db'
     began = time.perf_counter()
     words(path, options.missions)
@@ -243,7 +243,7 @@ def _timed(ask: Callable[[], Any]) -> tuple[list[float], Any]:
 
 
 def _more(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--objects', type=int, default=1_000_000, help='rows of the catalogue (default 1000000)')
+    parser.add_argument('--objects', type=int, default=1_000_000, help='rows of the catalog (default 1000000)')
     parser.add_argument('--missions', type=int, default=100_000, help='of the index of words (default 100000)')
 
 

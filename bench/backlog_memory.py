@@ -2,7 +2,7 @@
 
 One node records a bag in slices of ten seconds, keeps a full ring for events and makes forty objects a second, beside a simulated
 robot at its full rate. The S3 server is there (``--seconds``), away (``--away``), and back (``--back``) for longer than a period
-of the catalogue, which has a row of each object that leaves. Memory is the resident memory of the node's process tree, a sample a
+of the catalog, which has a row of each object that leaves. Memory is the resident memory of the node's process tree, a sample a
 second; ``--table`` writes every sample, with what glibc and the queues have of it.
 """
 

@@ -3,8 +3,8 @@
 Run it as ``python bench/dataset.py [--frames 900] [--rounds 3] [--json]`` where torch is installed (the extra ``train``). The
 guide's loop is its own: boto3's paginator, ``download_file`` one by one, then each file read and decoded (by Pillow). Both take
 turns on the same frames, 640 x 480, in the same SeaweedFS; a round's ratio is of two runs side by side. Ours is measured three
-times: single JPEGs from the stream, the same by number (shuffled), and archives of a second. Making the data set (the
-catalogue's question) and starting the workers is in it; importing torch, boto3 and Daft is in neither.
+times: single JPEGs from the stream, the same by number (shuffled), and archives of a second. Making the dataset (the
+catalog's question) and starting the workers is in it; importing torch, boto3 and Daft is in neither.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def picture(number: int) -> bytes:
 
 
 def fill(store: S3Store, frames: int) -> int:
-    """Single frames of the robot thor, archives of the same of tachi, and their catalogues; bytes of the frames."""
+    """Single frames of the robot thor, archives of the same of tachi, and their catalogs; bytes of the frames."""
     bodies = [picture(number) for number in range(16)]
     puts: list[tuple[str, bytes, dict[str, str]]] = []
     for number in range(frames):

@@ -1,7 +1,7 @@
 """What ``MissionDataset`` of a million rows costs before its first sample: seconds and memory.
 
 Run it as ``python bench/dataset_index.py [--rows 1000000] [--rounds 3] [--json]``. The rows are frames of a second in hourly
-parts, in a folder as ``shadowhound-data fetch`` leaves it. Each round is a process of its own that has made a data set of one of
+parts, in a folder as ``shadowhound-data fetch`` leaves it. Each round is a process of its own that has made a dataset of one of
 the parts before, so that libraries are loaded and have planned once; the index is what one process hands to its workers.
 """
 

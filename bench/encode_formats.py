@@ -88,7 +88,7 @@ class Messages:
         return self.header(), turn, self.rng.normal(size=9), rate, self.rng.normal(size=9), push, self.rng.normal(size=9)
 
     def depth(self) -> Any:
-        """640 x 480 millimetres of a slanted wall, with noise and a tenth of holes."""
+        """640 x 480 millimeters of a slanted wall, with noise and a tenth of holes."""
         wall = np.linspace(500, 6000, 640)[None, :] + np.linspace(0, 2000, 480)[:, None]
         noisy = (wall + self.rng.normal(0, 4, wall.shape)).astype(np.uint16)
         return np.where(self.rng.random(wall.shape) < 0.1, np.uint16(0), noisy)
@@ -144,12 +144,12 @@ class Messages:
         published = self.cdr(compressed, self.header(), 'jpeg', jpeg)
         raw = self.cdr(image, self.header(), 480, 640, 'bgr8', 0, 1920, picture.reshape(-1))
         deep = self.cdr(image, self.header(), 480, 640, '16UC1', 0, 1280, depth.reshape(-1).view(np.uint8))
-        metres = (depth / 1000).astype(np.float32).reshape(-1).view(np.uint8)
+        meters = (depth / 1000).astype(np.float32).reshape(-1).view(np.uint8)
         yield Case('jpeg   CompressedImage', 'camera', compressed, published)
         yield Case('jpeg   Image 640x480 bgr8', 'camera', image, raw)
         yield Case('jpeg   Image 640x480 16UC1: PNG', 'camera', image, deep)
         yield Case('jpeg   Image 640x480 32FC1: TIFF', 'camera', image,
-                   self.cdr(image, self.header(), 480, 640, '32FC1', 0, 2560, metres))  # fmt: skip
+                   self.cdr(image, self.header(), 480, 640, '32FC1', 0, 2560, meters))  # fmt: skip
         yield Case('png    Image 640x480 bgr8', 'camera', image, raw, 1, 'png')
         yield Case('tar    CompressedImage, batch of 30', 'camera', compressed, published, 30, 'tar')
         yield Case('zip    CompressedImage, batch of 30', 'camera', compressed, published, 30, 'zip')

@@ -92,7 +92,7 @@ def measure(options: argparse.Namespace) -> Report:
         'memory_most_while_writing': large['most'],
         'round_before_s': {'median': statistics.median(before), 'longest': before[-1], 'rounds': len(before)},
         'round_meanwhile_s': {'median': statistics.median(meanwhile), 'longest': meanwhile[-1], 'rounds': len(meanwhile)},
-        'asked_for': sum(row['received'] for row in large['ledger']['events'].values()), 'lost': gone,
+        'requested_rmw': sum(row['received'] for row in large['ledger']['events'].values()), 'lost': gone,
     }  # fmt: skip
     bars = (
         Bar('memory of a full ring over all topics, against its bytes', f'at most {BAR}', grown, 'of them', grown <= BAR),

@@ -23,7 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
 DEPTH = 2000
-LEAST_NAP_S = 0.0002
+MIN_NAP_S = 0.0002
 """It sleeps until the next message is due, this long at least: up to 5,000 a second come one by one, then in small groups."""
 STAMP = struct.Struct('<iI')
 STAMP_AT = 4
@@ -53,7 +53,7 @@ def publish(publisher: Any, message: bytearray, count: int, rate_hz: float) -> d
                 STAMP.pack_into(message, STAMP_AT, *divmod(time.time_ns(), 1_000_000_000))
                 publisher.publish(bytes(message))
                 sent += 1
-            time.sleep(max(LEAST_NAP_S, start + sent / rate_hz - time.monotonic()))
+            time.sleep(max(MIN_NAP_S, start + sent / rate_hz - time.monotonic()))
     except RuntimeError as error:  # RCLError, which rclpy does not export
         print(f'stopped after {sent} messages: {error}', file=sys.stderr)
     seconds = time.monotonic() - start

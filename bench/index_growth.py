@@ -2,7 +2,7 @@
 
 Run it as ``python bench/index_growth.py [--hours 6] [--day] [--folder F] [--json]``. Time is simulated: each second of the robot
 is one commit of the objects that ``launch_configs/go2.yaml`` makes of it, with the metadata that a node in a mission gives them,
-one delivery of all of them, and one part of the catalogue a minute. The first three hours are left out. ``--day`` goes on for a
+one delivery of all of them, and one part of the catalog a minute. The first three hours are left out. ``--day`` goes on for a
 day and a half with ``remember_days: 1``, for how large the file becomes in the end. Of the longest commit the CPU time is told.
 """
 
@@ -19,9 +19,9 @@ from time import thread_time
 from typing import Any
 
 from shadowhound_data_logger.core.clock import SECOND, utc
-from shadowhound_data_logger.core.config import CatalogueSettings, SpoolSettings
+from shadowhound_data_logger.core.config import CatalogSettings, SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, Outcome, State
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
 
 START_NS = 1_760_774_400 * SECOND
@@ -85,7 +85,7 @@ class Robot:
         self.clock = SimulatedClock()
         self.spool = Spool(root, SpoolSettings(min_free_bytes=0, remember_days=remember_days), self.clock, 'thor')
         self.spool.open()
-        self._catalogue = CatalogueWriter(root, CatalogueSettings(), 'thor', self.clock, lambda: self.clock.boot_ns() / SECOND)
+        self._catalog = CatalogWriter(root, CatalogSettings(), 'thor', self.clock, lambda: self.clock.boot_ns() / SECOND)
         self._second = 0
         self.slowest_s = 0.0
         """CPU time of the longest commit."""
@@ -95,7 +95,7 @@ class Robot:
         delivered = 0
         for _ in range(seconds):
             self.clock.now_ns += SECOND
-            objects = [*made(self._second), *(self._catalogue.due() if self._second % 10 == 0 else ())]
+            objects = [*made(self._second), *(self._catalog.due() if self._second % 10 == 0 else ())]
             self._second += 1
             for item in objects:
                 if item.topic is not None:

@@ -124,7 +124,7 @@ def measure(options: argparse.Namespace) -> Report:
 
 
 def _bars(figures: dict[str, Any], late: dict[str, list[float]], rounds: Sequence[float]) -> tuple[Bar, ...]:
-    words = {'_previews': 'preview', KEPT.folder: 'catalogue row'}
+    words = {'_previews': 'preview', KEPT.folder: 'catalog row'}
     shaped = f'link of {MBPS:g} Mbit/s, {figures["seconds"]:g} s'
     return (
         Bar('CPU of the node that keeps all at full rate, against one beside it that uploads 1 Hz', f'at most {MOST_RATIO}',

@@ -1,4 +1,4 @@
-"""A catalogue of one-minute parts on the embedded Tower, asked before and after compaction; and ``fetch`` beside rclone and aws.
+"""A catalog of one-minute parts on the embedded Tower, asked before and after compaction; and ``fetch`` beside rclone and aws.
 
 Run it as ``python bench/lake.py [--days 30] [--objects 5000] [--folder F] [--json]``: 30 days are 43,200 parts, a million rows.
 A question is for the camera frames near a point while the battery was low, on one day; importing Daft is not in it. The fetches

@@ -1,7 +1,7 @@
 """A day of pictures at 1 Hz asked by likeness: 86,400 vectors of 512 numbers, against one product of plain numpy in the same run.
 
 Run it as ``python bench/likeness.py [--vectors 86400] [--numbers 512] [--json]``. The search alone is measured, as the answer
-needs it: reading the parts and the catalogue's rows comes beside it (``read_s``).
+needs it: reading the parts and the catalog's rows comes beside it (``read_s``).
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ WATCHING = 8
 """While the page is killed."""
 TAKINGS = round(4 / 1.1, 1)
 """Times the CPU of taking the messages that the page may use with one viewer: 4 % of a core was the aim where that cost 1.1 %."""
-MOST_LATE_MS, FULL_SHARE = 60.0, 0.9
+MAX_LATE_MS, FULL_SHARE = 60.0, 0.9
 """What an IMU message may take besides the way, and the part of the bytes of a near viewer that a far one must get."""
 BESIDE = 1.2
 """Times its p95 alone that a viewer beside one on a slow link may have."""
@@ -371,7 +371,7 @@ def far_bars(near: dict[str, Any], far: dict[str, Any], round_ms: float) -> list
     return [
         at_least(f'bytes of a viewer {where}, of those of one beside the robot', FULL_SHARE,
                  far['each'][0]['mbps'] / near['each'][0]['mbps'], 'of them'),
-        *late(far, {'imu': round_ms / 2 + MOST_LATE_MS}, where),
+        *late(far, {'imu': round_ms / 2 + MAX_LATE_MS}, where),
     ]  # fmt: skip
 
 

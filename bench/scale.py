@@ -17,11 +17,11 @@ HOURS: Final = 8
 """That a robot works a day; all else is a day of them."""
 DAY_S: Final = HOURS * 3600
 PART_BYTES, ROW_BYTES = 4000, 81
-"""Of a part of the catalogue, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33 KB)."""
+"""Of a part of the catalog, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33 KB)."""
 COMPACT_ROW_BYTES: Final = 88
 """Of a row in a compacted day (measured on 33,326 rows; their sha256 is random text, which hardly shrinks)."""
 PART_S: Final = 60
-"""``catalogue.period_s``."""
+"""``catalog.period_s``."""
 LISTED: Final = 1000
 """Keys a LIST answers, in S3."""
 PUTS_A_CORE: Final = 190
@@ -62,8 +62,8 @@ def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
         )  # fmt: skip
 
 
-def catalogue(profile: Profile) -> Iterator[tuple[str, ...]]:
-    """Rows: the catalogue of a day, and the requests of a question for the whole fleet's day, before and after compaction."""
+def catalog(profile: Profile) -> Iterator[tuple[str, ...]]:
+    """Rows: the catalog of a day, and the requests of a question for the whole fleet's day, before and after compaction."""
     for robots in FLEETS:
         parts = robots * DAY_S // PART_S
         rows = robots * profile.objects_s * DAY_S
@@ -100,7 +100,7 @@ HEADS: Final = {
         'bytes a year',
         'cores that take it',
     ),
-    'catalogue': ('robots', 'rows a day', 'parts a day', 'in parts', 'requests for a day of all', 'compacted', 'requests then'),
+    'catalog': ('robots', 'rows a day', 'parts a day', 'in parts', 'requests for a day of all', 'compacted', 'requests then'),
     'store': (
         'robots',
         'objects in 30 days',
@@ -111,7 +111,7 @@ HEADS: Final = {
         'reading all once',
     ),
 }
-TABLES: Final = {'flow': flow, 'catalogue': catalogue, 'store': store}
+TABLES: Final = {'flow': flow, 'catalog': catalog, 'store': store}
 
 
 def size(count: float) -> str:

@@ -1,4 +1,4 @@
-"""The sharp frames of a fleet, found by several worker processes: the catalogue asked, the frames fetched, decoded and judged.
+"""The sharp frames of a fleet, found by several worker processes: the catalog asked, the frames fetched, decoded and judged.
 
     python examples/fleet_frames.py --since yesterday --near=-0.6,3.1,2 --workers 4
     python examples/fleet_frames.py --since yesterday --runner ray --address ray://HEAD:10001 --workers 64
@@ -61,10 +61,10 @@ class Judge:
 
 def judged(pixels: Any) -> dict[str, float | None]:
     """Sharpness and mean brightness of an image, by its green, which most of what the eye takes for light is."""
-    grey = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
-    inner = grey[1:-1, 1:-1]
-    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
-    return {'sharpness': float(np.var(laplacian)), 'brightness': float(grey.mean())}
+    gray = (pixels[..., 1] if pixels.ndim == 3 else pixels).astype(np.float32)
+    inner = gray[1:-1, 1:-1]
+    laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * inner
+    return {'sharpness': float(np.var(laplacian)), 'brightness': float(gray.mean())}
 
 
 def frames(place: Place, workers: int, least: float, **flags: Any) -> daft.DataFrame:

@@ -35,7 +35,7 @@ FRAME_EVERY: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """What a robot says of itself; percent, degrees Celsius, metres, radians."""
+    """What a robot says of itself; percent, degrees Celsius, meters, radians."""
 
     battery_percentage: float
     temperature: float
@@ -66,7 +66,7 @@ class SimulatedRobot:
 
 
 class Pose(NamedTuple):
-    """A row of the trajectory: seconds since 1970, metres, radians."""
+    """A row of the trajectory: seconds since 1970, meters, radians."""
 
     timestamp: float
     x: float

@@ -5,11 +5,11 @@
 
 Frames come from the store that AWS_ENDPOINT_URL names (or from ``--folder``, what ``shadowhound-data fetch --to`` brought), the
 run goes to MLFLOW_TRACKING_URI: parameters, losses, the best checkpoint. What is learnt is speed (m/s) and yaw rate (rad/s)
-from one frame to the next, by the catalogue's poses. The last fifth in the order of time is for validation: neighbours look
+from one frame to the next, by the catalog's poses. The last fifth in the order of time is for validation: neighbors look
 alike.
 
 With ``--export DIR`` it learns from a training set of ``shadowhound-data export lerobot`` instead: the action of each frame. Then
-the missions that are marked as validation are held back, and the run is marked with the digest of the data set, by which
+the missions that are marked as validation are held back, and the run is marked with the digest of the dataset, by which
 ``shadowhound-data export where`` finds it.
 """
 
@@ -63,7 +63,7 @@ class Policy(nn.Module):
 
 
 def motions(stamps_ns: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """(n, 2): speed ahead and yaw rate from each frame to the next; NaN where there is none or it is not a neighbour."""
+    """(n, 2): speed ahead and yaw rate from each frame to the next; NaN where there is none or it is not a neighbor."""
     found = np.full((len(poses), 2), np.nan)
     if len(poses) < 2:
         return found

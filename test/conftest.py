@@ -31,10 +31,10 @@ SERVERS = ('process_request_thread', '_server_entry')
 """Threads of the stand-in servers (http.server, moto), which end with their clients or the session."""
 ENGINE = ('DaftBackgroundEventLoop', 'Dummy-')
 """Daft's own, of which a process keeps one set; the latter is what Python calls threads of another language."""
-MOST_WORKERS = 6
+MAX_WORKERS = 6
 """Each collects all tests and loads all libraries, some 6 s of CPU; many tests wait."""
 ONE_ROBOT_AT_A_TIME = (
-    'test/e2e/test_bag.py', 'test/e2e/test_catalogue.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
+    'test/e2e/test_bag.py', 'test/e2e/test_catalog.py', 'test/e2e/test_go2_profile.py', 'test/e2e/test_killed.py',
     'test/e2e/test_raw_camera.py', 'test/sim/test_demo.py', 'test/sim/test_sim_go2_node.py',
 )  # fmt: skip
 """Files with robots at full rate, of which nothing may be missed. They come first, after one another, and others make way."""
@@ -81,7 +81,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     names = [Path(argument.partition('::')[0]) for argument in config.args]
     if config.args_source is pytest.Config.ArgsSource.ARGS and all(name.is_file() for name in names):
         return 0
-    return min(3 * len(os.sched_getaffinity(0)), MOST_WORKERS)
+    return min(3 * len(os.sched_getaffinity(0)), MAX_WORKERS)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -157,7 +157,7 @@ def test_one_file_of_the_doctor_knows_ros() -> None:
     assert [path.name for path in ours if any(name.startswith('rclpy') for name in imports(path))] == ['ros_watch.py']
 
 
-def test_a_robot_writes_the_catalogue_without_reading_it() -> None:
+def test_a_robot_writes_the_catalog_without_reading_it() -> None:
     """What the node runs imports none of the packages that only the extra ``lake`` brings."""
     program = f"""
 import sys

@@ -45,7 +45,7 @@ def test_it_is_arithmetic(scale: Any) -> None:
     """One robot by hand: 8 hours at 6 objects a second."""
     row = next(iter(scale.flow(scale.PROFILES[0])))
     assert row[:5] == ('1', '3 Mbit/s', '6.0', '172,800', '12 GB')
-    row = next(iter(scale.catalogue(scale.PROFILES[0])))
+    row = next(iter(scale.catalog(scale.PROFILES[0])))
     assert row[:3] == ('1', '172,800', '480')
     assert row[4] == '481'
 

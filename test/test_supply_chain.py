@@ -20,7 +20,7 @@ def supply_chain(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module('supply_chain')
 
 
-def test_all_that_is_bundled_has_a_version_a_licence_and_a_hash(supply_chain: Any) -> None:
+def test_all_that_is_bundled_has_a_version_a_license_and_a_hash(supply_chain: Any) -> None:
     """Each package of package-lock.json that runs in the page, as npm hands it out."""
     found = {each['name']: each for each in supply_chain.vendored()}
     wanted = json.loads((ROOT / 'requirements/page/package.json').read_text())['dependencies']

@@ -29,7 +29,7 @@ from torture._command import progress
 LIMIT_BYTES: Final = 2 << 30
 HANG_S: Final = 60.0
 """A round takes some milliseconds; of one that takes a minute its reader does not end by itself."""
-MOST_TOLD: Final = 20
+MAX_TOLD: Final = 20
 TRIES: Final = 20
 """Processes of one kind that may die before the others have their turn."""
 
@@ -58,7 +58,7 @@ def fuzz(kind: str, seed: int, seconds: float) -> Told:
     told, end = Told(), time.monotonic() + seconds
     for _ in range(TRIES):
         left = end - time.monotonic()
-        if left <= 0 or len(told.wrong) >= MOST_TOLD:
+        if left <= 0 or len(told.wrong) >= MAX_TOLD:
             break
         with tempfile.TemporaryDirectory(prefix='readers-') as name:
             _watch(kind, seed + told.rounds, left, Path(name), told)
@@ -107,7 +107,7 @@ def main(arguments: Sequence[str]) -> None:
     one = KINDS[kind](Shop(folder))
     watch_writes()
     end, wrong = time.monotonic() + seconds, 0
-    while time.monotonic() < end and wrong < MOST_TOLD:
+    while time.monotonic() < end and wrong < MAX_TOLD:
         resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + HANG_S), resource.RLIM_INFINITY))
         said: dict[str, object] = {'seed': seed}
         try:

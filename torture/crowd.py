@@ -1,4 +1,4 @@
-"""A neighbour in the robot's ROS domain makes many topics, and publishers that come and go: what it costs the node in memory.
+"""A neighbor in the robot's ROS domain makes many topics, and publishers that come and go: what it costs the node in memory.
 
 The node records all topics into a bag and keeps them for events. What is measured is its resident memory above the level before.
 """
@@ -36,7 +36,7 @@ PROGRAM: Final = Path(__file__).parents[1] / 'test/e2e/crowd.py'
 
 
 class Crowd:
-    """The neighbour, told what to do line by line."""
+    """The neighbor, told what to do line by line."""
 
     def __init__(self, processes: Processes) -> None:
         self._popen = subprocess.Popen(

@@ -35,7 +35,7 @@ SECONDS: Final = 600.0
 SHORT_SECONDS: Final = 20.0
 HANG_S: Final = 30.0
 """A round takes a hundredth of a second."""
-MOST_TOLD: Final = 20
+MAX_TOLD: Final = 20
 Round = Callable[[int], Mapping[str, int]]
 
 
@@ -75,7 +75,7 @@ def fuzz(one: Round, seed: int, seconds: float) -> Field:
     """Rounds with rising seeds until the time is over."""
     result = Field()
     end = time.monotonic() + seconds
-    while time.monotonic() < end and len(result.wrong) < MOST_TOLD:
+    while time.monotonic() < end and len(result.wrong) < MAX_TOLD:
         try:
             with at_most(HANG_S):
                 result.found.update(one(seed + result.rounds))

@@ -1,7 +1,7 @@
 """Kills the node, the mission agent and the process that sends, each at random, with MLflow and the store up and down.
 
 The simulated Go2 walks all the time. Afterwards each mission must be one run with every point and frame that agent and node have
-journalled, each once; so must the store; and every object of the robot must name the mission of its time, and no other.
+journaled, each once; so must the store; and every object of the robot must name the mission of its time, and no other.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, read_json
+from shadowhound_data_logger.missions.pictures import NAMES
 from shadowhound_data_logger.stores.s3 import S3Store
 from torture._command import Bar, asked_kills, parser, progress, verdict, workshop
 from torture.kills import ROBOT, running
@@ -40,7 +40,7 @@ SHORT_KILLS: Final = 6
 COMMAND: Final = 'joined'
 NODE, AGENT, SENDER = 'node', 'agent', 'sender'
 UP_S: Final = (0.3, 8.0)
-"""A pose waits for two seconds before it is journalled."""
+"""A pose waits for two seconds before it is journaled."""
 AT_THE_START: Final = 0.2
 """Share of the kills that do not wait until the node listens."""
 AGENT_PERIOD_S: Final = 0.02
@@ -181,7 +181,7 @@ def judge(found: Found, server: Server, flight: Flight, objects: Mapping[str, Ob
     there = Counter((point.timestamp, point.step, point.value) for point in server.history(run_id, 'pose_x'))
     found.looked['poses'] += sum(there.values())
     if there != Counter(set(wanted)):
-        found.wrong['node'].append(f'{name}: {len(wanted)} journalled, {len(there)} in the run')
+        found.wrong['node'].append(f'{name}: {len(wanted)} journaled, {len(there)} in the run')
     judge_files(found, server, flight, run_id, objects)
 
 

@@ -78,7 +78,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     'camera.rate_hz': 5.0, 'camera.ship': 'on_request', 'lidar.ship': 'on_request', 'imu.ship': 'on_request',
     'bag.record': 'always', 'bag.topics': ['/odom', '/imu', '/point_cloud2'], 'bag.slice_s': 5.0, 'bag.compression': 'none',
     'bag.ship': 'on_request',
-    'keep.max_bytes': 64 << 20, 'keep.poll_s': 0.5, 'catalogue.period_s': 2.0,
+    'keep.max_bytes': 64 << 20, 'keep.poll_s': 0.5, 'catalog.period_s': 2.0,
     'upload.max_mbps': 8.0, 'upload.read_timeout_s': 3.0, 'upload.backoff_s': 2.0,
 }  # fmt: skip
 NO_ROOM: Final = {'spool.min_free_bytes': 1 << 60}
@@ -347,7 +347,7 @@ def judge(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any],
         'unbalanced', 'unanswered or contradictory', 'seen and neither stored nor accounted for', 'not what was spooled',
         'cut out of slices and not their messages',
         'too few requests served to prove anything', 'kinds of fault that never fell while requests were open',
-        'twice in the catalogue', 'protected and evicted', 'quarantined or renamed', 'to be recovered after a clean stop',
+        'twice in the catalog', 'protected and evicted', 'quarantined or renamed', 'to be recovered after a clean stop',
     )}  # fmt: skip
     wrong['unbalanced'] += campaign.unbalanced
     source = Bucket(tower.store_settings(), 'sensor-data')
@@ -356,13 +356,13 @@ def judge(campaign: Campaign, tower: Tower, kills: int) -> tuple[dict[str, Any],
     with closing(store), closing(sqlite3.connect(campaign.home / 'spool' / 'index.db')) as db:
         in_store = {info.key for info in store.list('sensor-data', f'{ROBOT}/')}
         lost = {row['key'] for row in _rows(source, in_store, KEPT.folder) if row['where'] == LOST}
-        catalogued = Counter(row['key'] for row in _rows(source, in_store, OBJECTS.folder))
+        cataloged = Counter(row['key'] for row in _rows(source, in_store, OBJECTS.folder))
         figures = _answers(campaign, source, store, in_store, lost, wrong)
         query = "SELECT DISTINCT key, sha256 FROM requested JOIN objects USING (id) WHERE state = 'delivered'"
         for key, sha256 in db.execute(query):
             if key not in in_store or hashlib.sha256(store.get('sensor-data', key)).hexdigest() != sha256:
                 wrong['not what was spooled'].append(key)
-        wrong['twice in the catalogue'] += [key for key, count in catalogued.items() if count > 1]
+        wrong['twice in the catalog'] += [key for key, count in cataloged.items() if count > 1]
         wrong['protected and evicted'] += [
             key for (key,) in db.execute("SELECT key FROM objects WHERE state = 'evicted' AND protected")
         ]
@@ -424,7 +424,7 @@ def _miscut(campaign: Campaign, store: S3Store, answer: dict[str, Any], slices: 
     there = Counter[tuple[str, int, bytes]]()
     for bag in answer['bags']:
         remote = find_bag(store, ROBOT, bag)
-        if not verify_remote(store, remote, deep=True).is_sound:
+        if not verify_remote(store, remote, deep=True).is_intact:
             return [f'{bag} is not sound']
         sources: list[Ranged] = [StoredFile(store, 'sensor-data', each.key, each.size) for each in remote.slices]
         there += Counter(message for each in sources for message in _messages(each, wanted))

@@ -39,7 +39,7 @@ BARE_OBJECTS: Final = 2_000
 SMALL: Final = ('odom', 'states')
 LARGE: Final = ('camera', 'lidar')
 FLAT_MB: Final = 16.0
-MOST_MB: Final = 200.0
+MAX_MB: Final = 200.0
 RATE: Final = 0.8
 LIVE_S: Final = 10.0
 """Within this an object that is made meanwhile is in the store, with few exceptions."""
@@ -155,7 +155,7 @@ def bars(drain: Drain, bare_rate: float, count: int) -> tuple[dict[str, Any], li
     return figures, [
         Bar('everything is delivered, once', objects['delivered'] == objects['spooled'] == len(drain.deliveries), str(objects)),
         Bar('the ledger balances', not ledger.imbalances(drain.ledger)),
-        Bar('memory is flat', max(rss) - rss[0] <= FLAT_MB and max(rss) <= MOST_MB, str(figures['rss_mb'])),
+        Bar('memory is flat', max(rss) - rss[0] <= FLAT_MB and max(rss) <= MAX_MB, str(figures['rss_mb'])),
         Bar('small state topics go first', max(place[name] for name in SMALL) < min(place[name] for name in LARGE)),
         Bar('the oldest do not starve', oldest_share >= 0.1, f'{oldest_share:.2f} of the large in the first half'),
         Bar('what is new does not starve', in_time >= 0.9, f'{in_time:.2f} within {LIVE_S:g} s: {figures["live_wait_s"]}'),

@@ -77,7 +77,7 @@ PERIODS: Final = 2
 READERS: Final = 4
 PARAMETERS: Final[dict[str, Any]] = {
     'sensors': [stream.topic.strip('/') for stream in STREAMS], 'bag.record': 'always', 'bag.slice_s': 3.0,
-    'catalogue.period_s': 5.0, 'upload.backoff_s': 2.0,
+    'catalog.period_s': 5.0, 'upload.backoff_s': 2.0,
     **{f'{stream.topic.strip("/")}.{name}': value for stream in STREAMS
        for name, value in (('topics', [stream.topic.strip('/')]), ('types', [STRING]), ('rate_hz', 0.0), ('batch_s', 1.0))},
 }  # fmt: skip

@@ -1,8 +1,8 @@
 """Simulated weeks of a robot that keeps what it records: shifts, a dock, two WiFi networks, a disk that others fill, requests.
 
-Time is virtual; spool, rules, thinning, requests, catalogue and the store, a folder, are the real ones. Each minute of a shift
+Time is virtual; spool, rules, thinning, requests, catalog and the store, a folder, are the real ones. Each minute of a shift
 the robot records an archive of pictures, each ten minutes a slice of a bag, now and then an event. At every hour the ledger is
-held to the gap journal, at the end of a day to the files, the catalogue and the store: nothing is thinned, evicted, sent or
+held to the gap journal, at the end of a day to the files, the catalog and the store: nothing is thinned, evicted, sent or
 deleted that no rule names, and of the last day at least a picture a second is left. At the end ``lake prune`` keeps half.
 """
 
@@ -30,7 +30,7 @@ from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND, iso
-from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings
 from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, KeptFilter, PullRequest, encode_inbox, inbox_key
 from shadowhound_data_logger.core.model import (
     EVENTS_WHEN,
@@ -53,7 +53,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.forgotten import forgotten
 from shadowhound_data_logger.node.encoding.halving import Halving
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.spool.files import Tree
@@ -269,7 +269,7 @@ class Weeks:
 
     def _tell(self) -> None:
         self.now_s = (self.clock.now_ns - MONDAY_NS) / SECOND
-        self.spool.commit(self.catalogue.due())
+        self.spool.commit(self.catalog.due())
 
     def _restart(self) -> None:
         self.spool.close()
@@ -281,9 +281,7 @@ class Weeks:
         self.spool = Spool(self.folder / 'spool', spool, self.clock, ROBOT, KEEP)
         self.spool.open()
         self.now_s = (self.clock.now_ns - MONDAY_NS) / SECOND
-        self.catalogue = CatalogueWriter(
-            self.folder / 'spool', CatalogueSettings(), ROBOT, self.clock, lambda: self.now_s, keeps=True
-        )
+        self.catalog = CatalogWriter(self.folder / 'spool', CatalogSettings(), ROBOT, self.clock, lambda: self.now_s, keeps=True)
         home = self.folder / 'home'
         thinner = Thinner(self.spool, KEEP.thin_to_hz, Halving(home, ROBOT, KEEP.thin_to_hz))
         self.server = RequestServer(
@@ -346,10 +344,10 @@ class Weeks:
             self.faults.append(f'{now}: the gap journal says {said}, the ledger {tally}')
 
     def _until_told(self) -> bool:
-        """Whether the catalogue has all by now."""
+        """Whether the catalog has all by now."""
         for _ in range(40):
             self.now_s += 60.0
-            self.spool.commit(self.catalogue.due())
+            self.spool.commit(self.catalog.due())
             self._send()
             if not self._query('SELECT 1 FROM unreported LIMIT 1') and not self._query(
                 "SELECT 1 FROM objects WHERE state = 'pending' LIMIT 1"
@@ -367,11 +365,11 @@ class Weeks:
         own = {row['key']: (row['bytes'], json.loads(row['metadata']).get(words.COUNT)) for row in self._rows("state = 'kept'")}
         for key in kept.keys() ^ own.keys():
             self.faults.append(
-                f'{now}: {key} is {"kept, and the catalogue does not say so" if key in own else "in the catalogue alone"}'
+                f'{now}: {key} is {"kept, and the catalog does not say so" if key in own else "in the catalog alone"}'
             )
         for key in kept.keys() & own.keys():
             if kept[key][0] != own[key][0] or (own[key][1] is not None and kept[key][1] != int(own[key][1])):
-                self.faults.append(f'{now}: {key} has {own[key]}, the catalogue says {kept[key]}')
+                self.faults.append(f'{now}: {key} has {own[key]}, the catalog says {kept[key]}')
         for topic, sink in (('/camera', 'objects'), ('/front', 'bags')):
             told = gaps.newest(self.source, robot=ROBOT, topic=topic, sink=sink, findings=findings).to_pylist()
             said = sum(row['count'] or 0 for row in told if row['kind'] == 'evicted')

@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.description import Description, of_files, of_m
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
-from shadowhound_data_logger.core.untrusted import MOST_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
 from shadowhound_data_logger.core.zstd import ZstdError, ZstdFile
 from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.format import CDR, ROS2
@@ -467,7 +467,7 @@ def _too_large(database: sqlite3.Connection) -> str:
         columns = database.execute(f'PRAGMA table_info({table})').fetchall()
         names = [str(name) for _, name, *_ in columns if str(name).isidentifier()]
         longest = [database.execute(f'SELECT max(length("{name}")) FROM {table}').fetchone()[0] for name in names]  # noqa: S608 - checked
-        if max(filter(None, longest), default=0) > MOST_CHUNK_BYTES:
+        if max(filter(None, longest), default=0) > MAX_CHUNK_BYTES:
             return f'a row of {table} has {max(filter(None, longest)):,} bytes'
     return ''
 

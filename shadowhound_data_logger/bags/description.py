@@ -19,9 +19,9 @@ from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.untrusted import check_size, from_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo, counted
 
-MOST_QOS_BYTES: Final = 64 << 10
+MAX_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
-MOST_BOOT_ID: Final = 100
+MAX_BOOT_ID: Final = 100
 """Letters."""
 _INFINITE_S: Final = 9_000_000_000
 _LATEST_NS: Final = 1 << 64
@@ -185,7 +185,7 @@ def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
     """Offered QoS profiles: rosbag2 keeps them as a list, before its version 9 as the YAML of one."""
     if isinstance(qos, str):
         try:
-            check_size(len(qos), MOST_QOS_BYTES)
+            check_size(len(qos), MAX_QOS_BYTES)
             qos = from_yaml(qos) if qos else []
         except ValueError:
             return ()
@@ -214,7 +214,7 @@ def _described(found: Mapping[str, Any], there: Container[str]) -> Description:
         storage=_text(found.get('storage_identifier') or ''), distro=_text(found.get('ros_distro') or ''),
         compression='' if compression.lower() == 'none' else compression.lower(),
         topics=tuple(_topics(found.get('topics_with_message_count') or ())),
-        messages=messages, t_start_ns=start, t_end_ns=end, clock=clock_said(found.get('custom_data')),
+        messages=messages, t_start_ns=start, t_end_ns=end, clock=clock_state(found.get('custom_data')),
         parts=tuple(_part(path if path in there else PurePosixPath(path).name, told.get(path, {})) for path in paths),
     )  # fmt: skip
 
@@ -227,12 +227,12 @@ def _times(told: Mapping[str, Any], messages: int | None) -> tuple[int | None, i
     return start, start + length
 
 
-def clock_said(custom: object) -> dict[str, str]:
+def clock_state(custom: object) -> dict[str, str]:
     """As ``Description.clock``, from a bag's custom data or a slice's metadata; what is not as we write it says nothing."""
     if not isinstance(custom, Mapping):
         return {}
     known, boot_id, offset_ns = (custom.get(word) for word in (words.CLOCK, words.BOOT_ID, words.CLOCK_OFFSET_NS))
-    if known not in {words.SET_LATER, words.UNSET} or not isinstance(boot_id, str) or len(boot_id) > MOST_BOOT_ID:
+    if known not in {words.SET_LATER, words.UNSET} or not isinstance(boot_id, str) or len(boot_id) > MAX_BOOT_ID:
         return {}
     found = {words.CLOCK: str(known), words.BOOT_ID: boot_id}
     if known == words.UNSET:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from shadowhound_data_logger.bags.contents import described, open_folder
-from shadowhound_data_logger.bags.description import Description, clock_said, of_metadata
+from shadowhound_data_logger.bags.description import Description, clock_state, of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, natural
@@ -76,7 +76,7 @@ def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
     if description is None:
         raise BagError(f'{name} has neither {METADATA} nor a finished MCAP slice', remedy='is it a bag, or only starting?')
     if claimed is None:
-        description = replace(description, clock=clock_said(tags))
+        description = replace(description, clock=clock_state(tags))
     return _info(robot, name, where, manifest, description, meter, tags)
 
 

@@ -132,7 +132,7 @@ class BagRecovery:
         try:
             if folder not in self._states:
                 self._states[folder] = self._read(folder)
-            is_whole = self._make_whole(self._states[folder])
+            is_whole = self._complete(self._states[folder])
         finally:
             if not is_whole:
                 self._folders.append(folder)
@@ -191,7 +191,7 @@ class BagRecovery:
 
     # -- one bag ---------------------------------------------------------------------------------------------------
 
-    def _make_whole(self, state: BagState) -> bool:
+    def _complete(self, state: BagState) -> bool:
         """False for one that waits for its date."""
         self._keep(state)
         for path in self._slices(state, OPEN):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from shadowhound_data_logger.bags.description import clock_said
+from shadowhound_data_logger.bags.description import clock_state
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural, prefix_of
 from shadowhound_data_logger.core import metadata_words as words
@@ -106,7 +106,7 @@ def document(store: ObjectStore, file: RemoteFile) -> bytes:
 def clock_of(store: ObjectStore, bag: RemoteBag) -> dict[str, str]:
     """As ``Description.clock``, from the metadata of the first slice, where there is no metadata.yaml. Raises StoreError."""
     held = store.head(BUCKET, bag.slices[0].key) if bag.slices else None
-    return clock_said(held.metadata) if held is not None else {}
+    return clock_state(held.metadata) if held is not None else {}
 
 
 def missing_of(bag: RemoteBag, manifest: Manifest) -> list[str]:

@@ -17,7 +17,7 @@ from typing import Any, Final
 from shadowhound_data_logger.bags.contents import check_schema
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.errors import BagDamaged
-from shadowhound_data_logger.core.untrusted import MOST_CHUNK_BYTES
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES
 
 TABLES: Final = ('schema', 'metadata', 'topics', 'message_definitions', 'messages')
 _TYPES: Final = frozenset({'INTEGER', 'TEXT', 'BLOB'})
@@ -92,7 +92,7 @@ class _Rows:
 
     def __init__(self, database: sqlite3.Connection, table: str, columns: list[str]) -> None:
         names = ', '.join(f'"{name}"' for name in columns)
-        small = ' AND '.join(f'ifnull(length("{name}"), 0) <= {MOST_CHUNK_BYTES}' for name in columns)
+        small = ' AND '.join(f'ifnull(length("{name}"), 0) <= {MAX_CHUNK_BYTES}' for name in columns)
         if table == 'messages':
             small += " AND typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
         self._query = f'SELECT rowid, {names} FROM {table} WHERE rowid > ? AND {small} ORDER BY rowid'  # noqa: S608 - checked by the caller

@@ -49,7 +49,7 @@ RECORD: Final = 'shadowhound_recording'
 """Name of the metadata record."""
 RECORD_SHARE: Final = 100
 """Such a record takes a hundredth of the slice before at most ..."""
-LEAST_ROWS_BYTES: Final = 4096
+MIN_ROWS_BYTES: Final = 4096
 """... but for this much of rows: some twenty slices."""
 ENDED: Final = '.ended'
 """Ends the name of a slice without messages that a bag which ended keeps until it is whole in the spool, for its record."""
@@ -160,7 +160,7 @@ class BagState:
         """What the slice ``number`` says of the bag at its beginning (RECORD)."""
         rows = self.rows(list(self.slices.values()), len(self.missing))
         last = rows.slices[-1].bytes if rows.slices else 0
-        room = max(LEAST_ROWS_BYTES, last // RECORD_SHARE - len(rows.said) - len(rows.channels))
+        room = max(MIN_ROWS_BYTES, last // RECORD_SHARE - len(rows.said) - len(rows.channels))
         missing = _newest(rows.missing, room // 4)
         slices = _newest(rows.slices, room - len(json.dumps(missing)))
         left_out = len(rows.slices) + len(rows.missing) - len(slices) - len(missing)

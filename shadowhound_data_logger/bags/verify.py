@@ -61,7 +61,7 @@ class VerifiedBag:
         return tuple(check for check in self.checks if check.finding)
 
     @property
-    def is_sound(self) -> bool:
+    def is_intact(self) -> bool:
         return not self.findings
 
 

@@ -64,10 +64,10 @@ from shadowhound_data_logger.stores.memory import MemoryStore
 
 STORE_THREADS: Final = 8
 LOCAL_REMEDY: Final = 'shadowhound-data bag verify DIR --deep shows what is damaged'
-LEAST_RATED_S: Final = 0.01
+MIN_RATED_S: Final = 0.01
 """A bag that is shorter has no rates."""
 REPAIR: Final = 'In a folder, `shadowhound-data bag repair` recovers what a damaged file still holds.'
-MOST_LOSSES: Final = 20
+MAX_LOSSES: Final = 20
 """Of a repaired file that are printed."""
 LOOK_S: Final = 5.0
 """Between two looks for bags that are finished."""
@@ -219,11 +219,11 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
         checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
         facts = {'bag': found.bag, 'state': found.state, 'checks': checks, 'read_bytes': found.read_bytes,
                  'missing': list(map(asdict, found.missing)), 'remarks': list(found.remarks)}  # fmt: skip
-        said = {**facts, 'is_sound': found.is_sound, 'is_complete': found.state not in {GROWING, FOREIGN}}
+        said = {**facts, 'is_intact': found.is_intact, 'is_complete': found.state not in {GROWING, FOREIGN}}
         print_json(said)
     else:
         print_page(*_verdict(found))
-    return exit_code(finding=not (found.is_sound and found.state != GROWING))
+    return exit_code(finding=not (found.is_intact and found.state != GROWING))
 
 
 @bag.command('repair', epilog=examples('bag repair my_bag', 'bag repair my_bag/my_bag_3.mcap -o whole.mcap'))
@@ -525,7 +525,7 @@ def _remarks(remarks: Sequence[str]) -> Iterator[Text]:
 
 def _rate(messages: int | None, seconds: float | None) -> str:
     """Nothing where a bag is too short for one: times may be a counter instead of a clock."""
-    if messages is None or seconds is None or messages < 2 or seconds < LEAST_RATED_S:
+    if messages is None or seconds is None or messages < 2 or seconds < MIN_RATED_S:
         return '-'
     return f'{(messages - 1) / seconds:,.1f} Hz'
 
@@ -645,13 +645,13 @@ def _told_file(file: FileRepair, *, keep_damaged: bool) -> Iterator[RenderableTy
         return
     lost = 'an unknown number is lost' if file.lost_messages is None else f'{number(file.lost_messages)} lost'
     yield plain(f'{file.name}: {counted(file.messages or 0, "message")}, {lost}', 'yellow')
-    for loss in file.losses[:MOST_LOSSES]:
+    for loss in file.losses[:MAX_LOSSES]:
         count = '' if loss.messages is None else f', {counted(loss.messages, "message")}'
         span = '' if loss.from_ns is None else f', after {shown_time(loss.from_ns)}'
         span += '' if loss.to_ns is None else f', until {shown_time(loss.to_ns)}'
         yield plain(f'  lost at {number(loss.at)}: {volume(loss.bytes)}, {loss.what}{count}{span}')
-    if len(file.losses) > MOST_LOSSES:
-        yield f'  and {number(len(file.losses) - MOST_LOSSES)} more places: --json lists them'
+    if len(file.losses) > MAX_LOSSES:
+        yield f'  and {number(len(file.losses) - MAX_LOSSES)} more places: --json lists them'
     if file.rebuilt:
         yield plain(f'  rebuilt: {", ".join(file.rebuilt)}')
     if file.is_cut:

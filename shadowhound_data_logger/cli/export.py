@@ -25,7 +25,7 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress, volume
-from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, report_skipped
 from shadowhound_data_logger.core.errors import TrackingError
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.stores import open_reader
@@ -127,7 +127,7 @@ def _missions(command: _Command) -> _Command:
 def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, pull: bool,  # noqa: PLR0913
                    dry_run: bool, workers: int | None, runner: str, address: str | None, as_json: bool,
                    **how: Any) -> ExitCode:  # fmt: skip
-    """Add missions to the LeRobot data set NAME (v3.0).
+    """Add missions to the LeRobot dataset NAME (v3.0).
 
     Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
     """
@@ -138,7 +138,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
         from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
         from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
 
-        check_name(name, 'the name of the data set')
+        check_name(name, 'the name of the dataset')
         options = _options(how)
         cluster = _cluster(address) if runner == 'ray' else None
         if address and cluster is None:
@@ -176,7 +176,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
         print_lines(*_report(result, str(place or folder), is_dry=dry_run))
         if moved is not None:
             print_lines(plain(f'{number(moved.files)} files ({volume(moved.bytes)}) uploaded to {place}.'))
-    tell_left_out(left_out)
+    report_skipped(left_out)
     return exit_code(finding=result.refused or result.waiting or len(left_out))
 
 
@@ -224,7 +224,7 @@ def _pairs(name: str, given: tuple[str, ...], kind: Callable[[str], Any]) -> dic
 
 
 def _copy_of(url: str) -> Path:
-    """The folder on this machine of a data set in a store."""
+    """The folder on this machine of a dataset in a store."""
     return the_home() / COPIES / url.removeprefix(SCHEME).rstrip('/')
 
 
@@ -272,7 +272,7 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
 @click.option('--read', 'is_read', is_flag=True, help='Read every source again, instead of asking for its checksum.')
 @as_json
 def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> ExitCode:
-    """Prove that a data set is as it was written.
+    """Prove that a dataset is as it was written.
 
     It checks that the files are whole, the sources unchanged, and the pictures those of their sources.
 
@@ -325,7 +325,7 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
 @_arm
 @_times
 @click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, help='Samples a second.')
-@click.option('--joints', default='', metavar='NAMES', help="Of qpos, in their order  [default: ALOHA's fourteen]")
+@click.option('--joints', default='', metavar='NAMES', help='Of qpos, in their order  [default: joint_0, joint_1, ...]')
 @as_json
 def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
                        as_json: bool) -> ExitCode:  # fmt: skip
@@ -350,7 +350,7 @@ def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool)
         print_json(asdict(found))
         return exit_code(finding=found.refused)
     lines = [plain(f'  {episode} is refused: {why}', 'red') for episode, why in list(found.refused.items())[:SHOWN]]
-    lines += [plain(f'  imported before, and not in this data set: {episode}', 'yellow') for episode in found.absent[:SHOWN]]
+    lines += [plain(f'  imported before, and not in this dataset: {episode}', 'yellow') for episode in found.absent[:SHOWN]]
     rest = f', {number(len(found.refused))} refused' if found.refused else ''
     rest += f', {number(len(found.absent))} imported before are not in it' if found.absent else ''
     lines.append(plain(f'{counted(found.episodes, "new episode")} of {arm} with {number(found.samples)} samples, '
@@ -374,7 +374,7 @@ def _proof(found: Proved, place: str) -> Iterator[Text]:
               help='Search only here  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
-    """Find the data sets and models that saw an object.
+    """Find the datasets and models that saw an object.
 
     Models are found by the MLflow runs that lake.log_dataset marked. Exit code 1 when MLflow cannot be asked.
     """
@@ -400,7 +400,7 @@ def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCod
     for each in told:
         lines.append(plain(f'{each["where"]}: {number(each["frames"])} frames of {", ".join(each["missions"])}'))
         lines += [plain(f'  trained on it: run {run}') for run in each['runs'] or ()]
-    print_lines(*lines, *([] if told else [plain(f'No data set has values of {key}.')]))
+    print_lines(*lines, *([] if told else [plain(f'No dataset has values of {key}.')]))
     return exit_code(finding=unknown)
 
 
@@ -459,10 +459,10 @@ def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
 @export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
 @click.argument('mission')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Only from this data set  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
+              help='Only from this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
-    """Take the episode of a mission out of data sets.
+    """Take the episode of a mission out of datasets.
 
     It is not exported to them again.
 
@@ -503,5 +503,5 @@ def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> Exit
         print_json(dropped)
     else:
         told = [plain(f'{where}: dropped; its digest is {digest[:16]} now.') for where, digest in dropped.items()]
-        print_lines(*told or [plain(f'No data set has an episode of {mission}.', 'yellow')])
+        print_lines(*told or [plain(f'No dataset has an episode of {mission}.', 'yellow')])
     return exit_code(finding=not dropped)

@@ -23,7 +23,7 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, progress, volume
-from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.stores import open_reader
 
@@ -74,7 +74,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         begun_s = time.monotonic()
         left_out = quietly()
         rows = [] if prefix is not None else _asked(flags, limit, left_out)
-        wishes = list(dict.fromkeys(lake.Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
+        wishes = list(dict.fromkeys(lake.FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
             wishes = lake.under(Bucket(store, bucket), prefix)
     size = sum(wish.size for wish in wishes)
@@ -98,7 +98,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
     else:
         where = f'{"" if prefix is None else f"under {prefix} "}in {Bucket(store, bucket).describe()}'
         print_lines(*_report(found, len(wishes), took_s, to, where))
-        tell_left_out(left_out)
+        report_skipped(left_out)
     return exit_code(finding=found.failed or len(left_out))
 
 
@@ -119,7 +119,7 @@ def _fetch_dataset(url: str, to: Path, *, is_json: bool) -> ExitCode:
 
 
 def _asked(flags: Mapping[str, Any], limit: int | None, left_out: Any) -> list[dict[str, Any]]:
-    """The rows of the catalogue."""
+    """The rows of the catalog."""
     from shadowhound_data_logger.lake import query as lake  # noqa: PLC0415 - the extra lake
     from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
 

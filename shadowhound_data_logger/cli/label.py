@@ -31,7 +31,7 @@ from shadowhound_data_logger.cli.output import (
     print_page,
     shown_time,
 )
-from shadowhound_data_logger.cli.question import asking, quietly, ranges_option, tell_left_out
+from shadowhound_data_logger.cli.question import asking, quietly, ranges_option, report_skipped
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, visible
@@ -105,7 +105,7 @@ def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool)
     """Import labels from a CSV, or boxes from a COCO file.
 
     A CSV names its columns: label, since and until, or key; and any of robot bucket x y width height note. The file names of a
-    COCO file are keys, as `fetch` lays pictures out. Exit code 1 when the catalogue lacks one of them: the others are imported.
+    COCO file are keys, as `fetch` lays pictures out. Exit code 1 when the catalog lacks one of them: the others are imported.
     """
     body = file.read(MOST_DOCUMENT_BYTES + 1)
     now_ns = SystemClock.of_this_machine().wall_ns()
@@ -134,7 +134,7 @@ def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCod
             _check(source, labels.read(source, None, findings=quietly()), robots={robot}, labels={name})
     if as_json:
         print_json([asdict(each) for each in found])
-        return tell_left_out(left_out)
+        return report_skipped(left_out)
     table = plain_table('', _COLUMNS, _COLUMNS)
     table.title = None
     for each in found[:SHOWN]:
@@ -146,7 +146,7 @@ def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCod
     print_page(*([table] if found else [plain(f'There are no labels in {source.describe()}.{store_hint()}')]))
     if len(found) > SHOWN:
         click.echo(f'{number(len(found))} labels; the first {SHOWN} are shown (--json has all)')
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', 'by', 'note')
@@ -183,7 +183,7 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
         print_lines(
             f'{counted(len(found), "label")} removed.', *(f'{visible(each)} is not the id of a label.' for each in unknown)
         )
-    return exit_code(finding=unknown or tell_left_out(left_out))
+    return exit_code(finding=unknown or report_skipped(left_out))
 
 
 def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
@@ -201,8 +201,8 @@ def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
         print_json({'added': len(checked), 'ids': [each.id for each in checked], 'absent': absent, 'layers': keys})
     else:
         print_lines(f'{counted(len(checked), "label")} added, in {counted(len(keys), "layer")}.',
-                    *(f'{visible(key)} is not in the catalogue.' for key in absent[:SHOWN]))  # fmt: skip
-    return exit_code(finding=absent or tell_left_out(left_out))
+                    *(f'{visible(key)} is not in the catalog.' for key in absent[:SHOWN]))  # fmt: skip
+    return exit_code(finding=absent or report_skipped(left_out))
 
 
 def _check(source: Bucket, there: Sequence[Label], *, robots: Iterable[str | None], labels: Iterable[str | None] = (),

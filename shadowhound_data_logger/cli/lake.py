@@ -1,4 +1,4 @@
-"""``shadowhound-data lake``: the catalogue itself: its state in the store, compacted, restored, compared with the store."""
+"""``shadowhound-data lake``: the catalog itself: its state in the store, compacted, restored, compared with the store."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.export import all_datasets
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
-from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.shipping.audit import KINDS, Audit, audit
@@ -46,15 +46,15 @@ THREADS: Final = 16
 """Objects at a time."""
 UNLISTED: Final = 'unlisted'
 DAY_NS: Final = 24 * 3600 * SECOND
-MOST_COVERED_NS: Final = 400 * DAY_NS
-WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalogue; `lake reindex` adds those that are there"}
+MAX_COVERED_NS: Final = 400 * DAY_NS
+WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalog; `lake reindex` adds those that are there"}
 COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'superseded')
 _robot = click.option('--robot', metavar='NAME', help='Only of this robot.')
 
 
 @click.group(epilog=examples('lake status', 'lake compact'))
 def lake() -> None:
-    """Look after the catalogue of what is stored.
+    """Look after the catalog of what is stored.
 
     It is in the store itself: BUCKET/ROBOT/_catalog/.
     """
@@ -64,7 +64,7 @@ def lake() -> None:
 @_robot
 @as_json
 def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
-    """Show the size of the catalogue, by robot."""
+    """Show the size of the catalog, by robot."""
     with asking():
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.live_files import state  # noqa: PLC0415
@@ -74,15 +74,15 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
     found = state(source, robot, left_out)
     if as_json:
         print_json([asdict(row) for row in found])
-        return tell_left_out(left_out)
+        return report_skipped(left_out)
     table = plain_table('', COLUMNS, ('robot', 'first', 'last'))
     table.title = None
     for row in found:
         counts = (row.files, row.size, row.compacted, row.open_days, row.covered)
         table.add_row(plain(row.robot), number(row.days), row.first, row.last, number(counts[0]), volume(counts[1]),
                       *map(number, counts[2:]))  # fmt: skip
-    print_page(table if found else plain(f'There is no catalogue yet in {source.describe()}.{store_hint()}'))
-    return tell_left_out(left_out)
+    print_page(table if found else plain(f'There is no catalog yet in {source.describe()}.{store_hint()}'))
+    return report_skipped(left_out)
 
 
 @lake.command(
@@ -100,7 +100,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
 
     Files that an earlier run merged are deleted.
 
-    Exit code 1 when a file is not part of a catalogue, or has rows that are not its robot's: it is named and stays as it is.
+    Exit code 1 when a file is not part of a catalog, or has rows that are not its robot's: it is named and stays as it is.
     """
     found = []
     with asking():
@@ -116,7 +116,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
             bar.say(f'{day.robot} {day.date}')
     if as_json:
         print_json([asdict(day) for day in found])
-        return tell_left_out(left_out)
+        return report_skipped(left_out)
     merged, deleted, kept = (sum(getattr(day, name) for day in found) for name in ('merged', 'deleted', 'kept'))
     days = sum(day.merged > 0 for day in found)
     click.echo(f'{number(merged)} files are {number(days)} now, one a day.' if merged else 'There is nothing to merge.')
@@ -126,7 +126,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
         click.echo(f'{number(kept)} superseded files are still there: a later run deletes them.')
     if any(day.denied for day in found):
         click.echo('These credentials may not delete: the files only take up space.')
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 @lake.command(
@@ -141,7 +141,7 @@ def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: fl
               help='Where more is left, such as 2TB, also delete the oldest days of these sensors.')  # fmt: skip
 @_robot
 @click.option('--dry-run', is_flag=True, help='Only say what would be deleted.')
-@click.option('--force', is_flag=True, help='Also delete what data sets, labels and open requests refer to.')
+@click.option('--force', is_flag=True, help='Also delete what datasets, labels and open requests refer to.')
 @click.option('--yes', is_flag=True, help='Do not ask.')
 @as_json
 def lake_prune(
@@ -150,7 +150,7 @@ def lake_prune(
     """Delete old objects from the store.
 
     By sensor and age; `bags`, `events` and `missions` are sensors here, too, and go as a whole. What no rule names stays, and so
-    does what a data set, a label or an open request (`pull`) refers to. The catalogue keeps the rows, as forgotten.
+    does what a dataset, a label or an open request (`pull`) refers to. The catalog keeps the rows, as forgotten.
 
     It asks before it deletes all of a sensor or, with --force, what something refers to; without a terminal it then does nothing.
     Exit code 1 when it did nothing for that reason, or when more is left than --max-bytes.
@@ -176,7 +176,7 @@ def lake_prune(
     if dry_run or not (made.going or made.unfinished):
         if as_json:
             print_json(_prune_told(made))
-        return exit_code(finding=made.over_bytes or tell_left_out(left_out))
+        return exit_code(finding=made.over_bytes or report_skipped(left_out))
     if (reasons := list(_reasons(made))) and not yes:
         for reason in reasons:
             click.echo(reason, err=True)
@@ -192,11 +192,11 @@ def lake_prune(
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) are deleted.')
         if done.mended:
             click.echo(f'So are {number(done.mended)} that an earlier run did not come to.')
-    return exit_code(finding=made.over_bytes or tell_left_out(left_out))
+    return exit_code(finding=made.over_bytes or report_skipped(left_out))
 
 
 def _exported(say: Callable[[str], None] = lambda _: None) -> dict[tuple[str, str], str]:
-    """(bucket, key) -> a data set that has values of it."""
+    """(bucket, key) -> a dataset that has values of it."""
     from shadowhound_data_logger.datasets import verify  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
 
@@ -258,7 +258,7 @@ def _reasons(made: PrunePlan) -> Iterator[str]:
 @click.option('--statistics', is_flag=True, help='Instead, open objects without statistics of their fields, and add those.')
 @as_json
 def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
-    """Add objects that the catalogue lacks.
+    """Add objects that the catalog lacks.
 
     It lists the store, and reads the metadata of each object that has no row.
     """
@@ -277,33 +277,31 @@ def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
     elif statistics:
         click.echo(f'{number(found.listed)} objects had no statistics; of {number(found.added)} they are there now.')
     else:
-        click.echo(
-            f'{number(found.listed)} objects are in the store; {number(found.added)} were not in the catalogue and are now.'
-        )
+        click.echo(f'{number(found.listed)} objects are in the store; {number(found.added)} were not in the catalog and are now.')
         if found.gone:
             click.echo(f'{number(found.gone)} rows name objects that are gone from the store.')
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 @lake.command('verify', epilog=examples('lake verify --since 7d', 'lake verify --robot thor --deep'))
 @question
-@click.option('--catalogue', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
-              help='Catalogue of another store, downloaded by `fetch ROBOT/_catalog/ --to DIR`.')  # fmt: skip
+@click.option('--catalog', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
+              help='Catalog of another store, downloaded by `fetch ROBOT/_catalog/ --to DIR`.')  # fmt: skip
 @click.option('--deep', is_flag=True, help='Read every object back.')
 @click.option('--again', is_flag=True, help='Verify from the beginning, even if a run was interrupted.')
 @as_json
-def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool, again: bool, as_json: bool) -> ExitCode:
-    """Check that the store has what the catalogue says.
+def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, again: bool, as_json: bool) -> ExitCode:
+    """Check that the store has what the catalog says.
 
     It asks for every object, its size and its checksum.
 
-    All objects, or those that the flags select. If data was moved to another store, name the catalogue of the old one as well:
+    All objects, or those that the flags select. If data was moved to another store, name the catalog of the old one as well:
     only it shows what the new one lost along with its rows. Started again with the same flags within a week, an interrupted run
-    resumes where it stopped. Exit code 1 when something is not as the catalogue says, or when no
+    resumes where it stopped. Exit code 1 when something is not as the catalog says, or when no
     object was selected.
     """
-    if catalogue and 'success' in flags:
-        raise BadUsage('a catalogue does not say which missions failed', 'leave out --failed and --succeeded, or --catalogue')
+    if catalog and 'success' in flags:
+        raise BadUsage('a catalog does not say which missions failed', 'leave out --failed and --succeeded, or --catalog')
     with asking():
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake import verify as library  # noqa: PLC0415
@@ -314,15 +312,15 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         begun_s = time.monotonic()
         left_out = quietly()
         own = library.rows(default_source(store), left_out, **flags)
-        theirs = library.rows(selecting.fetched(catalogue), left_out, **flags) if catalogue else own
-        if not len(theirs) and catalogue:
-            raise BadUsage(f'there are no rows in {catalogue}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalogue}')
-        if not len(own) and not catalogue:
+        theirs = library.rows(selecting.fetched(catalog), left_out, **flags) if catalog else own
+        if not len(theirs) and catalog:
+            raise BadUsage(f'there are no rows in {catalog}', f'shadowhound-data fetch ROBOT/_catalog/ --to {catalog}')
+        if not len(own) and not catalog:
             check_names(default_source(store), left_out, **flags)
-        rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalogue else (own, [])
+        rows, lacking = (theirs.joined(own), theirs.lacking(own)) if catalog else (own, [])
     with closing(open_reader(store)) as target:
         where = target.describe()
-        asked = json.dumps([where, deep, catalogue and str(catalogue.resolve()), flags], sort_keys=True)
+        asked = json.dumps([where, deep, catalog and str(catalog.resolve()), flags], sort_keys=True)
         with library.Unfinished(rows, the_home() / 'verify', asked, again=again) as left:
             earlier = left.earlier()
             with progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
@@ -330,7 +328,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
                 found = audit(left, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
             if found.away is None:
                 left.finish()
-    said = {'store': where, 'catalogue': catalogue and str(catalogue), **_said(rows, found, lacking, earlier, deep=deep)}
+    said = {'store': where, 'catalog': catalog and str(catalog), **_said(rows, found, lacking, earlier, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)
     said['left_out'] = [asdict(one) for one in left_out]
     said['ok'] = said['ok'] and not said['left_out']
@@ -338,7 +336,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalogue: Path | None, deep: bool,
         print_json(said)
     else:
         print_page(*_page(said))
-        tell_left_out(left_out)
+        report_skipped(left_out)
     return exit_code(finding=not said['ok'])
 
 
@@ -375,10 +373,10 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
 
         now_ns = SystemClock.of_this_machine().wall_ns()
         since_ns, until_ns = moment('--since', since, now_ns), moment('--until', until, now_ns)
-        if not 0 < until_ns - since_ns <= MOST_COVERED_NS:
+        if not 0 < until_ns - since_ns <= MAX_COVERED_NS:
             raise BadUsage(
                 f'--since {since} --until {until} is not a span of time',
-                f'--since before --until, up to {MOST_COVERED_NS // DAY_NS} days',
+                f'--since before --until, up to {MAX_COVERED_NS // DAY_NS} days',
             )
         left_out = quietly()
         if wifi is not None:
@@ -394,7 +392,7 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
         print_json([_told(each) for each in found])
     else:
         print_page(*_covered(found))
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_out: Any, *, as_json: bool) -> ExitCode:
@@ -408,7 +406,7 @@ def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_ou
     click.echo(f'Wrote {target}', err=True)
     if as_json:
         print_json([one._asdict() for one in found])
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 def _told(each: Coverage) -> dict[str, Any]:
@@ -473,7 +471,7 @@ def _said(rows: Rows, found: Audit, lacking: list[Any], earlier: int, *, deep: b
 
 
 def _page(said: Mapping[str, Any]) -> list[Any]:
-    by = f'its own catalogue and the one in {said["catalogue"]}' if said['catalogue'] else 'its own catalogue'
+    by = f'its own catalog and the one in {said["catalog"]}' if said['catalog'] else 'its own catalog'
     asked = f'{said["store"]} was asked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
     asked += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
     lines: list[Any] = [plain(f'{asked}, in {duration(said["took_s"])}.')]
@@ -491,10 +489,10 @@ def _verdict(said: Mapping[str, Any]) -> Text:
         )
         return Text.assemble(('The store cannot be reached', 'yellow'), left)
     if not said['known']:
-        return Text.assemble(('Nothing is verified', 'yellow'), f': the catalogue has no such objects.{store_hint()}')
+        return Text.assemble(('Nothing is verified', 'yellow'), f': the catalog has no such objects.{store_hint()}')
     if said['ok']:
         return Text.assemble(('All of them are there', 'green'), f', {how}.')
     if not said['findings']:
         return Text.assemble(('All objects that it names are there', 'yellow'), f', {how}; but it is not whole.')
     wrong = len({(one['bucket'], one['key']) for piled in said['findings'].values() for one in piled['first']})
-    return Text.assemble((f'{number(wrong)} are not as the catalogue says', 'red'), f', {how}.')
+    return Text.assemble((f'{number(wrong)} are not as the catalog says', 'red'), f', {how}.')

@@ -11,14 +11,14 @@ import click
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_page, progress
-from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
     from shadowhound_data_logger.lake.likeness import Embedded
 
 REASONS: Final = {
-    'missing': 'not in the store any more', 'too_large': 'too large', 'changed': 'another content than the catalogue says',
+    'missing': 'not in the store any more', 'too_large': 'too large', 'changed': 'another content than the catalog says',
     'unreadable': 'no JPEG, PNG or TIFF that can be decoded, or the model makes no vector of it',
 }  # fmt: skip
 model_option = click.option(
@@ -36,7 +36,7 @@ model_option = click.option(
 def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -> ExitCode:
     """Make vectors of pictures, by which `query --like` finds them.
 
-    Of all pictures that the flags choose and that have none of this model yet. They are kept beside the catalogue, in
+    Of all pictures that the flags choose and that have none of this model yet. They are kept beside the catalog, in
     sensor-data/_vectors/: run it again whenever there are new pictures, or after it was interrupted.
 
     Without --model it is the perceptual hash dHash, which finds pictures that are nearly the same. A model is a folder with
@@ -63,7 +63,7 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
                     'refused': dict(found.refused), 'took_s': round(took_s, 3)})  # fmt: skip
     else:
         print_page(*_told(found, chosen.name, took_s))
-    told = tell_left_out(left_out)
+    told = report_skipped(left_out)
     return told or exit_code(finding=bool(found.refused))
 
 
@@ -74,9 +74,9 @@ def _told(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
         yield plain(f'{counted(count, "picture")} without one: {REASONS[reason]}.', 'yellow')
 
 
-def likest(source: Any, like: Path | None, text: str | None, folder: Path | None, limit: int, left_out: Findings,
+def most_similar(source: Any, like: Path | None, text: str | None, folder: Path | None, limit: int, left_out: Findings,
            flags: Mapping[str, Any]) -> Any:  # fmt: skip
-    """The rows of the likest pictures, with how like they are; what has no vector is said on standard error."""
+    """The rows of the most similar pictures, with how like they are; what has no vector is said on standard error."""
     from shadowhound_data_logger.core.untrusted import open_image  # noqa: PLC0415
     from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - the extra lake
     from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415

@@ -27,7 +27,7 @@ from shadowhound_data_logger.cli.likeness import lake_embed
 from shadowhound_data_logger.cli.live import live
 from shadowhound_data_logger.cli.missions import missions
 from shadowhound_data_logger.cli.node import node
-from shadowhound_data_logger.cli.output import print_error, tell_error
+from shadowhound_data_logger.cli.output import print_error, report_error
 from shadowhound_data_logger.cli.policy import policy
 from shadowhound_data_logger.cli.pull import pull
 from shadowhound_data_logger.cli.query import query
@@ -121,7 +121,7 @@ def main() -> None:
         if wants_json(sys.argv[1:]):
             print_error(*told, code)
         else:
-            tell_error(*told)
+            report_error(*told)
         sys.exit(code)
 
 

@@ -117,7 +117,7 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
     try:
         left = _wait(where, time.monotonic() + deadline)
     finally:
-        replayer.let_go()
+        replayer.release()
     if as_json:
         print_json({'left': left})
         return exit_code(finding=left)

@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, spool_folder, the_spool
-from shadowhound_data_logger.cli.output import plain, plain_table, print_json, print_page, tell_error
+from shadowhound_data_logger.cli.output import plain, plain_table, print_json, print_page, report_error
 from shadowhound_data_logger.spool.control import connect
 
 F = TypeVar('F', bound=Callable[..., Any])
@@ -131,7 +131,7 @@ def _ask(
     if as_json:
         print_json(answer)
     elif not answer['ok']:
-        tell_error(f'shadowhound-data node {do}', answer['error'], 'shadowhound-data status says what the node does')
+        report_error(f'shadowhound-data node {do}', answer['error'], 'shadowhound-data status says what the node does')
     elif show is not None:
         print_page(*show(answer))
     else:

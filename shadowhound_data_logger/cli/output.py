@@ -44,7 +44,7 @@ def print_json(value: object, *, is_line: bool = False) -> None:
     click.echo(json.dumps(value, indent=None if is_line else 2, default=str))
 
 
-def tell_error(verb: str, what: str, remedy: str) -> None:
+def report_error(verb: str, what: str, remedy: str) -> None:
     """On standard error: the verb, what is wrong and where, and on the next line what to do."""
     for start, text in ((f'{verb}: ', what), ('  -> ', remedy)):  # which may quote what a robot wrote
         click.echo(start + '\n'.join(map(visible, text.split('\n'))), err=True)

@@ -186,8 +186,8 @@ SECTIONS: Final = (
     ),
     Section(
         'Find it later',
-        'The catalogue of what the store holds ([lake](lake.md)).',
-        ('catalogue.enabled', 'catalogue.period_s', 'SENSOR.statistics'),
+        'The catalog of what the store holds ([lake](lake.md)).',
+        ('catalog.enabled', 'catalog.period_s', 'SENSOR.statistics'),
     ),
     Section(
         'Know what was lost',

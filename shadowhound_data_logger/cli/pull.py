@@ -12,9 +12,9 @@ import click
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
-from shadowhound_data_logger.cli.question import asking, question, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.keys import is_name
-from shadowhound_data_logger.core.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MOST_KEYS, KeptFilter, offer
+from shadowhound_data_logger.core.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MAX_KEYS, KeptFilter, offer
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import visible
 
@@ -90,7 +90,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
                         lake.await_rows(source, robot, want, rows, left_out)
     if as_json:
         print_json({**said, 'answer': answer})
-    code = tell_left_out(left_out)
+    code = report_skipped(left_out)
     return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
 
 
@@ -198,8 +198,8 @@ def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]
         return rows, want
     rows = query.within_chosen(rows, asked)
     rows = rows if asked.where is None else query.chosen(rows, asked.where)
-    if len(rows) > MOST_KEYS:
-        raise BadUsage(f'this chooses {len(rows):,} objects: more than {MOST_KEYS:,} cannot be asked for by name', 'ask for less')
+    if len(rows) > MAX_KEYS:
+        raise BadUsage(f'this chooses {len(rows):,} objects: more than {MAX_KEYS:,} cannot be asked for by name', 'ask for less')
     return rows, replace(want, patterns=(), keys=frozenset(rows['key'].to_pylist()))
 
 

@@ -15,7 +15,7 @@ import click
 from rich.console import RenderableType
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, store_hint, the_store_settings
-from shadowhound_data_logger.cli.likeness import likest, model_option
+from shadowhound_data_logger.cli.likeness import model_option, most_similar
 from shadowhound_data_logger.cli.output import (
     counted,
     duration,
@@ -28,7 +28,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
     with_dates,
 )
-from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.expression import STORED, parse
@@ -42,8 +42,8 @@ SHOWN: Final = 30
 """Rows of a table unless --limit says more."""
 COLUMNS: Final = ('likeness', 't_start', 'sensor', 'key', 'bytes', 'x', 'y', 'battery_pct', 'mission_type', 'labels')
 """Of a table of objects; the other formats have all."""
-MOST_POSES: Final = 20_000
-MOST_TIMES: Final = 100
+MAX_POSES: Final = 20_000
+MAX_TIMES: Final = 100
 _OBJECTS: Final = {'bucket', 'key'}
 _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 
@@ -93,9 +93,9 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' is about the values in the objects: the answer is times, which
     --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
 
-    --like and --like-text compare all pictures that the flags choose and answer with the likest: 1 is the same, to the model.
+    --like and --like-text compare all images that the flags select, and list the most similar first; 1 is identical to the model.
 
-    Exit code 1 when files of the catalogue are damaged: they are left out, and named on standard error.
+    Exit code 1 when files of the catalog are damaged: they are left out, and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import labels, names  # noqa: PLC0415
@@ -112,9 +112,9 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         source, left_out = default_source(the_store_settings()), quietly()
         if like or like_text or model:
             if sql or order or bool(like) is bool(like_text):
-                raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the likest first',
+                raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the most similar first',
                                'leave out the other one, SQL and --order')  # fmt: skip
-            found = likest(source, like, like_text, model, limit or SHOWN, left_out, flags)
+            found = most_similar(source, like, like_text, model, limit or SHOWN, left_out, flags)
             limit = limit or SHOWN
         else:
             try:
@@ -131,7 +131,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         if sheet or ground:
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
     _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 def _found(source: Any, sql: str | None, flags: Mapping[str, Any], order: str | None, limit: int | None, left_out: Any,
@@ -166,7 +166,7 @@ def _times(when: str, flags: Mapping[str, Any], *, scan: bool, join_s: float | N
     if found.fields:
         names.check_name_of('field', values.field_of(when, found.fields), found.fields)
     _print_times(when, found, is_json=is_json)
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
@@ -177,7 +177,7 @@ def _print_times(condition: str, found: ValueAnswer, *, is_json: bool) -> None:
         return
     table = plain_table('', ('robot', 'from (UTC)', 'to (UTC)', 'lasts', 'messages'), ('robot', 'from (UTC)', 'to (UTC)'))
     table.title = None
-    for each in found.ranges[:MOST_TIMES]:
+    for each in found.ranges[:MAX_TIMES]:
         lasts = duration((each.until_ns - each.since_ns) / SECOND)
         table.add_row(plain(each.robot), shown_time(each.since_ns), shown_time(each.until_ns), lasts, number(each.messages))
     parts: list[RenderableType] = [table, ''] if found.ranges else []
@@ -189,7 +189,7 @@ def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
     if not found.objects:
         yield plain(f'There are no such objects.{store_hint()}')
         return
-    more = f'; the first {MOST_TIMES} are shown (--json has all)' if len(found.ranges) > MOST_TIMES else ''
+    more = f'; the first {MAX_TIMES} are shown (--json has all)' if len(found.ranges) > MAX_TIMES else ''
     percent = 100 * found.opened / found.objects
     share = f'{percent:.{0 if percent >= 10 else 2}{"f" if percent >= 10 else "g"}} %' if found.opened else 'none'
     opened = f'{number(found.opened)} of {counted(found.objects, "object")} opened ({share})'
@@ -272,5 +272,5 @@ def _pictures(source: Any, rows: Sequence[Mapping[str, Any]], flags: Mapping[str
         poses = lake.objects(source, findings=left_out, columns=('x', 'y'), where='x IS NOT NULL', **around).to_pydict()
         path = list(zip(poses['x'], poses['y'], strict=True))
         near = wanted(0, near=flags.get('near')).near
-        pictures.ground(rows, path[:: len(path) // MOST_POSES + 1], near, question_text(flags), ground)
+        pictures.ground(rows, path[:: len(path) // MAX_POSES + 1], near, question_text(flags), ground)
         click.echo(f'Wrote {ground}', err=True)

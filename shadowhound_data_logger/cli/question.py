@@ -1,4 +1,4 @@
-"""The flags with which ``query`` and ``fetch`` search the catalogue, and the library behind them, which a robot does not have."""
+"""The flags with which ``query`` and ``fetch`` search the catalog, and the library behind them, which a robot does not have."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FLAGS: Final = {
         '--since', metavar='TIME', help='Begun at or after TIME: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'
     ),
     'until': click.option('--until', metavar='TIME', help='Begun before TIME.'),
-    'near': click.option('--near', metavar='X,Y,R', help='Within R metres of X,Y in the odometry frame.'),
+    'near': click.option('--near', metavar='X,Y,R', help='Within R meters of X,Y in the odometry frame.'),
     'mission': click.option('--mission', metavar='ID', help='Only of missions whose id, or whose run id, begins with ID.'),
     'mission_type': click.option('--mission-type', metavar='TYPE', help='Only of missions of this type.'),
     'failed': click.option(
@@ -123,11 +123,11 @@ def quietly() -> Findings:
     return Findings(lambda _: None)
 
 
-def tell_left_out(left_out: Findings) -> ExitCode:
+def report_skipped(left_out: Findings) -> ExitCode:
     """Each on standard error; the exit code."""
     for one in left_out:
         click.echo(str(one), err=True)
     if len(left_out):
-        text = f'{number(len(left_out))} of the catalogue are left out. Move them away, and run `shadowhound-data lake reindex`.'
+        text = f'{number(len(left_out))} of the catalog are left out. Move them away, and run `shadowhound-data lake reindex`.'
         click.echo(text, err=True)
     return exit_code(finding=len(left_out))

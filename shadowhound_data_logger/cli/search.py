@@ -35,10 +35,10 @@ from shadowhound_data_logger.cli.output import (
     shown_time,
     with_dates,
 )
-from shadowhound_data_logger.cli.question import FLAGS, asking, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import FLAGS, asking, quietly, report_skipped
 
 FILE: Final = 'search.db'
-MOST_SAID: Final = 80
+MAX_SAID: Final = 80
 """Letters of a document in the table; JSON has all."""
 _ASKED: Final = ('robot', 'since', 'until', 'mission', 'mission_type', 'success', 'label', 'ranges')
 _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*[^/])')
@@ -97,7 +97,7 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
         said = each['title'] if not each['excerpt'] or each['excerpt'] == each['title'] else f'{each["title"]}: {each["excerpt"]}'
         said = said.removeprefix(': ')
         cells = [each['kind'], each['robot'], shown_time(each['since_ns']), each['mission_id'] or '-',
-                 said if len(said) <= MOST_SAID else f'{said[:MOST_SAID]} ...', ', '.join(each['labels'])]  # fmt: skip
+                 said if len(said) <= MAX_SAID else f'{said[:MAX_SAID]} ...', ', '.join(each['labels'])]  # fmt: skip
         table.add_row(*map(plain, cells[: len(columns)]))
     until = f'up to {shown_time(fresh_ns)}' if fresh_ns is not None else 'up to a time that is not known'
     more = f'; {counted(waiting, "mission")} had no summary yet' if waiting else ''
@@ -133,7 +133,7 @@ def lake_index(*, to: str | None, as_json: bool) -> ExitCode:
         print_lines(f'{counted(found.missions, "mission")} added; {number(found.documents)} documents are in {to or path}.')
         if found.waiting:
             print_lines(f'{counted(found.waiting, "mission")} without a summary yet.')
-    return tell_left_out(left_out)
+    return report_skipped(left_out)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""``shadowhound-data lake sink``: the catalogue and what lies beside it into Elasticsearch or OpenSearch."""
+"""``shadowhound-data lake sink``: the catalog and what lies beside it into Elasticsearch or OpenSearch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store_settings
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress
-from shadowhound_data_logger.cli.question import asking, quietly, tell_left_out
+from shadowhound_data_logger.cli.question import asking, quietly, report_skipped
 from shadowhound_data_logger.core.errors import StoreUnavailable
 
 SHOWN: Final = 10
@@ -33,9 +33,9 @@ SHOWN: Final = 10
               help='With --follow: seconds between checks.')  # fmt: skip
 @as_json
 def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follow: bool, every: float, as_json: bool) -> ExitCode:
-    """Send the catalogue to Elasticsearch or OpenSearch.
+    """Send the catalog to Elasticsearch or OpenSearch.
 
-    It sends catalogue rows, gaps, missions, their events, and labels. $SHADOWHOUND_HOME/sink records what the server has
+    It sends catalog rows, gaps, missions, their events, and labels. $SHADOWHOUND_HOME/sink records what the server has
     accepted, so an interrupted run resumes there, and no document is created twice. ELASTIC_API_KEY, or
     ELASTIC_USERNAME and ELASTIC_PASSWORD, authenticate.
 
@@ -77,4 +77,4 @@ def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follo
             print_lines(plain(f'{number(count)} refused: {reason}'))
         if total.refused:
             print_lines(f'{position.path} lists them, in the table refused.')
-    return tell_left_out(left_out) or exit_code(finding=total.refused)
+    return report_skipped(left_out) or exit_code(finding=total.refused)

@@ -33,10 +33,11 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, 
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, tell_gaps_again, usage_by_sensor
+from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, usage_by_sensor
+from shadowhound_data_logger.spool.listing import resend_gaps as resend_all_gaps
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.object_table import MISSING
 from shadowhound_data_logger.spool.spool import Spool
@@ -108,7 +109,7 @@ def drain(folder: Path, *, patience: float, as_json: bool) -> ExitCode:
     """Upload everything that waits, without a node.
 
     Use it before a robot is put away, or with the disk of a broken one. It needs the AWS_... variables of the node: without them
-    the store is a folder. Each object is verified as by the node, and gets its row in the catalogue. Exit code 1 when an object
+    the store is a folder. Each object is verified as by the node, and gets its row in the catalog. Exit code 1 when an object
     is left or refused. Ctrl-C loses nothing.
     """
     _check(folder)
@@ -141,18 +142,18 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
     return exit_code(finding=done.gone or (names and done.objects < len(frozenset(names))))
 
 
-@spool.command('tell-gaps', epilog=examples('spool tell-gaps'))
+@spool.command('resend-gaps', epilog=examples('spool resend-gaps'))
 @as_json
 @click.pass_obj
-def tell_gaps(folder: Path, *, as_json: bool) -> ExitCode:
+def resend_gaps(folder: Path, *, as_json: bool) -> ExitCode:
     """Send the gap journal to the store again.
 
-    For a store that lost parts of it. A running node sends it within a minute (catalogue.period_s). Gaps older than
+    For a store that lost parts of it. A running node sends it within a minute (catalog.period_s). Gaps older than
     spool.remember_days cannot be sent again.
     """
     _check(folder)
     try:
-        rows = tell_gaps_again(folder)
+        rows = resend_all_gaps(folder)
     except sqlite3.Error as error:
         remedy = 'is it yours, and its disk neither full nor read-only?'
         raise SpoolError(f'the spool {folder} cannot be changed: {error}', remedy=remedy) from error
@@ -242,14 +243,14 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
     # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
     spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
     spool.open()
-    catalogue = CatalogueWriter(folder, settings.catalogue, settings.robot, clock)
+    catalog = CatalogWriter(folder, settings.catalog, settings.robot, clock)
     try:
         with (
             closing(spool),
             delivering(spool, settings, CLOSE_S) as (uploader, writer),
             progress('delivered', spool.pending_count(), of='objects') as bar,
         ):
-            _wait(spool, uploader, writer, catalogue, patience_s, bar)
+            _wait(spool, uploader, writer, catalog, patience_s, bar)
             writer.flush(CLOSE_S)
             said = {'store': where, **_drained(folder, spool, uploader.status())}
     except (OSError, sqlite3.Error) as error:
@@ -272,9 +273,9 @@ def _destination(folder: Path, settings: Settings) -> str:
     return where
 
 
-def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: CatalogueWriter, patience_s: float,
+def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalog: CatalogWriter, patience_s: float,
           bar: ProgressBar) -> None:  # fmt: skip
-    """Until nothing waits that can be delivered, the catalogue's parts of it included; or nothing moves for so long."""
+    """Until nothing waits that can be delivered, the catalog's parts of it included; or nothing moves for so long."""
     done, sent, retries, moved_s = -1, 0, 0, time.monotonic()
     while time.monotonic() - moved_s < patience_s:
         is_drained = uploader.drain(LOOK_S)
@@ -290,7 +291,7 @@ def _wait(spool: Spool, uploader: Uploader, writer: SpoolWriter, catalogue: Cata
         if not is_drained:
             time.sleep(LOOK_S)  # it returns at once where the store is away
             continue
-        parts = catalogue.parts()
+        parts = catalog.parts()
         for part in parts:
             writer.put(part)
         if not (parts and writer.flush(CLOSE_S)):

@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.options import (
     GROUPS,
     BagSettings,
     CaptureSettings,
-    CatalogueSettings,
+    CatalogSettings,
     ClockSettings,
     EventSettings,
     KeepSettings,
@@ -43,7 +43,7 @@ __all__ = [
     'NOT_SETTINGS',
     'BagSettings',
     'CaptureSettings',
-    'CatalogueSettings',
+    'CatalogSettings',
     'ClockSettings',
     'EventSettings',
     'KeepSettings',
@@ -100,7 +100,7 @@ class Settings:
     mission: MissionSettings
     bag: BagSettings
     events: EventSettings
-    catalogue: CatalogueSettings
+    catalog: CatalogSettings
 
     @property
     def spool_path(self) -> Path:

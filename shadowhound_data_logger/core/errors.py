@@ -145,13 +145,13 @@ class BagDamaged(BagError):
 
 
 class LakeError(DataLoggerError):
-    """A query of the catalogue cannot be answered: an invalid query, or a catalogue that contradicts itself."""
+    """A query of the catalog cannot be answered: an invalid query, or a catalog that contradicts itself."""
 
-    DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalogue'
+    DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalog'
 
 
 class SinkUnavailable(LakeError):
-    """A server that is sent the catalogue gives no answer, or asks to wait."""
+    """A server that is sent the catalog gives no answer, or asks to wait."""
 
     DEFAULT_REMEDY = 'run it again: it goes on where it stopped'
 

@@ -36,17 +36,18 @@ COMPARISONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     '<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '==': operator.eq, '!=': operator.ne,
 }  # fmt: skip
 """Signs and what they compare."""
-COMPARISON, FUNCTION, HOLD, NETWORK, TIME, MISSION, NOT, JOINED = PARTS = (
-    'a number of a field (lowstate:bms_state.soc > 30)', 'a statistic of an object (max(imu.temperature) > 60)',
+TOPIC, SENSOR, FUNCTION, HOLD, NETWORK, TIME, MISSION, NOT, JOINED = PARTS = (
+    'a number of a topic (lowstate:bms_state.soc > 30)', 'a number of a sensor (imu.accelerometer.2 > 15)',
+    'a statistic of an object (max(imu.temperature) > 60)',
     "'for' seconds", 'wifi.ssid == "lab"', 'the time of day (time 22:00-06:00)', 'mission, or mission == "patrol"',
     "'not'", "'and', 'or' and parentheses",
 )  # fmt: skip
 """The parts of the language, as errors name them."""
-MACHINE: Final = frozenset({COMPARISON, HOLD, NETWORK, TIME, MISSION, NOT, JOINED})
+MACHINE: Final = frozenset({TOPIC, HOLD, NETWORK, TIME, MISSION, NOT, JOINED})
 """What a rule about the robot and its surroundings may contain."""
-MESSAGE: Final = frozenset({COMPARISON, HOLD})
+MESSAGE: Final = frozenset({TOPIC, HOLD})
 """What may trigger an event: one number of a topic's messages."""
-STORED: Final = frozenset({COMPARISON, FUNCTION, JOINED})
+STORED: Final = frozenset({SENSOR, FUNCTION, JOINED})
 """What can be asked about stored objects."""
 _SIGNS: Final = {'=': '==', '<>': '!='}
 _NUMBER: Final = r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?'
@@ -172,25 +173,25 @@ def conditions(texts: Iterable[str], setting: str = 'events.conditions') -> tupl
     return tuple(found.values())
 
 
-def tests(expression: Expression) -> Iterator[Test]:
+def leaves(expression: Expression) -> Iterator[Test]:
     """All tests, from left to right."""
     if isinstance(expression, Not):
-        yield from tests(expression.part)
+        yield from leaves(expression.part)
     elif isinstance(expression, Joined):
         for part in expression.parts:
-            yield from tests(part)
+            yield from leaves(part)
     else:
         yield expression
 
 
 def topics(expression: Expression) -> list[str]:
     """The topics whose messages it needs, as they were written."""
-    return [test.source for test in tests(expression) if isinstance(test, Comparison)]
+    return [test.source for test in leaves(expression) if isinstance(test, Comparison)]
 
 
 def comparisons(expression: Expression) -> list[Comparison]:
     """All comparisons, from left to right."""
-    return [test for test in tests(expression) if isinstance(test, Comparison)]
+    return [test for test in leaves(expression) if isinstance(test, Comparison)]
 
 
 def text_of(expression: Expression) -> str:
@@ -281,6 +282,7 @@ class _Parser:
             self._need(FUNCTION)
             self._take('bracket', '(') or self._fail("'('")
         field = self._take('field') or self._fail('a test')
+        self._need(TOPIC if ':' in field else SENSOR)
         if function:
             self._take('bracket', ')') or self._fail("')'")
         source, _, path = field.partition(':') if ':' in field else field.partition('.')

@@ -26,11 +26,11 @@ from shadowhound_data_logger.core.untrusted import from_json
 MAILBOX_BUCKET: Final = 'sensor-data'
 FORMAT: Final = 1
 MOST_INBOX_BYTES: Final = 256 << 10
-MOST_ENTRIES: Final = 256
-MOST_KEYS: Final = 1000
+MAX_ENTRIES: Final = 256
+MAX_KEYS: Final = 1000
 """Keys and patterns of one request."""
-MOST_PATTERN: Final = 512
-MOST_WILD: Final = 16
+MAX_PATTERN: Final = 512
+MAX_WILD: Final = 16
 """Of them with ``*`` or ``?``: each is tried on all that is kept."""
 LATEST_NS: Final = 4_102_444_800 * SECOND
 """2100."""
@@ -40,12 +40,12 @@ DEFAULT_EXPIRY_NS: Final = 7 * 24 * 3600 * SECOND
 DEFAULT_PRIORITY: Final = 5
 BAG_SENSOR: Final = 'bag'
 """Its objects are slices: one is wanted where its time overlaps the time that is asked for."""
-LEAST_SPARED: Final = 64 << 10
+MIN_SPARED: Final = 64 << 10
 """Bytes that cutting a slice has to spare: a cut is three objects."""
 _ID: Final = re.compile(r'[0-9a-f]{32}')
 _PATTERN: Final = re.compile(r"[A-Za-z0-9!_.'()=+@*?/-]+")
 _WORDS: Final = ('sensor', 'topic', 'mission', 'mission_type')
-_MOST_WORD: Final = 256
+_MAX_WORD: Final = 256
 _ASKING: Final = frozenset({'id', 'robot', 'by', 'made_ns', 'expires_ns', 'priority', 'want'})
 _CANCELLING: Final = frozenset({'cancel', 'by', 'made_ns'})
 
@@ -68,7 +68,7 @@ class KeptFilter:
     until_ns: int | None = None
     """Exclusive."""
     near: tuple[float, float, float] | None = None
-    """x, y and radius in metres, in the odometry's frame."""
+    """x, y and radius in meters, in the odometry's frame."""
     mission: str | None = None
     """How the id of a mission or of its run begins."""
     mission_type: str | None = None
@@ -96,7 +96,7 @@ class KeptFilter:
             return size
         since_ns, until_ns = max(self.since_ns or begin_ns, begin_ns), min(self.until_ns or end_ns + 1, end_ns + 1)
         wanted = size * max(until_ns - since_ns, 1) // max(end_ns + 1 - begin_ns, 1)
-        return max(wanted, 1) if size - wanted >= LEAST_SPARED else size
+        return max(wanted, 1) if size - wanted >= MIN_SPARED else size
 
     def takes(self, key: str, sensor: str, topic: str | None, begin_ns: int, end_ns: int, metadata: Mapping[str, str]) -> bool:
         """Whether an object is wanted; ``metadata`` as it will have it in the store."""
@@ -154,13 +154,13 @@ class PullCancel:
 
 
 def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
-    """About how many bytes of an object are wanted, by its row of ``catalogue.schema.KEPT``: of a slice at its ends a part."""
+    """About how many bytes of an object are wanted, by its row of ``catalog.schema.KEPT``: of a slice at its ends a part."""
     begin_ns = row['t_start_ns'] or 0
     return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
 
 
 def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | None) -> dict[str, Any]:
-    """What a request for these rows of ``catalogue.schema.KEPT`` comes to: all of them are wanted.
+    """What a request for these rows of ``catalog.schema.KEPT`` comes to: all of them are wanted.
 
     ``objects`` that the robot keeps and about how many ``bytes`` of them it would send, in how
     many ``seconds`` at its pace, None where that is not known; and what it has ``lost``, by reason.
@@ -199,7 +199,7 @@ def request_id(robot: str, want: Mapping[str, Any]) -> str:
 def encode_inbox(entries: Sequence[Mapping[str, Any]]) -> bytes:
     """The mailbox with these entries. Raises RequestRefused where it would be too large."""
     body = json.dumps({'format': FORMAT, 'entries': list(entries)}, separators=(',', ':')).encode()
-    if len(entries) > MOST_ENTRIES or len(body) > MOST_INBOX_BYTES:
+    if len(entries) > MAX_ENTRIES or len(body) > MOST_INBOX_BYTES:
         raise RequestRefused('too_large', f'the mailbox is full: {len(entries):,} entries, {len(body):,} bytes')
     return body
 
@@ -215,8 +215,8 @@ def decode_inbox(body: bytes) -> list[Any]:
     entries = found.get('entries') if isinstance(found, dict) and set(found) == {'format', 'entries'} else None
     if not isinstance(entries, list) or found['format'] != FORMAT:
         raise RequestRefused('not_ours', f'the mailbox is none of format {FORMAT}')
-    if len(entries) > MOST_ENTRIES:
-        raise RequestRefused('too_many', f'the mailbox has more than {MOST_ENTRIES} entries')
+    if len(entries) > MAX_ENTRIES:
+        raise RequestRefused('too_many', f'the mailbox has more than {MAX_ENTRIES} entries')
     return entries
 
 
@@ -253,7 +253,7 @@ def _read_want(said: Any) -> KeptFilter:
     if not isinstance(said, dict) or not set(said) <= {*_WORDS, 'since_ns', 'until_ns', 'near', 'keys'} or not said:
         raise RequestRefused('fields', 'want is not an object of known fields')
     for name in _WORDS:
-        if name in said and not (isinstance(said[name], str) and 0 < len(said[name]) <= _MOST_WORD and said[name].isprintable()):
+        if name in said and not (isinstance(said[name], str) and 0 < len(said[name]) <= _MAX_WORD and said[name].isprintable()):
             raise RequestRefused('want', f'{name} is not a short text')
     for name in ('since_ns', 'until_ns'):
         if name in said:
@@ -261,14 +261,14 @@ def _read_want(said: Any) -> KeptFilter:
     keys = said.get('keys', [])
     if (
         not isinstance(keys, list)
-        or len(keys) > MOST_KEYS
+        or len(keys) > MAX_KEYS
         or not all(map(_is_pattern, keys))
-        or sum(map(_is_wild, keys)) > MOST_WILD
+        or sum(map(_is_wild, keys)) > MAX_WILD
     ):
-        raise RequestRefused('keys', f'keys are not at most {MOST_KEYS} keys, {MOST_WILD} of them patterns')
+        raise RequestRefused('keys', f'keys are not at most {MAX_KEYS} keys, {MAX_WILD} of them patterns')
     near = said.get('near')
     if near is not None and not _is_circle(near):
-        raise RequestRefused('near', 'near is not x, y and a radius in metres')
+        raise RequestRefused('near', 'near is not x, y and a radius in meters')
     given = {name: said[name] for name in (*_WORDS, 'since_ns', 'until_ns') if name in said}
     circle = None if near is None else (near[0], near[1], near[2])
     return KeptFilter(
@@ -283,7 +283,7 @@ def _is_circle(near: Any) -> bool:
 
 
 def _is_pattern(pattern: Any) -> bool:
-    return isinstance(pattern, str) and len(pattern) <= MOST_PATTERN and bool(_PATTERN.fullmatch(pattern))
+    return isinstance(pattern, str) and len(pattern) <= MAX_PATTERN and bool(_PATTERN.fullmatch(pattern))
 
 
 def _is_wild(pattern: str) -> bool:

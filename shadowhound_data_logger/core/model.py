@@ -1,4 +1,4 @@
-"""The only things that stages exchange: frozen, slotted, without behaviour of their own."""
+"""The only things that stages exchange: frozen, slotted, without behavior of their own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UPLOAD_WHEN: Final = 'upload.when'
 EVENTS_WHEN: Final = 'events.when'
 """Settings that objects wait for (``waits_for``)."""
 ON_ROBOT, LOST = 'robot', 'lost'
-"""Where an object is that a robot kept (the column ``where`` of ``catalogue.schema.KEPT``)."""
+"""Where an object is that a robot kept (the column ``where`` of ``catalog.schema.KEPT``)."""
 PREVIEWS: Final = '_previews'
 """The folder of previews; a preview's sensor has this behind its name."""
 
@@ -108,9 +108,9 @@ class DataObject:
     key_pattern: str | None = None
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
     statistics: bytes = b''
-    """Of the numbers in it, as ``encode.statistics.packed``; for the catalogue."""
-    catalogues: tuple[int, ...] = ()
-    """A part of the catalogue: the ids of the objects that it has rows of. It is left out where another part has one of them."""
+    """Of the numbers in it, as ``encode.statistics.packed``; for the catalog."""
+    catalogs: tuple[int, ...] = ()
+    """A part of the catalog: the ids of the objects that it has rows of. It is left out where another part has one of them."""
     tells: tuple[tuple[int, str], ...] = ()
     """A part of the table of what is kept: the ids and states of its rows. It is left out where another part has one of them."""
     answers: tuple[str, int, str] | None = None
@@ -158,7 +158,7 @@ class SpooledObject:
 def waits_for(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> str:
     """The setting that says when an object is uploaded; empty for what always is.
 
-    Always: what tells of the robot and of other objects (catalogue, gaps, ledger, previews, answers), and what is never evicted
+    Always: what tells of the robot and of other objects (catalog, gaps, ledger, previews, answers), and what is never evicted
     (endings of bags, summaries of missions, what was asked for), but for the bags of events.
     """
     if sensor.startswith('_') or sensor.endswith(PREVIEWS):

@@ -55,7 +55,7 @@ class SensorSettings:
     quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
-    dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalogue.')
+    dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalog.')
     priority: int = _setting(
         5, '0 is uploaded first and dropped or evicted last; 9 is uploaded last and evicted first.', low=0, high=9, live=True
     )
@@ -70,7 +70,7 @@ class SensorSettings:
     )
 
     statistics: tuple[str, ...] = _setting(
-        ('',), 'Fields whose statistics go to the catalogue, such as bms_state.soc; none named: the first 64; "none": none.'
+        ('',), 'Fields whose statistics go to the catalog, such as bms_state.soc; none named: the first 64; "none": none.'
     )
 
     @property
@@ -192,11 +192,11 @@ class MissionSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CatalogueSettings:
-    """The catalogue of what the store holds, written after delivery."""
+class CatalogSettings:
+    """The catalog of what the store holds, written after delivery."""
 
-    enabled: bool = _setting(True, 'Write a row for each delivered object to the catalogue.')
-    period_s: float = _setting(60.0, 'Seconds between two files of the catalogue.', low=1.0, high=86_400.0)
+    enabled: bool = _setting(True, 'Write a row for each delivered object to the catalog.')
+    period_s: float = _setting(60.0, 'Seconds between two files of the catalog.', low=1.0, high=86_400.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -279,7 +279,7 @@ GROUPS: Final[dict[str, type]] = {
     'mission': MissionSettings,
     'bag': BagSettings,
     'events': EventSettings,
-    'catalogue': CatalogueSettings,
+    'catalog': CatalogSettings,
 }
 DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
     'camera': {

@@ -20,7 +20,7 @@ TIMES_IN_BAG: Final = (
 )
 EPOCH_S: Final = 1_000_000_000
 """In a bag a number from here on is not a duration but seconds since 1970, as ``ros2 bag info`` prints them."""
-MOST_AGE_S: Final = 10**11
+MAX_AGE_S: Final = 10**11
 _NUMBER: Final = re.compile(r'[+-]?\d{1,19}(\.\d{1,9})?', re.ASCII)
 _ISO: Final = re.compile(
     r'(\d{4})(-?)(\d\d)\2(\d\d)'
@@ -45,7 +45,7 @@ def moment(name: str, given: str | datetime, now_ns: int) -> int:
         return _ns(midnight - timedelta(days=_DAYS_AGO[text.lower()]))
     if age := _AGE.fullmatch(text):
         seconds = Decimal(age[1]) * _UNITS[age[2].lower()]
-        found = now_ns - int(seconds * SECOND) if seconds < MOST_AGE_S else None
+        found = now_ns - int(seconds * SECOND) if seconds < MAX_AGE_S else None
     else:
         found = _iso_ns(text)
     if found is None or not _is_a_date(found):

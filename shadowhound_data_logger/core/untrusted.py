@@ -27,14 +27,14 @@ MOST_JSON_DEPTH: Final = 64
 """Of JSON. Whoever reads a document may go into it by recursion, which Python ends at a depth of 1,000 or less."""
 MOST_SUMMARY_BYTES: Final = 1 << 20
 """Of a mission's ``summary.json``."""
-MOST_YAML_BYTES: Final = 4 << 20
+MAX_YAML_BYTES: Final = 4 << 20
 """Of a ``metadata.yaml``: that of some 15,000 slices."""
-MOST_YAML_NODES: Final = 250_000
+MAX_YAML_NODES: Final = 250_000
 """Each takes 50 us."""
-MOST_YAML_DEPTH: Final = 32
+MAX_YAML_DEPTH: Final = 32
 MOST_OBJECT_BYTES: Final = 64 << 20
 """Of an object that is decoded in memory: an archive is closed after 16 MiB of messages."""
-MOST_CHUNK_BYTES: Final = 128 << 20
+MAX_CHUNK_BYTES: Final = 128 << 20
 """Of a bag's chunk, packed and unpacked: rosbag2 makes them of 768 KB, or as large as their largest message."""
 PIECE_BYTES: Final = 4096
 """Of damaged content: so much is lost where it cannot be unpacked."""
@@ -175,13 +175,13 @@ def from_yaml(content: str) -> Any:
             self.depth += 1
             if self.parser.check_event(AliasEvent):
                 raise ValueError('it has aliases')
-            if self.nodes > MOST_YAML_NODES or self.depth > MOST_YAML_DEPTH:
-                raise ValueError(f'it is deeper than {MOST_YAML_DEPTH}, or has more than {MOST_YAML_NODES:,} values')
+            if self.nodes > MAX_YAML_NODES or self.depth > MAX_YAML_DEPTH:
+                raise ValueError(f'it is deeper than {MAX_YAML_DEPTH}, or has more than {MAX_YAML_NODES:,} values')
             made = super().compose_node(parent, index)
             self.depth -= 1
             return made
 
-    check_size(len(content), MOST_YAML_BYTES)
+    check_size(len(content), MAX_YAML_BYTES)
     yaml = YAML(typ='safe', pure=True)  # the parser in C neither counts nor ends at a depth
     yaml.Composer = Plain
     try:
@@ -204,8 +204,8 @@ def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes
 
     It ends at the size: a frame that holds more is wrong, and its rest is never unpacked. Raises ValueError.
     """
-    most = MOST_CHUNK_BYTES if size is None else size
-    check_size(most, MOST_CHUNK_BYTES)
+    most = MAX_CHUNK_BYTES if size is None else size
+    check_size(most, MAX_CHUNK_BYTES)
     if compression not in {'zstd', 'lz4'}:
         raise ValueError(f'it is compressed with {compression!r}, which is not supported')
     try:
@@ -219,7 +219,7 @@ def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes
 
 def partly_unpacked(compression: str, content: bytes, size: int) -> bytearray:
     """What can still be unpacked of content that is torn or damaged: its beginning, of at most this size. Raises ValueError."""
-    check_size(size, MOST_CHUNK_BYTES)
+    check_size(size, MAX_CHUNK_BYTES)
     if compression == 'zstd':
         from shadowhound_data_logger.core.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
 

@@ -156,7 +156,7 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
         builder, job, attempt = running.pop(ready)
         mission = job[0].mission.mission_id
         try:
-            _bring(builder, ray.get(ready), job[-1])
+            _download(builder, ray.get(ready), job[-1])
         except RayTaskError as error:
             raise error.cause from None
         except RayError as error:
@@ -180,7 +180,7 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
                         remedy=f'run it again: the {done} episodes that were made need not be made again')  # fmt: skip
 
 
-def _bring(builder: Any, files: Files, folder: Path) -> None:
+def _download(builder: Any, files: Files, folder: Path) -> None:
     """All that a worker wrote, ``episode.json`` last. Raises RayError, and LakeError for other bytes than were written."""
     import ray  # noqa: PLC0415
 

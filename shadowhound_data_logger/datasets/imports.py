@@ -54,9 +54,6 @@ MS: Final = 1_000_000
 PART: Final = 3000
 """Samples of an object."""
 COLUMNS: Final = ('episode', 'begin_ns')
-_ARM: Final = ('waist', 'shoulder', 'elbow', 'forearm_roll', 'wrist_angle', 'wrist_rotate', 'gripper')
-ALOHA: Final = tuple(f'{side}_{joint}' for side in ('left', 'right') for joint in _ARM)
-"""Its fourteen joints, in the order of ``qpos``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +226,7 @@ def of_hdf5(
         if positions.ndim != 2 or not len(positions) or (commands is not None and commands.shape != positions.shape):
             raise LakeError(f'{path}: observations/qpos and action are not of one shape, (samples, joints)')
         width = positions.shape[1]
-        names = tuple(joints) or (ALOHA if width == len(ALOHA) else tuple(f'joint_{n}' for n in range(width)))
+        names = tuple(joints) or tuple(f'joint_{n}' for n in range(width))
         if len(names) != width:
             raise LakeError(f'{path} has {width} joints, not {len(names)}', remedy='--joints names them in their order')
         stamps = times[number] + np.rint(np.arange(len(positions)) * (SECOND / fps)).astype(np.int64)

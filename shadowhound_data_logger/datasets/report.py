@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw
 
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.datasets.lerobot import OURS, EpisodeRow, Lerobot
+from shadowhound_data_logger.missions.contact_sheet import INK, evenly
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,15 +22,13 @@ HEIGHT: Final = 150
 GAP: Final = 8
 FRAMES: Final = 5
 MOST: Final = 60
-"""Episodes, evenly chosen: a picture of more is not looked at."""
-INK, PALE, RED, GREEN = '#22303c', '#9aa7b3', '#d62828', '#4c9f70'
+"""Episodes, evenly chosen."""
+PALE, RED, GREEN = '#9aa7b3', '#d62828', '#4c9f70'
 
 
 def draw(made: Lerobot, target: Path) -> None:
     """Write the picture of a data set that has at least one episode. Raises LakeError, OSError."""
-    rows = made.rows
-    if len(rows) > MOST:
-        rows = [rows[round(place * (len(rows) - 1) / (MOST - 1))] for place in range(MOST)]
+    rows = evenly(made.rows, MOST)
     sheet = Image.new('RGB', (WIDTH, len(rows) * (HEIGHT + GAP) + GAP), 'white')
     for place, row in enumerate(rows):
         _episode(made, row, sheet, GAP + place * (HEIGHT + GAP))
@@ -41,8 +40,8 @@ def draw(made: Lerobot, target: Path) -> None:
 def _episode(made: Lerobot, row: EpisodeRow, sheet: Image.Image, top: int) -> None:
     pen = ImageDraw.Draw(sheet)
     name = f'{row["episode_index"]}  {row[f"{OURS}mission_id"]}  {utc(row[f"{OURS}first_tick_ns"]):%Y-%m-%d %H:%M:%S}'
-    told = f'{name}  {row["tasks"][0]}  {row["length"]} frames  {row[f"{OURS}split"]}'
-    pen.text((GAP, top), told[:150].encode('latin-1', 'replace').decode('latin-1'), fill=INK)
+    title = f'{name}  {row["tasks"][0]}  {row["length"]} frames  {row[f"{OURS}split"]}'
+    pen.text((GAP, top), title[:150].encode('latin-1', 'replace').decode('latin-1'), fill=INK)
     wanted = sorted({round(share * (row['length'] - 1)) for share in np.linspace(0, 1, FRAMES)})
     left, height = GAP, HEIGHT - 50
     for key in made.picture_keys()[:1]:

@@ -50,8 +50,8 @@ UNKNOWN: Final = Stream(0.0)
 NAME: Final = 'ros'
 WINDOW_S: Final = 2.5
 PEEK_S: Final = 1.2
-MOST_PEEKS: Final = 3
-MOST_NODES: Final = 3
+MAX_PEEKS: Final = 3
+MAX_NODES: Final = 3
 TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 """Below half of the expected rate; above a tenth that did not arrive."""
 ENOUGH: Final = 4
@@ -129,7 +129,7 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
     ours = domain_of(context.environ)
     theirs = [domain_of(driver.environ) for driver in processes(context.root, *DRIVERS) if driver.environ]
     others = [int(domain) for domain in dict.fromkeys([*theirs, *map(str, domains(context.root))]) if domain != ours]
-    for domain in others[:MOST_PEEKS]:
+    for domain in others[:MAX_PEEKS]:
         if there := _peek(domain, topics, listener):
             yield error(
                 'ros.domain',
@@ -197,7 +197,7 @@ def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: floa
 
 def _other_types(one: Heard, sensor: SensorSettings, others: Sequence[str]) -> Result:
     by = sorted({publisher.node for publisher in one.publishers if publisher.type in others} - {''})
-    whose = ', '.join(by[:MOST_NODES]) or 'a program that is not a ROS node'
+    whose = ', '.join(by[:MAX_NODES]) or 'a program that is not a ROS node'
     own = f'{sensor.name}.types: [{others[0]}]'
     return error(
         'ros.type',

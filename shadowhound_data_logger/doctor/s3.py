@@ -253,7 +253,7 @@ def race_creates(requests: S3Requests, bucket: str, robot: str) -> Iterator[Resu
     yield warning(
         's3.race',
         f'of {RACERS} who created one object at once {winners} won',
-        'the server does not honour If-None-Match in one instant: of two who write one key, one is overwritten',
+        'the server does not honor If-None-Match in one instant: of two who write one key, one is overwritten',
         'give each robot a name of its own (SHADOWHOUND_ROBOT), and update the S3 server',
     )
 
@@ -303,7 +303,7 @@ def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
         return
     if winners != [1] * RACES:
         seen = f'of {RACERS} who replaced one version of a mailbox at once {winners} won'
-        yield warning(check, seen, 'the server does not honour If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
+        yield warning(check, seen, 'the server does not honor If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
     elif is_made:
         yield warning(check, 'If-Match made an object that was not there', 'an error of MinIO before 2025', 'update the server')
     else:

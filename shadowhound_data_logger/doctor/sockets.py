@@ -19,7 +19,7 @@ from shadowhound_data_logger.ros.shared_memory import orphans
 
 NAME: Final = 'sockets'
 PROFILE_FILE: Final = f'$(ros2 pkg prefix shadowhound_data_logger)/share/shadowhound_data_logger/launch_configs/{SHIPPED}'
-LEAST_BUFFER: Final = 1 << 20
+MIN_BUFFER: Final = 1 << 20
 """Bytes with which all of 105 raw images at 15 Hz arrived; into the default of kernels, 208 KB, not one of them fits."""
 ENOUGH_BUFFER: Final = 8 << 20
 """net.core.rmem_max: a second of clouds of 320 KB at 10 Hz twice over, or eight raw images (docs/thor.md, Middleware)."""
@@ -29,7 +29,7 @@ ENOUGH_SHM: Final = 128 << 20
 """Three participants with the segment of our profile."""
 LARGE: Final = frozenset({IMAGE, POINT_CLOUD})
 _SEGMENT: Final = re.compile(r'<segment_size>\s*(\d+)\s*</segment_size>')
-_LEAST_BUFFER: Final = re.compile(r'<SocketReceiveBufferSize\b[^>]*\bmin=["\']\s*(\d+)\s*([a-z]*)', re.IGNORECASE)
+_MIN_BUFFER: Final = re.compile(r'<SocketReceiveBufferSize\b[^>]*\bmin=["\']\s*(\d+)\s*([a-z]*)', re.IGNORECASE)
 _UNITS: Final = {'k': 10, 'm': 20, 'g': 30}
 """kB, MB and MiB in powers of 2; https://cyclonedds.io/docs/cyclonedds/0.10.5/config/config_file_reference.html"""
 SYSCTL: Final = (
@@ -87,10 +87,10 @@ def _obtained(context: Context, node: Mapping[str, Any] | None) -> Result:
             seen += f', in which {node["dropped_datagrams"]:,} datagrams found no room since its start'
     else:
         seen = f'net.core.rmem_max is {size:,} bytes'
-    if size < LEAST_BUFFER <= (limit or 0):
+    if size < MIN_BUFFER <= (limit or 0):
         remedy = f'start the node again: sudo systemctl restart shadowhound-data-logger  # net.core.rmem_max is {limit:,} now'
         return warning(name, seen, cause, remedy, **figures)
-    if size < LEAST_BUFFER:
+    if size < MIN_BUFFER:
         return warning(name, seen, cause, f'{SYSCTL} ; then start the node again', **figures)
     return ok(name, seen, **figures) if size >= ENOUGH_BUFFER else info(name, seen, cause, SYSCTL, **figures)
 
@@ -148,7 +148,7 @@ def _cyclone(context: Context, *, listens: bool) -> Iterator[Result]:
 
 def _least_buffer(text: str) -> int:
     """The receive buffer, bytes, without which a Cyclone DDS with these settings does not start."""
-    found = _LEAST_BUFFER.search(text)
+    found = _MIN_BUFFER.search(text)
     return int(found[1]) << _UNITS.get(found[2][:1].lower(), 0) if found else 0
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from shadowhound_data_logger.formats.cdr import ENCAPSULATION_BYTES
-from shadowhound_data_logger.formats.statistics import MOST_DEPTH, MOST_ELEMENTS, MOST_FIELDS, covers, packed_parts
+from shadowhound_data_logger.formats.statistics import MAX_DEPTH, MAX_ELEMENTS, MOST_FIELDS, covers, packed_parts
 from shadowhound_data_logger.formats.types import PLACEHOLDER, SIZES, MessageTypes
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class _Walk:
     def _message(self, type_name: str, name: str, depth: int, *, is_seen: bool) -> None:
         for field, description in self._types.fields(type_name):
             path = f'{name}.{field}' if name else field
-            self._value(description, path, depth + 1, is_seen=is_seen and depth <= MOST_DEPTH and field != PLACEHOLDER)
+            self._value(description, path, depth + 1, is_seen=is_seen and depth <= MAX_DEPTH and field != PLACEHOLDER)
 
     def _value(self, description: Any, name: str, depth: int, *, is_seen: bool) -> None:
         kind, of = description
@@ -154,16 +154,16 @@ class _Walk:
             inner, count = of
             is_text = kind == Nodetype.SEQUENCE and inner[0] == Nodetype.BASE and inner[1][0] in _TEXT_BYTES
             count = self._length() if kind == Nodetype.SEQUENCE else count
-            self._elements(inner, count, name, depth, is_seen=is_seen and not is_text and depth <= MOST_DEPTH)
+            self._elements(inner, count, name, depth, is_seen=is_seen and not is_text and depth <= MAX_DEPTH)
 
     def _elements(self, inner: Any, count: int, name: str, depth: int, *, is_seen: bool) -> None:
-        if inner[0] == Nodetype.BASE and inner[1][0] != 'string' and (count > MOST_ELEMENTS or not is_seen):
+        if inner[0] == Nodetype.BASE and inner[1][0] != 'string' and (count > MAX_ELEMENTS or not is_seen):
             self._numbers(inner[1][0], count, f'{name}.*', is_seen=is_seen)
             return
         for place in range(count):
             if self._at > len(self._cdr):
                 raise _Unknown
-            self._value(inner, f'{name}.{place if count <= MOST_ELEMENTS else "*"}', depth + 1, is_seen=is_seen)
+            self._value(inner, f'{name}.{place if count <= MAX_ELEMENTS else "*"}', depth + 1, is_seen=is_seen)
 
     def _numbers(self, base: str, count: int, name: str, *, is_seen: bool) -> None:
         size = SIZES.get(base)

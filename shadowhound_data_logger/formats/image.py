@@ -243,7 +243,7 @@ def _rows(message: Any, pixel: _Pixel) -> NDArray[Any]:
 def _jpeg(message: Any, pixel: _Pixel, quality: int) -> bytes:
     _check_sides(message)
     pixels = _rows(message, pixel).reshape(message.height, message.width, pixel.size)
-    # Half-resolution colour is what OpenCV and libjpeg write by default, and takes half the time of full.
+    # Half-resolution color is what OpenCV and libjpeg write by default, and takes half the time of full.
     subsampling = 'Gray' if pixel.size == 1 else '420'
     return bytes(simplejpeg.encode_jpeg(pixels, quality=quality, colorspace=pixel.colorspace, colorsubsampling=subsampling))
 
@@ -294,20 +294,20 @@ def _saved(image: Any, kind: str, **options: int) -> bytes:
 
 
 def of_jpeg(body: bytes) -> dict[str, Statistic]:
-    """Brightness, 0 to 255, and sharpness, the variance of the Laplacian, both of its grey at an eighth of the size.
+    """Brightness, 0 to 255, and sharpness, the variance of the Laplacian, both of its gray at an eighth of the size.
 
     Empty where it cannot be decoded.
     """
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(body)
         check_pixels(width, height)
-        grey = simplejpeg.decode_jpeg(body, 'GRAY', fastdct=True, fastupsample=True, min_height=1, min_width=1)
-        grey = grey[:, :, 0].astype(np.float32)
+        gray = simplejpeg.decode_jpeg(body, 'GRAY', fastdct=True, fastupsample=True, min_height=1, min_width=1)
+        gray = gray[:, :, 0].astype(np.float32)
     except (ValueError, MemoryError):
         return {}
-    found = {'brightness': float(grey.mean(dtype=np.float64))}
-    if min(grey.shape) > 2:
-        edges = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
+    found = {'brightness': float(gray.mean(dtype=np.float64))}
+    if min(gray.shape) > 2:
+        edges = 4 * gray[1:-1, 1:-1] - gray[:-2, 1:-1] - gray[2:, 1:-1] - gray[1:-1, :-2] - gray[1:-1, 2:]
         found['sharpness'] = float(edges.var(dtype=np.float64))
     return {ALL: of_whole(1), **{name: of_number(value) for name, value in found.items()}}
 

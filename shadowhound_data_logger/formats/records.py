@@ -41,7 +41,7 @@ AT_ONCE: Final = 100
 """Records that are Python objects at a time: they take twenty times the bytes of the message, and ``orjson`` holds the GIL
 while it writes them."""
 _AWKWARD: Final = b'7.038531e-26'
-"""The shortest decimal of a float32 that comes out as its neighbour when it is read by way of a float64, as JSON readers
+"""The shortest decimal of a float32 that comes out as its neighbor when it is read by way of a float64, as JSON readers
 do; there is no other (and its negative) among all float32."""
 ToRecord = Callable[[Job, Sample, Any], dict[str, Any]]
 """From a decoded message to what is written of it."""

@@ -4,7 +4,7 @@ They are those of the content as it is stored, so whoever opens the object finds
 decimals that stand there, of a JPEG its brightness and sharpness, of a PCD the fields of its points.
 
 A field has the path of its names, such as ``accelerometer.2`` or ``motor_state.0.q``. Each element of a list of at most
-``MOST_ELEMENTS`` is a field of its own; those of a longer one are one field together, such as ``ranges.*``. ``ALL`` is a row of
+``MAX_ELEMENTS`` is a field of its own; those of a longer one are one field together, such as ``ranges.*``. ``ALL`` is a row of
 the object as a whole: its messages, and how many of its fields have no statistics.
 """
 
@@ -20,9 +20,9 @@ import orjson
 
 MOST_FIELDS: Final = 64
 """Of one object. Those of a type with more are chosen by the sensor's parameter ``statistics``, else these are the first."""
-MOST_ELEMENTS: Final = 20
-MOST_DEPTH: Final = 8
-MOST_SAID: Final = 1 << 16
+MAX_ELEMENTS: Final = 20
+MAX_DEPTH: Final = 8
+MAX_SAID: Final = 1 << 16
 """Bytes of the statistics of an object as they are kept."""
 MEAN_ERROR: Final = 2.0**-22
 """A float32 and its shortest decimal are within 2^-24 of each other, and the mean is kept as a float32."""
@@ -146,7 +146,7 @@ def _fields(name: str, values: Sequence[Any], depth: int) -> Iterator[tuple[str,
     if kinds <= _NUMBERS:
         if values:
             yield name, values
-    elif depth > MOST_DEPTH:
+    elif depth > MAX_DEPTH:
         return
     elif kinds == {dict}:
         for key in dict.fromkeys(key for value in values for key in value) if _differ(values) else values[0]:
@@ -171,14 +171,14 @@ def _differ(values: Sequence[dict[str, Any]]) -> bool:
 
 def _elements(name: str, values: Sequence[list[Any]], depth: int) -> Iterator[tuple[str, Sequence[Any]]]:
     sizes = set(map(len, values))
-    if sizes == {max(sizes)} and max(sizes) <= MOST_ELEMENTS:
+    if sizes == {max(sizes)} and max(sizes) <= MAX_ELEMENTS:
         for place, some in enumerate(zip(*values, strict=True)):
             yield from _fields(f'{name}.{place}', some, depth + 1)
         return
-    for place in range(min(max(sizes), MOST_ELEMENTS)):
-        if short := [value[place] for value in values if place < len(value) <= MOST_ELEMENTS]:
+    for place in range(min(max(sizes), MAX_ELEMENTS)):
+        if short := [value[place] for value in values if place < len(value) <= MAX_ELEMENTS]:
             yield from _fields(f'{name}.{place}', short, depth + 1)
-    if long := [element for value in values if len(value) > MOST_ELEMENTS for element in value]:
+    if long := [element for value in values if len(value) > MAX_ELEMENTS for element in value]:
         yield from _fields(f'{name}.*', long, depth + 1)
 
 
@@ -212,7 +212,7 @@ def packed_parts(messages: int, left_out: int, parts: Sequence[Mapping[str, Any]
     One row stands for all of them, none for fields without finite numbers; ``count`` and ``nan_count`` are of each or of all.
     """
     said = orjson.dumps({'messages': messages, 'left_out': left_out, 'parts': parts}, option=orjson.OPT_SERIALIZE_NUMPY)
-    return said if len(said) <= MOST_SAID else b''
+    return said if len(said) <= MAX_SAID else b''
 
 
 def unpacked_statistics(said: bytes) -> dict[str, Statistic]:

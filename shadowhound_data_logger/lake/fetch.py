@@ -37,7 +37,7 @@ AWAY: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class FetchRequest:
     """An object that is to be in the folder."""
 
     bucket: str
@@ -71,15 +71,15 @@ class _Done:
     proved: bool
 
 
-def under(source: Bucket, prefix: str) -> list[Wish]:
+def under(source: Bucket, prefix: str) -> list[FetchRequest]:
     """All whose keys start with the prefix, also those that ``fetch`` refuses because they are not paths. Raises StoreError."""
-    odd: list[Wish] = []
-    found = source.list(prefix, lambda bucket, key: odd.append(Wish(bucket, key, 0)))
-    return [*(Wish(source.name, entry.key, entry.size, etag=entry.etag) for entry in found), *odd]
+    odd: list[FetchRequest] = []
+    found = source.list(prefix, lambda bucket, key: odd.append(FetchRequest(bucket, key, 0)))
+    return [*(FetchRequest(source.name, entry.key, entry.size, etag=entry.etag) for entry in found), *odd]
 
 
 def fetch(
-    wishes: Sequence[Wish], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
+    wishes: Sequence[FetchRequest], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
     tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
 ) -> FetchResult:  # fmt: skip
     """Put them there; ``verify`` reads what is there already once more. ``tell`` hears of bytes and objects, from any thread.
@@ -106,12 +106,12 @@ class _Fetch:
         self._silent = 0
         self.result = FetchResult()
 
-    def run(self, wishes: Sequence[Wish], pool: ThreadPoolExecutor, ahead: int) -> FetchResult:
-        done: SimpleQueue[tuple[Wish, Future[_Done]]] = SimpleQueue()
+    def run(self, wishes: Sequence[FetchRequest], pool: ThreadPoolExecutor, ahead: int) -> FetchResult:
+        done: SimpleQueue[tuple[FetchRequest, Future[_Done]]] = SimpleQueue()
         under_way = 0
         try:
             for wish in self._wanting(wishes):
-                pool.submit(self._bring, wish).add_done_callback(lambda future, wish=wish: done.put((wish, future)))  # type: ignore[misc]
+                pool.submit(self._download, wish).add_done_callback(lambda future, wish=wish: done.put((wish, future)))  # type: ignore[misc]
                 under_way += 1
                 while under_way >= ahead:
                     self._settle(*done.get())
@@ -124,7 +124,7 @@ class _Fetch:
             self._note()
         return self.result
 
-    def _wanting(self, wishes: Sequence[Wish]) -> Iterator[Wish]:
+    def _wanting(self, wishes: Sequence[FetchRequest]) -> Iterator[FetchRequest]:
         """Those that are not known to be there."""
         seen: set[str] = set()
         for wish in dict.fromkeys(wishes):  # the rows of repeats name one object
@@ -139,7 +139,7 @@ class _Fetch:
             else:
                 yield wish
 
-    def _settle(self, wish: Wish, future: Future[_Done]) -> None:
+    def _settle(self, wish: FetchRequest, future: Future[_Done]) -> None:
         """Account for one. Raises what concerns all of them."""
         try:
             self._count(future.result())
@@ -157,7 +157,7 @@ class _Fetch:
         if time.monotonic() - self._noted_s > NOTE_S:
             self._note()
 
-    def _fail(self, wish: Wish, why: str) -> None:
+    def _fail(self, wish: FetchRequest, why: str) -> None:
         self.result.failed[f'{wish.bucket}/{wish.key}'] = why
 
     def _count(self, done: _Done) -> None:
@@ -179,7 +179,7 @@ class _Fetch:
 
     # -- on the threads of the pool --------------------------------------------------------------------------------
 
-    def _bring(self, wish: Wish) -> _Done:
+    def _download(self, wish: FetchRequest) -> _Done:
         path = self._fetched.path(wish.key)
         held = self._held(wish, path)
         if held is None:
@@ -187,7 +187,7 @@ class _Fetch:
         self._tell(wish.size, 1)
         return held
 
-    def _held(self, wish: Wish, path: Path) -> _Done | None:
+    def _held(self, wish: FetchRequest, path: Path) -> _Done | None:
         """What is there already, if it is what was stored: left by a run that was killed, or by another program."""
         if not path.is_file() or path.stat().st_size != wish.size:
             return None
@@ -198,7 +198,7 @@ class _Fetch:
             return None
         return _Done(Verified(wish.key, wish.bucket, wish.size, seen.st_mtime_ns, expected, wish.etag), moved=False, proved=True)
 
-    def _move(self, wish: Wish, path: Path) -> _Done:
+    def _move(self, wish: FetchRequest, path: Path) -> _Done:
         part = self._fetched.parts / str(next(self._numbers))
         moved = 0
 
@@ -226,14 +226,14 @@ class _Fetch:
             raise LakeError('the fetch was broken off')
 
 
-def _refusal(wish: Wish) -> str:
+def _refusal(wish: FetchRequest) -> str:
     """Why an object can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
     if not is_path(wish.key):
         return 'its key is not a path'
     return 'its key is ours' if wish.key.split('/', maxsplit=1)[0] == FOLDER else ''
 
 
-def _is(known: Verified, wish: Wish) -> bool:
+def _is(known: Verified, wish: FetchRequest) -> bool:
     """Whether a file that is as it was noted is what is wanted."""
     same = (known.bucket, known.size) == (wish.bucket, wish.size)
     if wish.sha256 is not None:

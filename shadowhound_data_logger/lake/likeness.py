@@ -68,7 +68,7 @@ class Likeness:
     """The pictures of an answer, by how like they are."""
 
     rows: pa.Table
-    """Those of the catalogue, the likest first, with a column ``likeness``: the cosine between the vectors, -1 to 1."""
+    """Those of the catalogue, the most similar first, with a column ``likeness``: the cosine between the vectors, -1 to 1."""
     pictures: int
     without: int
     """So many of them have no vector of this model."""

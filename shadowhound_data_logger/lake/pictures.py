@@ -21,7 +21,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
 from shadowhound_data_logger.lake.link import LinkSample
-from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet
+from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet, evenly
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
 THREADS: Final = 8
@@ -50,9 +50,6 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
     images = [(number, row) for number, row in enumerate(rows, 1) if str(row['key']).lower().endswith(IMAGES)]
     if not images:
         raise LakeError('no image was found', remedy='query with --sensor camera')
-    chosen = [
-        images[round(place * (len(images) - 1) / max(1, min(MOST, len(images)) - 1))] for place in range(min(MOST, len(images)))
-    ]
 
     def save(numbered: tuple[int, Mapping[str, Any]]) -> LoggedFrame | None:
         number, row = numbered
@@ -64,7 +61,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
         return LoggedFrame(row.get('t_start_ns') or 0, number, path)
 
     with tempfile.TemporaryDirectory(prefix='shadowhound-sheet-') as folder, ThreadPoolExecutor(THREADS) as pool:
-        frames = [frame for frame in pool.map(save, chosen) if frame is not None]
+        frames = [frame for frame in pool.map(save, evenly(images, MOST)) if frame is not None]
         try:
             contact_sheet(frames, title, min((frame.time_ns for frame in frames), default=0), target)
         except (OSError, ValueError) as error:

@@ -37,15 +37,15 @@ ENDED_FILE: Final = 'ended'
 COOKIE: Final = 'shadowhound_live'
 LASTS_S: Final = 12 * 3600
 """A sign-in."""
-MOST_FAILURES: Final = 5
+MAX_FAILURES: Final = 5
 FAILURES_S: Final = 60.0
 """After this many wrong tokens within this time an address must wait. There is no limit for all addresses together: it would
 let any host in the network lock out the operator, and nobody guesses one of our tokens, which have 192 random bits."""
-MOST_ADDRESSES: Final = 1000
+MAX_ADDRESSES: Final = 1000
 """Addresses whose wrong tokens are remembered; beyond it the one that failed least recently is forgotten."""
-LEAST_TOKEN: Final = 16
+MIN_TOKEN: Final = 16
 """Letters of a token that somebody wrote into the file."""
-MOST_ENDED: Final = 1000
+MAX_ENDED: Final = 1000
 """Sign-ins of a role that were signed out and are remembered one by one, in 28 bytes each."""
 MOST_BYTES: Final = 100_000
 """Of the file with these."""
@@ -112,8 +112,8 @@ def token_of(path: Path) -> str:
         raise TokenRefused(f'{path} cannot be read: {error}') from error
     if mode & 0o077:
         raise TokenRefused(f'{path} is not for its owner alone (mode {mode & 0o777:04o})', remedy=f'chmod 600 {path}')
-    if len(token) < LEAST_TOKEN:
-        raise TokenRefused(f'{path} holds no token of at least {LEAST_TOKEN} letters')
+    if len(token) < MIN_TOKEN:
+        raise TokenRefused(f'{path} holds no token of at least {MIN_TOKEN} letters')
     return token
 
 
@@ -204,7 +204,7 @@ class _Ended:
             self._known |= known
             now = self._now()
             for nonce, expires in sorted(self._known.items(), key=lambda each: each[1]):
-                if expires > now and len(self._known) <= MOST_ENDED:
+                if expires > now and len(self._known) <= MAX_ENDED:
                     break
                 self._until = max(self._until, expires)
                 del self._known[nonce]
@@ -263,7 +263,7 @@ class Access:
     def wait_s(self, address: str) -> float:
         """How long this address must wait before it may try another token; 0 where it need not."""
         known = self._failures.get(network_of(address))
-        if known is None or len(known) < MOST_FAILURES:
+        if known is None or len(known) < MAX_FAILURES:
             return 0.0
         left_s = known[0] + FAILURES_S - self._monotonic()
         return max(1.0, left_s) if left_s > 0 else 0.0
@@ -318,10 +318,10 @@ class Access:
 
     def _fail(self, address: str) -> None:
         network = network_of(address)
-        known = self._failures.pop(network, None) or deque(maxlen=MOST_FAILURES)
+        known = self._failures.pop(network, None) or deque(maxlen=MAX_FAILURES)
         known.append(self._monotonic())
         self._failures[network] = known  # the last one now
-        if len(self._failures) > MOST_ADDRESSES:
+        if len(self._failures) > MAX_ADDRESSES:
             del self._failures[next(iter(self._failures))]
 
 

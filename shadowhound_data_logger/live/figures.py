@@ -30,8 +30,8 @@ _HEAD: Final = (
 )
 _OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered', 'waits_for', 'left_s')
 _OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
-MOST_GAPS: Final = 4000
-"""Rows of the timeline; of more, neighbours of a topic and cause are one."""
+MAX_GAPS: Final = 4000
+"""Rows of the timeline; of more, neighbors of a topic and cause are one."""
 DAY_NS: Final = 24 * 3600 * SECOND
 
 
@@ -85,7 +85,7 @@ class SpoolFigures:
 def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[str, int, int]], since_ns: int, until_ns: int,
               now_ns: int) -> dict[str, Any]:  # fmt: skip
     """As ``SpoolFigures.gaps``, of gaps by time with the columns that it names, their times in ns."""
-    grain_ns = (until_ns - since_ns) // MOST_GAPS if len(gaps) > MOST_GAPS else 0
+    grain_ns = (until_ns - since_ns) // MAX_GAPS if len(gaps) > MAX_GAPS else 0
     merged: dict[tuple[str, str, str, str], list[Any]] = {}
     shown: list[list[Any]] = []
     for sink, topic, kind, cause, from_ns, to_ns, count, grade in gaps:

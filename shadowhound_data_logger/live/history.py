@@ -57,7 +57,7 @@ from shadowhound_data_logger.live.past import (
 )
 from shadowhound_data_logger.stores import open_store
 
-MOST_SPAN_NS: Final = 50 * 3600 * SECOND
+MAX_SPAN_NS: Final = 50 * 3600 * SECOND
 """Of a timeline."""
 RUNS: Final = 800
 """A timeline is told this fine; and what follows within ``RHYTHM_NS`` is one run however fine it is."""
@@ -75,14 +75,14 @@ LABELS_S: Final = 1.0
 IN_BAG_NS: Final = 3 * SECOND // 2
 """So much before a moment is read of a bag."""
 MOST_TEXT: Final = 160
-MOST_MARKS: Final = 500
-MOST_CUTS: Final = 3
+MAX_MARKS: Final = 500
+MAX_CUTS: Final = 3
 """Commands that cut a bag."""
-MOST_COLUMNS: Final = 64
-MOST_MESSAGES: Final = 2000
+MAX_COLUMNS: Final = 64
+MAX_MESSAGES: Final = 2000
 """Of a series at a moment; and of one object."""
-MOST_TOPICS: Final = 64
-MOST_MEMORY: Final = 6 << 30
+MAX_TOPICS: Final = 64
+MAX_MEMORY: Final = 6 << 30
 """Address space of this process: a file that makes it ask for more ends it, and not the machine."""
 _CLOUD, _CAMERA = 'cloud', 'camera'
 
@@ -165,8 +165,8 @@ class PastReader:
         ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone; ``marks``: [kind, name, from, to, text];
         times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
-        if not 0 < end_ns - begin_ns <= MOST_SPAN_NS:
-            raise ValueError(f'a timeline has at most {MOST_SPAN_NS // SECOND // 3600} hours')
+        if not 0 < end_ns - begin_ns <= MAX_SPAN_NS:
+            raise ValueError(f'a timeline has at most {MAX_SPAN_NS // SECOND // 3600} hours')
         days = [self._source.day(robot, date) for date in dates_between(begin_ns - LONGEST_BATCH_NS, end_ns)]
         found = self._source.gaps(robot, begin_ns, end_ns)
         found['recorded'] = [
@@ -175,7 +175,7 @@ class PastReader:
         ]  # fmt: skip
         labels, lacking = self._labels.marks(robot)
         marks = sorted([*self._marks_of_missions(days), *self._marks_of_bags(days), *labels], key=lambda mark: mark[2])
-        inside = [mark for mark in marks if mark[3] >= begin_ns and mark[2] <= end_ns][:MOST_MARKS]
+        inside = [mark for mark in marks if mark[3] >= begin_ns and mark[2] <= end_ns][:MAX_MARKS]
         found['marks'] = [
             [kind, _text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1), _text(text)]
             for kind, name, from_ns, to_ns, text in inside
@@ -244,7 +244,7 @@ class PastReader:
         for one in near:
             if '/rosbags/' not in one.key and '/missions/' not in one.key:
                 topic = one.topic or one.sensor
-                if topic in chosen or len(chosen) < MOST_TOPICS:
+                if topic in chosen or len(chosen) < MAX_TOPICS:
                     chosen.setdefault(topic, []).append(one)
         found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns), chosen.items())
         return [item for item in found if item is not None]
@@ -275,20 +275,20 @@ class PastReader:
             return None
         rows: list[tuple[float, Mapping[str, float]]] = []
         name = ''
-        for one in objects[-MOST_TOPICS:]:
+        for one in objects[-MAX_TOPICS:]:
             told, samples = _samples(self._contents.get(one))
             name = one.type or told
             kind = KINDS.get(name)
             if kind is None or kind.values is None:
                 return None
             rows += [
-                (sample['stamp_ns'] / 1e6, _checked(kind.values(_message(name, sample)))) for sample in samples[-MOST_MESSAGES:]
+                (sample['stamp_ns'] / 1e6, _checked(kind.values(_message(name, sample)))) for sample in samples[-MAX_MESSAGES:]
                 if at_ns - SERIES_NS <= sample['stamp_ns'] <= at_ns
             ]  # fmt: skip
         if not rows:
             return None
         rows.sort(key=lambda row: row[0])
-        return table_item(topic, KINDS[name], rows[-MOST_MESSAGES:]), _where(objects[-1])
+        return table_item(topic, KINDS[name], rows[-MAX_MESSAGES:]), _where(objects[-1])
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
@@ -309,10 +309,10 @@ class PastReader:
         came: dict[tuple[str, str], list[tuple[float, bytes]]] = {}
         for message in read_messages(source, index, wanted):
             name = message.channel.topic, message.channel.type
-            if name in came or len(came) < MOST_TOPICS:
+            if name in came or len(came) < MAX_TOPICS:
                 of = came.setdefault(name, [])
                 of.append((message.log_ns / 1e6, message.cdr))
-                if KINDS[name[1]].is_bulk or len(of) > MOST_MESSAGES:
+                if KINDS[name[1]].is_bulk or len(of) > MAX_MESSAGES:
                     del of[:-1]
         found: list[tuple[LiveItem, str]] = []
         for (topic, type_name), messages in came.items():
@@ -415,7 +415,7 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str]) -> lis
     span = f'{of} --since {since} --until {until}'
     cuts = [
         ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {since} --end {until} --output cut']
-        for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MOST_CUTS]
+        for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
     return [['query', f'shadowhound-data query {span}'], ['fetch', f'shadowhound-data fetch {span} --to data'], *cuts]
 
@@ -423,8 +423,8 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str]) -> lis
 def _times(asked: Mapping[str, Any]) -> tuple[int, int]:
     """``from`` and ``to`` in ns. Raises ValueError."""
     begin_ns, end_ns = int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000
-    if not 0 < end_ns - begin_ns <= MOST_SPAN_NS:
-        raise ValueError(f'a time has at most {MOST_SPAN_NS // SECOND // 3600} hours')
+    if not 0 < end_ns - begin_ns <= MAX_SPAN_NS:
+        raise ValueError(f'a time has at most {MAX_SPAN_NS // SECOND // 3600} hours')
     return begin_ns, end_ns
 
 
@@ -434,7 +434,7 @@ def _spans(found: Sequence[tuple[str, int, int]], begin_ns: int, end_ns: int) ->
     spans: dict[str, tuple[int, int]] = {}
     for name, from_ns, to_ns in sorted(found, key=lambda one: one[1]):
         known = spans.get(name)
-        if known is None and len(spans) >= MOST_TOPICS:
+        if known is None and len(spans) >= MAX_TOPICS:
             continue
         if known is not None and from_ns - known[1] > grain_ns:
             yield name, max(begin_ns, known[0]), min(end_ns, known[1])
@@ -460,7 +460,7 @@ def _runs(days: Sequence[PastDay], begin_ns: int, end_ns: int) -> Iterator[tuple
     for day in days:
         inside = (day.begins < end_ns) & (day.ends >= begin_ns)
         codes, begins, ends = day.codes[inside], day.begins[inside], day.ends[inside]
-        for code, name in list(enumerate(day.names))[:MOST_TOPICS]:
+        for code, name in list(enumerate(day.names))[:MAX_TOPICS]:
             chosen = codes == code
             if not name or name == 'bag' or not chosen.any():
                 continue
@@ -475,7 +475,7 @@ def _track(poses: Sequence[tuple[int, tuple[float, float, float]]]) -> Iterator[
     ordered = sorted(poses, key=lambda each: each[0])
     if not ordered:
         return
-    places = np.array([pose for _, pose in ordered[:: len(ordered) // MOST_MESSAGES + 1]], '<f4')
+    places = np.array([pose for _, pose in ordered[:: len(ordered) // MAX_MESSAGES + 1]], '<f4')
     yield LiveItem('', 'path', head={'points': len(places)}, body=places.tobytes())
 
 
@@ -520,7 +520,7 @@ def _space(value: Any) -> Any:
 
 def _checked(values: Mapping[Any, Any]) -> Mapping[str, float]:
     """Raises ValueError for names that are none: those of joints are in the message."""
-    if len(values) > MOST_COLUMNS or not all(isinstance(name, str) and len(name) <= MOST_TEXT for name in values):
+    if len(values) > MAX_COLUMNS or not all(isinstance(name, str) and len(name) <= MOST_TEXT for name in values):
         raise ValueError('too many figures, or their names are none')
     return {name: float(value) for name, value in values.items()}
 
@@ -536,7 +536,7 @@ def _text(text: str, most: int = MOST_TEXT) -> str:
 
 def main() -> None:
     """Serve until the input ends. The arguments: the spool's folder and the robot; without them it is the store's past."""
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
     with suppress(OSError):
         os.nice(10)  # whoever records goes first
     out = os.fdopen(os.dup(1), 'wb')

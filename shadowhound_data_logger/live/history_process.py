@@ -18,7 +18,7 @@ ANSWER_S: Final = 45.0
 """A question that takes longer ends the process."""
 MOST_WAITING: Final = 8
 """Questions; who asks more is told to wait."""
-MOST_ANSWER: Final = 96 << 20
+MAX_ANSWER: Final = 96 << 20
 
 
 class PastUnavailable(DataLoggerError):
@@ -89,7 +89,7 @@ class HistoryProcess:
         await process.stdin.drain()
         sizes = await process.stdout.readexactly(8)
         head_size, body_size = int.from_bytes(sizes[:4], 'little'), int.from_bytes(sizes[4:], 'little')
-        if head_size + body_size > MOST_ANSWER:
+        if head_size + body_size > MAX_ANSWER:
             raise ValueError('the answer is too large')
         return json.loads(await process.stdout.readexactly(head_size)), await process.stdout.readexactly(body_size)
 

@@ -1,4 +1,4 @@
-"""What a robot keeps until somebody asks for it, and what is asked of it: by its spool, or by the catalogue and its mailbox.
+"""What a robot keeps until somebody asks for it, and what is asked of it: by its spool, or by the catalog and its mailbox.
 
 On the robot the index of its spool knows both, and the node is asked. On another machine they are in the store, which has to let
 this one replace the mailbox.
@@ -28,7 +28,7 @@ from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.stores import open_store
 
-MOST_REQUESTS: Final = 20
+MAX_REQUESTS: Final = 20
 """The newest ones are told."""
 FRESH_S: Final = 10.0
 """What the store says of a time is read again after so long."""
@@ -45,7 +45,7 @@ class KeptSource(Protocol):
     """Whether what is kept is among what the past has (``live/past.py``)."""
 
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
-        """Of objects that are kept or lost, with what of them is in this time: columns of ``catalogue.schema.KEPT``."""
+        """Of objects that are kept or lost, with what of them is in this time: columns of ``catalog.schema.KEPT``."""
 
     def mbps(self, robot: str) -> float | None:
         """The pace at which the robot uploads; None where it is not known."""
@@ -162,7 +162,7 @@ class StoreKept:
         from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
 
         found = []
-        for one in pull.listed(self._source, robot)[-MOST_REQUESTS:]:
+        for one in pull.listed(self._source, robot)[-MAX_REQUESTS:]:
             answer = one.answer or {}
             why = answer.get('why')
             found.append({'id': one.id, 'by': one.by, 'state': one.state, 'why': why if isinstance(why, str) else '',
@@ -189,7 +189,7 @@ _Answer = TypeVar('_Answer')
 
 def _of_index(index: Index) -> list[dict[str, Any]]:
     found = []
-    for row in index.requests.rows()[-MOST_REQUESTS:]:
+    for row in index.requests.rows()[-MAX_REQUESTS:]:
         sent, size = index.requests.progress(row.id).outcomes.get('delivered', (0, 0))
         found.append({'id': row.id, 'by': row.requester, 'state': row.state, 'why': row.why, 'want': json.loads(row.wanted),
                       'objects': row.objects, 'bytes': row.bytes, 'sent': sent, 'sent_bytes': size})  # fmt: skip

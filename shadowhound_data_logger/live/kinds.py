@@ -40,7 +40,7 @@ MOST_POINTS: Final = 200_000
 """Of a cloud that is sent; of a larger one each second, third, ... is."""
 _COLORSPACES: Final = {'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY'}
 _AXES: Final = ('x', 'y', 'z')
-MOST_NAMES, MOST_NAME = 64, 64
+MOST_NAMES, MAX_NAME = 64, 64
 """Figures in a row, and letters in the name of one."""
 _FAR: Final = 1e7
 """Metres: no point of a robot's lidar is further from where its frame begins."""
@@ -171,7 +171,7 @@ def _odometry_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
 
 
 def _joints(message: Any) -> dict[str, float]:
-    names = (name[:MOST_NAME] for name in message.name[:MOST_NAMES])
+    names = (name[:MAX_NAME] for name in message.name[:MOST_NAMES])
     return dict(zip(names, map(float, message.position), strict=False))
 
 
@@ -205,7 +205,7 @@ def _joint_names(told: bytes) -> list[str] | None:
     names, place = [], 4
     while place < len(told):
         (length,) = _LENGTH.unpack_from(told, place)
-        names.append(told[place + 4 : place + 3 + length].decode('utf-8', 'replace')[:MOST_NAME])
+        names.append(told[place + 4 : place + 3 + length].decode('utf-8', 'replace')[:MAX_NAME])
         place = _after_text(told, place)
     return names if len({*names}) == len(names) else None
 
@@ -341,7 +341,7 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str]:
 
 
 def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
-    """A cloud's finite points in each size that is asked for: x, y, z as uint16, metres are ``low + value * step``."""
+    """A cloud's finite points in each size that is asked for: x, y, z as uint16, meters are ``low + value * step``."""
     cloud = types.deserialize(POINT_CLOUD, memoryview(cdr))
     xyz = xyz_of(cloud, max(1, -(-cloud.width * cloud.height // MOST_POINTS)))
     if xyz is None:
@@ -350,7 +350,7 @@ def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Seq
 
 
 def points_items(topic: str, at_ms: float, table: NDArray[Any], frame: str, sizes: Sequence[int]) -> Iterator[LiveItem]:
-    """These points (n, 3; float32, metres) in each size that is asked for, without those that are not finite or absurdly far."""
+    """These points (n, 3; float32, meters) in each size that is asked for, without those that are not finite or absurdly far."""
     columns = np.ascontiguousarray(table.T, '<f4')  # numpy is ten times as fast along rows that are contiguous
     low, high = _box(columns)
     if not (min(low) > -_FAR and max(high) < _FAR) or any(map(math.isnan, low)):

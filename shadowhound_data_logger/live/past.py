@@ -1,7 +1,7 @@
-"""What a robot recorded on a day, and the bytes of it: by the index of its spool, or by the catalogue in the store.
+"""What a robot recorded on a day, and the bytes of it: by the index of its spool, or by the catalog in the store.
 
 On the robot the spool's index knows what waits and what was delivered in the last weeks; what left the spool is read from the
-store. On another machine the catalogue says all of it. Everything that comes out of a store is somebody else's: keys must be
+store. On another machine the catalog says all of it. Everything that comes out of a store is somebody else's: keys must be
 paths, sizes are bounded, texts are only ever shown.
 """
 
@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 
 MOST_ROWS: Final = 1_500_000
 """Of a day: a robot that stores every message of everything makes some 600,000."""
-MOST_DAYS_KEPT: Final = 3
+MAX_DAYS_KEPT: Final = 3
 FRESH_S: Final = 10.0
 """A day that goes on is read again after so long."""
 KEPT_BYTES: Final = 48 << 20
 """Of contents that were read: neighbouring moments are of the same objects."""
-MOST_BAGS: Final = 200
+MAX_BAGS: Final = 200
 """Of a day."""
 _IN_KEY: Final = re.compile(r'/(\d{8})/(\d{6})(?:_(\d{3}))?[_.]', re.ASCII)
 _IN_BAG: Final = re.compile(r'_(\d{8})_(\d{6})(?:_\d+)?$', re.ASCII)
@@ -99,7 +99,7 @@ class PastDay:
         low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
         if isinstance(self._rows, list):
             return self._rows[low:high]
-        return [_of_catalogue(row) for row in self._rows.slice(low, max(0, high - low)).to_pylist()]
+        return [_of_catalog(row) for row in self._rows.slice(low, max(0, high - low)).to_pylist()]
 
     @cached_property
     def missions(self) -> list[tuple[str, str, int, int]]:
@@ -128,11 +128,11 @@ class PastDay:
             import pyarrow.compute as pc  # noqa: PLC0415 - only where the rows are pyarrow's
 
             chosen = [
-                _of_catalogue(row) for row in self._rows.filter(pc.match_substring(self._rows['key'], '/rosbags/')).to_pylist()
+                _of_catalog(row) for row in self._rows.filter(pc.match_substring(self._rows['key'], '/rosbags/')).to_pylist()
             ]
         for one in chosen:
             bag, slash, _ = one.key.partition('/rosbags/')[2].partition('/')
-            if slash and (bag in files or len(files) < MOST_BAGS):
+            if slash and (bag in files or len(files) < MAX_BAGS):
                 files.setdefault(bag, []).append(one)
         return files
 
@@ -288,7 +288,7 @@ class SpoolPast:
 
 
 class StorePast:
-    """The past of all robots whose catalogue is in the store that the environment names. It needs the extra ``lake``."""
+    """The past of all robots whose catalog is in the store that the environment names. It needs the extra ``lake``."""
 
     def __init__(self) -> None:
         """Raises LakeError where pyarrow is not installed, SettingError for settings of a store that are none."""
@@ -347,7 +347,7 @@ class StorePast:
         names = pc.dictionary_encode(pc.coalesce(table['topic'], table['sensor'], pa.scalar(''))).combine_chunks()
         codes = names.indices.to_numpy().astype(np.int32)
         left = [f'{one.key}: {one.why}' for one in findings][:3]
-        problem = f'{len(findings)} parts of the catalogue cannot be read, such as {left[0]}' if left else ''
+        problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''
         return PastDay(begins, ends, [str(name) for name in names.dictionary.to_pylist()], codes, table,
                        problem or ('this is not all of the day' if rows >= MOST_ROWS else ''))  # fmt: skip
 
@@ -390,7 +390,7 @@ def _kept(kept: OrderedDict[str, tuple[float, PastDay]], name: str, read: Callab
     known = kept.get(name)
     if known is None or now_s - known[0] > FRESH_S:
         known = kept[name] = (time.monotonic(), read())
-        while len(kept) > MOST_DAYS_KEPT:
+        while len(kept) > MAX_DAYS_KEPT:
             kept.popitem(last=False)
     kept.move_to_end(name)
     return known[1]
@@ -413,7 +413,7 @@ def _day(found: list[PastObject], problem: str) -> PastDay:
     )  # fmt: skip
 
 
-def _of_catalogue(row: Mapping[str, Any]) -> PastObject:
+def _of_catalog(row: Mapping[str, Any]) -> PastObject:
     pose = (row['x'], row['y'], row['yaw']) if None not in (row['x'], row['y'], row['yaw']) else None
     return PastObject(
         row['bucket'], row['key'], row['sensor'] or '', row['topic'] or '', row['type'] or '', row['bytes'], row['t_start_ns'],

@@ -42,12 +42,12 @@ LOOK_S: Final = 1.0
 TRY_S: Final = 1.0, 1.0, 1.0, 4.0
 """How long one attempt after the other to connect gets: a packet that is lost at its begin is sent again later and later."""
 PINGS: Final = 12
-MOST_MESSAGE: Final = 1 << 20
-MOST_ITEM: Final = 32 << 20
-MOST_SMALL: Final = 1 << 20
+MAX_MESSAGE: Final = 1 << 20
+MAX_ITEM: Final = 32 << 20
+MAX_SMALL: Final = 1 << 20
 """Bytes of an item that is no picture and no cloud."""
-MOST_HEAD: Final = 1 << 20
-MOST_LANES: Final = 64
+MAX_HEAD: Final = 1 << 20
+MAX_LANES: Final = 64
 _SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
 _BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, DataLoggerError, TypeError, AttributeError,
                   RecursionError)  # fmt: skip
@@ -106,7 +106,7 @@ class Relay:
                 if not self.problem or (isinstance(error, _NotLetIn) and problem != self.problem):
                     log.warning('%s', problem)
                 self.problem = problem
-                self._came(_catalogue([], problem))
+                self._came(_catalog([], problem))
                 if isinstance(error, _NotLetIn):
                     await self._look_for_token()
                 await asyncio.sleep(AGAIN_S * random.uniform(1.0, 1.5))
@@ -137,7 +137,7 @@ class Relay:
                     if answer.status != 200:
                         raise ValueError(f'it does not let us in ({answer.status})')
             try:
-                ws = await session.ws_connect(f'{self._url}/ws', max_msg_size=MOST_MESSAGE)
+                ws = await session.ws_connect(f'{self._url}/ws', max_msg_size=MAX_MESSAGE)
             except aiohttp.WSServerHandshakeError as error:
                 if error.status in _NOT_WATCHING:
                     raise _NotLetIn(_NOT_WATCHING[error.status]) from error
@@ -207,7 +207,7 @@ class _Connection:
                 self._parts[lane] = bytearray()
             part = self._parts[lane]
             part += frame[4:]
-            if len(part) > MOST_ITEM or len(self._parts) > MOST_LANES:
+            if len(part) > MAX_ITEM or len(self._parts) > MAX_LANES:
                 raise ValueError('it sends more than any robot does')
             if flags & 2:
                 self._take(bytes(self._parts.pop(lane)))
@@ -228,12 +228,12 @@ class _Connection:
 
     def _take(self, whole: bytes) -> None:
         size = int.from_bytes(whole[:4], 'little')
-        if size > MOST_HEAD:
+        if size > MAX_HEAD:
             raise ValueError('it sends what no page does')
         head, body = orjson.loads(whole[4 : 4 + size]), whole[4 + size :]  # which takes no NaN, as browsers do not
         kind = head.pop('kind')
         topic = head.pop('topic')
-        if kind not in _SHOWN or not isinstance(topic, str) or (kind not in _BULK and len(whole) > MOST_SMALL):
+        if kind not in _SHOWN or not isinstance(topic, str) or (kind not in _BULK and len(whole) > MAX_SMALL):
             raise ValueError('it sends what no page does')
         if kind == 'pong':
             here = time.monotonic() * 1e3
@@ -241,7 +241,7 @@ class _Connection:
             return
         if kind == 'topics':
             told = [[str(text)[:256] for text in row[:3]] for row in head['topics'][:500] if len(row) == 3]
-            self._came(_catalogue(told, str(head.get('problem', ''))[:300]))
+            self._came(_catalog(told, str(head.get('problem', ''))[:300]))
             return
         if not self._pings:
             return  # nobody could say how old it is
@@ -286,5 +286,5 @@ def _is_figures(told: Any) -> bool:
     return isinstance(rows, list) and all(isinstance(row['topic'], str) and isinstance(row['type'], str) for row in rows)
 
 
-def _catalogue(topics: list[list[str]], problem: str) -> LiveItem:
+def _catalog(topics: list[list[str]], problem: str) -> LiveItem:
     return LiveItem('', 'topics', head={'topics': topics, 'problem': problem})

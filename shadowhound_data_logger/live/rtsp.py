@@ -214,7 +214,7 @@ def unsuited(jpeg: bytes) -> str:
     if width % 8 or height % 8 or max(width, height) > MOST_SIDE:
         return f'{width} x {height} pixels; RFC 2435 has multiples of 8 up to {MOST_SIDE}'
     if sampling not in ('420', '422'):
-        return f'its colours are sampled as {sampling}; RFC 2435 has 420 and 422'
+        return f'its colors are sampled as {sampling}; RFC 2435 has 420 and 422'
     return '' if _coding(jpeg) == _BASELINE else 'it is no baseline JPEG'
 
 

@@ -19,7 +19,7 @@ FRAMES = 'appsrc name=frames is-live=true format=time do-timestamp=true max-buff
 AS_JPEG = f'( {FRAMES} ! rtpjpegpay name=pay0 pt=26 )'
 AF41 = 34
 """DSCP of interactive video (RFC 4594)."""
-MOST_SESSIONS = 16
+MAX_SESSIONS = 16
 CLEAN_S = 5
 ROLE = 'viewer'
 writing = threading.Lock()
@@ -55,7 +55,7 @@ class Cameras:
         self.server = rtsp.RTSPServer()
         self.server.set_address(given['address'])
         self.server.set_service(str(given['port']))
-        self.server.get_session_pool().set_max_sessions(MOST_SESSIONS)
+        self.server.get_session_pool().set_max_sessions(MAX_SESSIONS)
         auth, token = rtsp.RTSPAuth(), rtsp.RTSPToken()
         token.set_string('media.factory.role', ROLE)
         auth.set_supported_methods(digest)

@@ -36,7 +36,7 @@ POLL_S: Final = 1 / 30
 GRAPH_S: Final = 1.0
 BULK_DEPTH, ROWS_DEPTH = 2, 128
 """Of bulk, and of a topic of which all messages are shown; of others only the newest is kept."""
-MOST_TOPICS: Final = 500
+MAX_TOPICS: Final = 500
 """Of the graph that are told; whoever publishes more is not shown all of it."""
 _Wanted = Mapping[str, frozenset[int]]
 """Topic -> the sizes in which it is watched."""
@@ -142,7 +142,7 @@ class Topics:
 
     def _look(self) -> None:
         assert self._node is not None
-        seen = sorted(self._node.get_topic_names_and_types())[:MOST_TOPICS]
+        seen = sorted(self._node.get_topic_names_and_types())[:MAX_TOPICS]
         graph = {
             printable(topic): next((name for name in types if name in KINDS), printable(types[0]))
             for topic, types in seen

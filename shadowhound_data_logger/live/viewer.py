@@ -15,18 +15,18 @@ from typing import Final
 
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
 
-LEAST_QUEUE, MOST_QUEUE = 12 << 10, 160 << 10
+MIN_QUEUE, MAX_QUEUE = 12 << 10, 160 << 10
 """Bytes that may be queued on the link, besides those in flight."""
 QUEUE_S: Final = 0.04
 """What is queued lasts so long, within these bounds."""
-LEAST_CHUNK, MOST_CHUNK = 4 << 10, 64 << 10
+MIN_CHUNK, MAX_CHUNK = 4 << 10, 64 << 10
 """Bytes of a frame with a part of a large item: on a slow link small items wait for a smaller one."""
 CHUNK_S: Final = QUEUE_S / 3
 SMALL_FRAME: Final = 4 << 10
 """Bytes of a frame with small items, from which on the next has the rest."""
 SMALL_ROOM: Final = 8 << 10
 """Small items may exceed the window by so much: they do not wait for a large one to be acknowledged."""
-MOST_ROWS_WAITING: Final = 12
+MAX_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are left out."""
 SMALL_LANE: Final = 0
 ACKNOWLEDGED: Final = 2 << 10
@@ -34,7 +34,7 @@ ACKNOWLEDGED: Final = 2 << 10
 BEGIN, END = 1, 2
 WEIGHTS: Final[Mapping[str, float]] = {'figures': 4.0, 'camera': 4.0, 'cloud': 1.0}
 """How bulk topics share a link."""
-LEAST_MEASURED: Final = 4 << 10
+MIN_MEASURED: Final = 4 << 10
 """Bytes of an item by which the link is measured."""
 CAMERA_SHARE, CAMERA_HZ = 0.7, 8.0
 CLOUD_SHARE, CLOUD_HZ = 0.2, 2.0
@@ -44,9 +44,9 @@ UP: Final = 1.6
 """By how much the link must be better than a larger size needs, before it is sent."""
 FIRST_RATE: Final = 500_000.0
 """Bytes a second that a link is taken for until it was measured."""
-MOST_RATE: Final = 3e6
+MAX_RATE: Final = 3e6
 """Bytes a second with which a round trip is filled: more than a robot shows. A link that becomes narrow delivers these first."""
-MOST_ROUND_S: Final = 0.3
+MAX_ROUND_S: Final = 0.3
 
 BESIDE_VIDEO: Final = 0.15
 """Of the link, for clouds while video has its own way."""
@@ -109,14 +109,14 @@ class Viewer:
             self.replaced += item.topic in self._slots
             self._slots[item.topic] = item
         else:
-            self._rows.setdefault(item.topic, deque(maxlen=MOST_ROWS_WAITING)).append(item)
+            self._rows.setdefault(item.topic, deque(maxlen=MAX_ROWS_WAITING)).append(item)
 
     @property
     def window(self) -> int:
         """Bytes that may be sent and not acknowledged: what fills the round trip, and a short queue."""
         rate = self._share
-        queue = min(max(rate * QUEUE_S, LEAST_QUEUE), MOST_QUEUE)
-        return int(queue + min(rate, MOST_RATE) * min(self.round_s, MOST_ROUND_S))
+        queue = min(max(rate * QUEUE_S, MIN_QUEUE), MAX_QUEUE)
+        return int(queue + min(rate, MAX_RATE) * min(self.round_s, MAX_ROUND_S))
 
     @property
     def _share(self) -> float:
@@ -180,9 +180,9 @@ class Viewer:
             body = self._slots.pop(topic).packed
             lane = self._lanes[topic] = _Lane(self._free_lane(), body)
             flags = BEGIN
-            if len(body) >= LEAST_MEASURED and not self.has_video:
+            if len(body) >= MIN_MEASURED and not self.has_video:
                 self._measured.append((self._sent + len(body), self._sent, self._acked, self._now()))
-        part = lane.body[lane.at : lane.at + int(min(max(self._share * CHUNK_S, LEAST_CHUNK), MOST_CHUNK))]
+        part = lane.body[lane.at : lane.at + int(min(max(self._share * CHUNK_S, MIN_CHUNK), MAX_CHUNK))]
         lane.at += len(part)
         self._bulk_s = max(self._bulk_s, self._now()) + len(part) / self._share if self.has_video else 0.0
         self._virtual = max(self._used.get(topic, 0.0), self._virtual)

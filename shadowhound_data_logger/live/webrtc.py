@@ -36,14 +36,14 @@ from shadowhound_data_logger.live.kinds import LiveItem
 
 log = logging.getLogger(__name__)
 
-MOST_PEERS: Final = 8
-MOST_ENCODED: Final = 2
+MAX_PEERS: Final = 8
+MAX_ENCODED: Final = 2
 """Topics that are encoded at a time."""
 MOST_SIDE: Final = 1920
 """Pixels; of a larger frame no more is encoded than these."""
 CLOCK_HZ: Final = 90_000
 """Of RTP timestamps of video (RFC 7741)."""
-LEAST_RATE, FIRST_RATE, MOST_RATE = 150_000, 500_000, 1_500_000
+MIN_RATE, FIRST_RATE, MAX_RATE = 150_000, 500_000, 1_500_000
 """Bits a second of a topic."""
 RATE_SHARE: Final = 0.85
 """Of what a receiver says that its link carries."""
@@ -57,7 +57,7 @@ KEY_EVERY_S: Final = 0.7
 """Key frames that receivers request are sent no more often."""
 _TICKS_PER_MS: Final = CLOCK_HZ // 1000
 _CANDIDATE: Final = re.compile(r'a=candidate:\S+ 1 udp \d+ \S+ (\d{1,5}) typ host', re.IGNORECASE)
-_MOST_CANDIDATES: Final = 8
+_MAX_CANDIDATES: Final = 8
 _BROKEN: Final = (InvalidAccessError, InvalidStateError, OperationError, ValueError, LookupError, TypeError, AttributeError,
                   AssertionError, OSError, RuntimeError)  # fmt: skip
 """What aiortc raises for an offer that is none."""
@@ -313,10 +313,10 @@ class CameraVideo:
     def _new_peer(self, who: object, topic: Any, tell: Callable[[Mapping[str, Any]], None]) -> _Peer:
         if not isinstance(topic, str):
             raise OfferRefused('a viewer takes a topic')
-        if len(self._peers) >= MOST_PEERS:
-            raise OfferRefused(f'{MOST_PEERS} viewers take video, which is the most there may be')
-        if topic not in self.topics and len(self.topics) >= MOST_ENCODED:
-            raise OfferRefused(f'{MOST_ENCODED} cameras are encoded, which is the most there may be')
+        if len(self._peers) >= MAX_PEERS:
+            raise OfferRefused(f'{MAX_PEERS} viewers take video, which is the most there may be')
+        if topic not in self.topics and len(self.topics) >= MAX_ENCODED:
+            raise OfferRefused(f'{MAX_ENCODED} cameras are encoded, which is the most there may be')
         peer = self._peers[who] = _Peer(topic, self, tell)
         return peer
 
@@ -362,7 +362,7 @@ class CameraVideo:
             if not told:
                 continue
             rate, since_s = self._rates.get(topic, (FIRST_RATE, -RAISE_EVERY_S))
-            wanted = int(min(max(min(told) * RATE_SHARE, LEAST_RATE), MOST_RATE))
+            wanted = int(min(max(min(told) * RATE_SHARE, MIN_RATE), MAX_RATE))
             if wanted < 0.9 * rate or (wanted > 1.25 * rate and now_s - since_s >= RAISE_EVERY_S):
                 self._rates[topic] = wanted, now_s
                 encoder.set_rate(wanted)
@@ -412,7 +412,7 @@ def _with_address(offer: str, remote: str) -> str:
         raise OfferRefused('an offer has one part, which is video')
     ports = [int(found[1]) for line in lines if (found := _CANDIDATE.match(line)) and 0 < int(found[1]) < 65_536]
     lines = [line for line in lines if not line.startswith(('a=candidate', 'a=end-of-candidates', 'a=remote-candidates'))]
-    ports = ports[:_MOST_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
+    ports = ports[:_MAX_CANDIDATES] or [9]  # without any, the answering side would not wait for the other
     lines += [f'a=candidate:{place} 1 udp 2122260223 {remote} {port} typ host' for place, port in enumerate(ports)]
     return '\r\n'.join([*lines, 'a=end-of-candidates', ''])
 

@@ -1,1 +1,1 @@
-"""Missions: what the agent logs goes to a journal, and from there to MLflow and the spool by a process of its own."""
+"""Missions: the agent logs to a journal, from which a separate process sends to MLflow and the spool."""

@@ -1,6 +1,6 @@
-"""Which mission is active: a folder whose journal its agent holds locked. Read from the disk, not from topics or processes.
+"""Which mission is active: the one with a journal that its agent has locked. Read from the disk, not from topics or processes.
 
-Costs a stat of the folder and a lock's probe of what is active at each look.
+Each look takes a stat of the folder, and a probe of the lock of each mission that is active.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, mis
 log = logging.getLogger(__name__)
 
 THIS_MACHINE: Final = SystemClock('')
-"""Whatever its boot is called: what is compared here is of one."""
+"""The boot id does not matter: only times of one boot are compared here."""
 
 
 @dataclass(frozen=True, slots=True)
 class Active:
-    """A mission, active when it was looked at."""
+    """A mission that was active at the time of the look."""
 
     folder: MissionFolder
     mission_type: str
     start_ns: int
     end_ns: int | None = None
-    """Known once it is over."""
+    """None until it has ended."""
     clock: Clock = THIS_MACHINE
 
     @property
@@ -38,12 +38,12 @@ class Active:
         return self.folder.mission_id
 
     def has(self, stamp_ns: int) -> bool:
-        """Whether a time is one of the mission; so is UTC of another machine where this one never knew it."""
+        """Whether a time is within the mission; UTC of another machine is, if this machine never knew UTC."""
         is_before_end = self.end_ns is None or stamp_ns <= self.end_ns or self.end_ns < EARLIEST_SANE_NS <= stamp_ns
         return self.start_ns <= stamp_ns and is_before_end
 
     def since_start_ns(self, stamp_ns: int) -> int:
-        """How long it had been going on, though the clock was set meanwhile."""
+        """How long the mission had lasted, even if the clock was set during that time."""
         if self.start_ns < EARLIEST_SANE_NS <= stamp_ns:
             stamp_ns -= self.clock.wall_ns() - self.clock.boot_ns()
         return stamp_ns - self.start_ns
@@ -56,25 +56,25 @@ class MissionFinder:
         self._home = home
         self._robot = robot
         self._known: set[str] = set()
-        self._open: dict[str, MissionFolder] = {}  # those that are not over, or have no first record yet
+        self._open: dict[str, MissionFolder] = {}  # those that have not ended, or have no first record yet
         self._starts: dict[str, Mapping[str, Any]] = {}
         self._looked_ns = -1
-        self._told = ''
+        self._logged_error = ''
 
     def look(self) -> Active | None:
-        """The mission that is active now; None where the folder cannot be read, which is logged once."""
+        """The mission that is active now; None if the folder cannot be read, which is logged once."""
         try:
             self._find()
             found = [active for folder in tuple(self._open.values()) if (active := self._judge(folder))]
         except OSError as error:
-            if str(error) != self._told:
-                self._told = str(error)
+            if str(error) != self._logged_error:
+                self._logged_error = str(error)
                 log.warning('cannot look for missions: %s', error)
             return None
         return max(found, key=lambda active: active.start_ns, default=None)
 
     def _find(self) -> None:
-        """Take up what is new; once more after a change, because two changes may have one time."""
+        """Find new missions; once more after a change, because two changes may have the same time."""
         try:
             changed_ns = os.stat(self._home / MISSIONS).st_mtime_ns  # noqa: PTH116 - several times a second
         except FileNotFoundError:
@@ -88,11 +88,11 @@ class MissionFinder:
         self._known = set(folders)
 
     def _judge(self, folder: MissionFolder) -> Active | None:
-        """None for one that is over, or not yet begun, or another robot's."""
+        """None for a mission that has ended, has not started yet, or is another robot's."""
         name = folder.mission_id
         try:
             start = self._starts.get(name) or journal.first(folder.journal)
-            is_locked = journal.is_locked(folder.journal)  # after that: whoever wrote the first record had the lock before
+            is_locked = journal.is_locked(folder.journal)  # in this order: the lock is taken before the first record is written
         except FileNotFoundError:
             if name not in self._known:
                 self._forget(name)
@@ -111,7 +111,7 @@ class MissionFinder:
 
 
 def ended(active: Active) -> Active:
-    """The same with its end: what the agent recorded; a dead agent's mission has none, and ends at ``None``."""
+    """The same with the end that the agent recorded; None if the agent was killed."""
     try:
         end = journal.last(active.folder.journal)
     except OSError:

@@ -1,6 +1,6 @@
-"""The artifacts of a mission's run: which files they are, and how a file gets the name that it has there.
+"""The artifacts of a mission's run: which files they are, and how each file gets its name there.
 
-trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   what the agent gave to log_artifact
+trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   what the agent passed to log_artifact
 summary.json   camera_summary.jpg   trajectory.png   battery.png   events.jsonl   mission_command.txt
 """
 
@@ -13,22 +13,22 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from shadowhound_data_logger.missions.drawing import NAMES
 from shadowhound_data_logger.missions.folder import MissionFolder
-from shadowhound_data_logger.missions.story import Story
+from shadowhound_data_logger.missions.pictures import NAMES
+from shadowhound_data_logger.missions.state import MissionState
 from shadowhound_data_logger.missions.values import MAX_PARAM
 
 
 class Artifact(NamedTuple):
-    """A file of the mission's folder and what it is called among the run's artifacts."""
+    """A file of the mission's folder, and its name among the run's artifacts."""
 
     path: Path
     name: str
     folder: str = ''
 
 
-def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, story: Story) -> Iterator[Artifact]:
-    """What belongs to a record of the journal, in the order in which it is sent; the summary last. Raises OSError."""
+def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, state: MissionState) -> Iterator[Artifact]:
+    """The artifacts of a record of the journal, in the order in which they are sent; the summary last. Raises OSError."""
     kind, files = record.get('k'), folder.files
     if kind == 'start' and len(record['command']) > MAX_PARAM:
         path = files / 'command'
@@ -41,7 +41,7 @@ def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, story: Story)
     elif kind == 'artifact':
         yield Artifact(files / record['file'], record['name'], record['folder'])
     elif kind == 'end':
-        if story.counts['event']:
+        if state.counts['event']:
             yield Artifact(_write_events(folder), 'events.jsonl')
         if folder.trajectory.exists():
             yield Artifact(folder.trajectory, 'trajectory.csv', 'trajectories')
@@ -50,7 +50,7 @@ def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, story: Story)
 
 
 def prepared(folder: MissionFolder, artifact: Artifact) -> Path:
-    """The same file under its own name, which MLflow takes from it. Raises FileNotFoundError for one that is gone."""
+    """The file under the name that MLflow is to use. Raises FileNotFoundError if it was deleted."""
     place = folder.files / 'sending'
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(mode=0o700)
@@ -64,7 +64,7 @@ def prepared(folder: MissionFolder, artifact: Artifact) -> Path:
 
 
 def _write_events(folder: MissionFolder) -> Path:
-    """All events of the mission, a line each."""
+    """All events of the mission, one per line."""
     path = folder.files / 'events'
     with path.open('w', encoding='utf-8') as file:
         for line in folder.lines():

@@ -21,17 +21,17 @@ log = logging.getLogger(__name__)
 
 AGAIN_S: Final = 5.0
 LONGEST_S: Final = 60.0
-"""Between two starts of one that dies."""
+"""The longest pause before a sender that exits is restarted."""
 MOST_LOG_BYTES: Final = 1 << 20
-_let_go: list[subprocess.Popen[bytes]] = []
-"""Those that go on without their logger; looked at now and then, so that none stays a zombie."""
+_released: list[subprocess.Popen[bytes]] = []
+"""Senders that keep running after their logger was closed; polled, so that none stays a zombie."""
 PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 UNUSABLE: Final = 78
 """The exit code (EX_CONFIG) of an interpreter that cannot import the sender."""
 NICE: Final = 5
 HOLD_S: Final = 1.0
-"""How long it waits to be woken, or for the agent's end, before it loads MLflow: that takes a core for seconds, which the first
-mission's request for a run should not have to share."""
+"""How long it waits to be woken, or for the agent to exit, before it loads MLflow: loading takes a core for seconds, which the
+first mission's request for a run should not have to share."""
 PROGRAM: Final = f"""\
 import os, sys
 if sys.path[:1] == ['']:
@@ -46,8 +46,7 @@ except ImportError as error:
     sys.exit({UNUSABLE})
 sys.exit(main())
 """  # noqa: S608 - it is no SQL
-"""The sender. The working directory, which is the agent's, is not searched for modules: one called ``queue.py`` would replace
-Python's own."""
+"""The sender. It does not import modules from the agent's working directory: a ``queue.py`` there would replace Python's."""
 _PYTHON: Final = re.compile(r'(?:python|pypy)(\d+(?:\.\d+)?)?[a-z]*')
 """Names of interpreters, and their version."""
 REMEDY: Final = 'send them with `shadowhound-data missions resume`, from a Python that has this package'
@@ -56,7 +55,7 @@ REMEDY: Final = 'send them with `shadowhound-data missions resume`, from a Pytho
 class Replayer:
     """Starts and wakes the process that sends missions.
 
-    Lifecycle: New; start once; wake and look any number of times; let_go once. Only ``wake`` is thread-safe.
+    Lifecycle: New; start once; wake and look any number of times; release once. Only ``wake`` is thread-safe.
 
     The process runs in the agent's working directory at construction, so that relative paths in the environment
     (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) mean the same to it as to the agent.
@@ -79,10 +78,10 @@ class Replayer:
 
     def start(self) -> None:
         """Returns immediately. The process loads MLflow when woken, or after ``HOLD_S``; ``look`` retries a failed start."""
-        _let_go[:] = [process for process in _let_go if process.poll() is None]
+        _released[:] = [process for process in _released if process.poll() is None]
         folder = self._home / MISSIONS
         if self._python is None:
-            self._do_without(f'this program has no Python interpreter to start (sys.executable is {sys.executable!r})')
+            self._disable(f'this program has no Python interpreter to start (sys.executable is {sys.executable!r})')
             return
         command = [self._python, '-c', PROGRAM, str(HOLD_S), '--home', str(self._home), '--experiment', self._experiment]
         try:
@@ -104,16 +103,16 @@ class Replayer:
         """Have it read the journals now."""
         process = self._process
         if process is not None and process.stdin is not None:
-            with suppress(OSError, ValueError):  # it has died, was let go, or has enough to read
+            with suppress(OSError, ValueError):  # it has exited, was released, or its pipe is full
                 os.write(process.stdin.fileno(), b'\n')
 
     def look(self) -> None:
-        """Start it again when it ended by itself, with a pause that doubles."""
+        """Restart it if it has exited, after a pause that doubles."""
         if self._is_usable and self._process is not None and self._process.poll() == UNUSABLE:
-            self._do_without(f'{self._python} cannot import it: see {self._home / MISSIONS / "replay.log"}')
+            self._disable(f'{self._python} cannot import it: see {self._home / MISSIONS / "replay.log"}')
         if self._is_usable and (self._process is None or self._process.poll() is not None):
             if self._process is not None and self._next_s == 0.0:
-                log.warning("the missions' sender ended with %s; restarting it", self._process.returncode)
+                log.warning("the missions' sender exited with %s; restarting it", self._process.returncode)
             if self._next_s == 0.0:
                 self._next_s = time.monotonic() + self._pause_s
             elif time.monotonic() >= self._next_s:
@@ -121,21 +120,21 @@ class Replayer:
                 self._close_pipe()
                 self.start()
 
-    def let_go(self) -> None:
-        """It goes on without us, and ends when it has sent everything."""
+    def release(self) -> None:
+        """Let it run on without the agent: it exits when it has sent everything."""
         self._close_pipe()
         process, self._process = self._process, None
         if process is not None:
-            _let_go.append(process)
+            _released.append(process)
 
     def forget(self) -> None:
-        """In a forked child: it is the parent's."""
+        """In a forked child: the process belongs to the parent."""
         self._close_pipe()
         if self._process is not None:
             self._process.returncode, self._process = 0, None
 
-    def _do_without(self, reason: str) -> None:
-        """Say once that nothing is sent."""
+    def _disable(self, reason: str) -> None:
+        """Send nothing, and log that once."""
         self._is_usable = False
         log.warning('missions are journaled in %s but not sent: %s; %s', self._home / MISSIONS, reason, REMEDY)
 
@@ -149,7 +148,7 @@ def interpreter() -> str | None:
     """The path of the Python that runs this program, or of the one that is installed where its library is.
 
     In a program that embeds Python or is frozen, ``sys.executable`` is None, empty or that program, which must not be started a
-    second time: only a file that is called like an interpreter is taken. None where there is no such file.
+    second time: only a file with the name of an interpreter is used. None if there is no such file.
     """
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
     own = () if getattr(sys, 'frozen', False) else (sys.executable, getattr(sys, '_base_executable', None))
@@ -170,7 +169,7 @@ def _is_python(path: object, version: str) -> bool:
 
 
 def _import_path(environ: Mapping[str, str], python: str | None) -> list[str]:
-    """The agent's PYTHONPATH and where this package is; the agent's packages as well if the interpreter is another one."""
+    """The agent's PYTHONPATH and this package; also the agent's packages if the interpreter is another one."""
     given = []
     with suppress(OSError):  # the working directory was deleted
         given = [os.path.abspath(entry) for entry in environ.get('PYTHONPATH', '').split(os.pathsep) if entry]  # noqa: PTH100

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from PIL import Image, ImageDraw, ImageFont
 
@@ -21,10 +21,11 @@ LINE: Final = 20
 QUALITY: Final = 88
 INK: Final = '#22303c'
 PALE: Final = '#6b7884'
+_Item = TypeVar('_Item')
 
 
 class LoggedFrame(NamedTuple):
-    """A frame that was logged."""
+    """A frame of a mission, or of an answer of the lake."""
 
     time_ns: int
     number: int
@@ -37,19 +38,18 @@ class _Thumb(NamedTuple):
 
 
 def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path, *, below: str = '') -> str:
-    """Write the JPEG, with a line ``below`` its title; what there is to say about it: '' or how many frames are not pictures.
+    """Write the JPEG, with a line ``below`` its title; returns a note: '' or how many frames are not images.
 
-    Raises ValueError for none.
+    Raises ValueError if there is no image.
     """
     if not frames:
         raise ValueError('no camera frame was sampled')
-    count = min(MOST, len(frames))
-    chosen = [frames[round(place * (len(frames) - 1) / max(1, count - 1))] for place in range(count)]
+    chosen = evenly(frames, MOST)
     columns = _columns(len(chosen))
     width = (WIDTH - GAP) // columns - GAP
     thumbs, broken = _thumbs(chosen, width)
     if not thumbs:
-        raise ValueError(f'none of {len(chosen)} frames is a picture')
+        raise ValueError(f'none of {len(chosen)} frames is an image')
     height = max(thumb.image.height for thumb in thumbs)
     step_x, step_y = width + GAP, height + CAPTION + GAP
     rows = -(-len(thumbs) // columns)
@@ -58,20 +58,26 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
     pen = ImageDraw.Draw(sheet)
     pen.text((GAP, 9), title, fill=INK, font=_font(15))
     pen.text((GAP, HEAD - 4), below, fill=PALE, font=_font(12))
-    told = (
+    count_text = (
         f'{len(thumbs)} of {len(frames)} frames' if len(thumbs) < len(frames) else f'{len(thumbs)} frame{"s"[: len(thumbs) > 1]}'
     )
-    pen.text((WIDTH - GAP - pen.textlength(told, font=_font(12)), 12), told, fill=PALE, font=_font(12))
+    pen.text((WIDTH - GAP - pen.textlength(count_text, font=_font(12)), 12), count_text, fill=PALE, font=_font(12))
     for place, thumb in enumerate(thumbs):
         x, y = GAP + place % columns * step_x, top + place // columns * step_y
         sheet.paste(thumb.image, (x, y))
         _caption(pen, (x, y + thumb.image.height + 3), width, thumb.frame, start_ns)
     sheet.save(target, 'JPEG', quality=QUALITY, optimize=True)
-    return f'{broken} of {len(chosen)} frames are not pictures' if broken else ''
+    return f'{broken} of {len(chosen)} frames are not images' if broken else ''
+
+
+def evenly(items: Sequence[_Item], most: int) -> list[_Item]:
+    """At most so many of them, evenly chosen; the first and the last are among them."""
+    count = min(most, len(items))
+    return [items[round(place * (len(items) - 1) / max(1, count - 1))] for place in range(count)]
 
 
 def _columns(count: int) -> int:
-    """So that the sheet is full, and as few as the eye needs."""
+    """As few as possible while the sheet is full."""
     return {1: 1, 2: 2, 4: 2}.get(count, 3 if count <= 9 else 4)
 
 
@@ -84,7 +90,7 @@ def _thumbs(frames: Sequence[LoggedFrame], width: int) -> tuple[list[_Thumb], in
                 image.draft('RGB', (width, width))  # libjpeg scales while it decodes
                 height = min(2 * width, max(1, round(image.height * width / image.width)))
                 thumbs.append(_Thumb(frame, image.convert('RGB').resize((width, height), Image.Resampling.LANCZOS)))
-        except (OSError, ValueError, SyntaxError):  # all that Pillow calls a broken file
+        except (OSError, ValueError, SyntaxError):  # what Pillow raises for a broken file
             continue
     return thumbs, len(frames) - len(thumbs)
 
@@ -97,9 +103,9 @@ def _caption(pen: ImageDraw.ImageDraw, place: tuple[int, int], width: int, frame
     long = f'{time}   +{seconds // 60}:{seconds % 60:02d}'
     name = f'frame {frame.number}'
     room = width - pen.textlength(name, font=font) - 2 * GAP
-    told = long if pen.textlength(long, font=font) <= room else time
+    label = long if pen.textlength(long, font=font) <= room else time
     pen.text(place, name, fill=INK, font=font)
-    pen.text((place[0] + width - pen.textlength(told, font=font), place[1]), told, fill=PALE, font=font)
+    pen.text((place[0] + width - pen.textlength(label, font=font), place[1]), label, fill=PALE, font=font)
 
 
 def _font(size: int) -> Any:

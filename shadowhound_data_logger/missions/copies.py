@@ -1,4 +1,4 @@
-"""Files that a mission keeps until they are sent: whole or not at all, and never the disk's last bytes."""
+"""Files that a mission keeps until they are sent: complete or not at all, and never on a disk that is almost full."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Final
 from shadowhound_data_logger.core.errors import Rejected
 
 MIN_FREE_BYTES: Final = 64 << 20
-"""Below it no file is kept: the journal's few bytes are worth more."""
+"""Below it no file is kept: the journal needs the rest."""
 COPY_BYTES: Final = 1 << 20
 SPARES: Final = 4
-"""Between two syncs 10 Hz needs one."""
+"""At 10 Hz, one is needed between two syncs."""
 
 
 class Spares:
     """Frames of a mission, in files that were made before they are needed.
 
-    After each sync the next new name in a folder costs ext4 more than the writing of a frame (its journal copies what it is
-    committing), so that is left to the thread that syncs. Life: New; ``write`` and ``fill`` from any thread; close once.
-    ``_lock`` guards who makes files ahead.
+    After each sync, creating the next file in a folder takes ext4 longer than writing a frame (its journal copies what it is
+    committing), so the thread that syncs does it. Lifecycle: New; ``write`` and ``fill`` from any thread; close once.
+    ``_lock`` guards the files that were made ahead.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,14 +46,14 @@ class Spares:
         return target.name
 
     def fill(self) -> None:
-        """Make some ahead, as far as there is room."""
+        """Make some ahead if there is room."""
         with self._lock, suppress(OSError):
             while self._is_open and len(self._ready) < SPARES:
                 _check_room(self._folder)
                 self._ready.append(self._new())
 
     def close(self) -> None:
-        """Remove what was not needed; idempotent."""
+        """Remove unused files; idempotent."""
         with self._lock:
             self._is_open = False
             while self._ready:
@@ -62,7 +62,7 @@ class Spares:
                 target.unlink(missing_ok=True)
 
     def forget(self) -> None:
-        """In a forked child: let go of what the parent made."""
+        """In a forked child: close what the parent opened."""
         self._lock, self._is_open = threading.Lock(), False
         while self._ready:
             os.close(self._ready.popleft()[1])
@@ -98,7 +98,7 @@ def _write(target: Path, descriptor: int, data: memoryview) -> None:
 def copy(source: str | os.PathLike[str], target: Path) -> None:
     """Raises Rejected for what is not a file that can be read, OSError when there is no room; then nothing is there."""
     try:
-        if not os.path.isfile(source):  # noqa: PTH113 - a text or a Path; a pipe would never end
+        if not os.path.isfile(source):  # noqa: PTH113 - a text or a Path; reading a pipe would not end
             raise FileNotFoundError(f'{source!s:.200} is not a file')
         opened = open(source, 'rb')  # noqa: PTH123, SIM115 - closed below
     except (OSError, TypeError, ValueError) as error:

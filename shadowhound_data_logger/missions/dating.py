@@ -1,8 +1,8 @@
-"""Dates missions that begin while the clock of this machine is not set, by the rule of ``dating.py``.
+"""Dates missions that start while the clock of this machine is not set, by the rule of ``core/dating.py``.
 
-Until it is set, records have the time of the boot clock, which shows: it is before 2024. The sender leaves such a mission where
-it lies until the clock is set, because neither a run nor a key can be given another date later; then the difference of the
-clocks is noted beside the journal (``clock.json``), once, and whoever reads the journal adds it.
+Until it is set, records have the time of the boot clock, recognizable because it is before 2024. The sender does not send such a
+mission until the clock is set, because the date of a run or a key cannot be changed later; then the difference between the
+clocks is written next to the journal (``clock.json``), once, and readers of the journal add it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ REMEDY: Final = 'does it reach a time server? `timedatectl`'
 
 
 def now_ns(clock: Clock) -> int:
-    """UTC, or the time of the boot clock while nobody knows UTC."""
+    """UTC, or the time of the boot clock while UTC is unknown."""
     wall_ns = clock.wall_ns()
     return wall_ns if wall_ns >= EARLIEST_SANE_NS else clock.boot_ns()
 
@@ -30,7 +30,7 @@ def waits(folder: MissionFolder) -> bool:
 
 
 def give_date(folder: MissionFolder, dating: Dating) -> bool:
-    """Whether the times of a mission are as good as they will ever be. Raises OSError."""
+    """Whether the times of a mission are final. Raises OSError."""
     if not waits(folder):
         return True
     start = journal.first(folder.journal)

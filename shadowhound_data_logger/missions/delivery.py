@@ -1,8 +1,8 @@
-"""What has not yet been sent of one mission: to MLflow's run, its artifacts, and the objects of the store.
+"""Sends one mission: to MLflow's run, to its artifacts, and as objects to the store.
 
-Two journals tell of it, the agent's and the node's, each on its way by itself (journal_delivery.py); the agent's makes the run
-and ends it. What the agent logs itself wins: points of a metric that it has logged are not sent for the node. Frames of both are
-kept: those of the node have numbers of their own (node_log.FIRST_FRAME).
+It has two journals, the agent's and the node's, which are sent independently (journal_delivery.py); the run starts and ends with
+the agent's. The agent's values win: points of a metric that it has logged are not sent for the node. Frames of both are kept:
+those of the node have separate numbers (node_log.FIRST_FRAME).
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.errors import TrackingRefused
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, prepared
-from shadowhound_data_logger.missions.batch import send
-from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, Run, stamped, write_json
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
 from shadowhound_data_logger.missions.objects import Spooler
-from shadowhound_data_logger.missions.story import FRAMES, KILLED, Point, Story, run_request, summary_of
-from shadowhound_data_logger.missions.tracking import Tracking
+from shadowhound_data_logger.missions.pictures import Pictures, nothing
+from shadowhound_data_logger.missions.state import FRAMES, KILLED, MissionState, Point, run_request, summary_of
+from shadowhound_data_logger.missions.tracking import Tracking, send
 from shadowhound_data_logger.missions.values import MAX_TAG
 
 log = logging.getLogger(__name__)
@@ -37,17 +36,17 @@ ARTIFACTS_A_STEP: Final = 4
 OBJECTS_A_STEP: Final = 64
 BYTES_A_STEP: Final = 8 << 20
 AGENT_S: Final = 30.0
-"""How long the agent may take to create the run: its requests have deadlines, but a server may send an answer byte by byte."""
+"""How long the agent may take to create the run: its requests have deadlines, but a server may answer byte by byte."""
 NODE_S: Final = 30.0
-"""How long the end of a mission waits for a node that does not let go of its journal: it takes a second, unless it hangs."""
+"""How long the end of a mission waits until the node closes its journal: that takes a second, unless the node hangs."""
 
 
 class Delivery:
     """Sends one mission: points and state to MLflow, artifacts, and objects to the spool.
 
-    Life: New; ``track``, ``attach`` and ``spool`` in turns, until ``sent.complete``. Not thread-safe.
+    Lifecycle: New; ``track``, ``attach`` and ``spool`` in turns, until ``sent.complete``. Not thread-safe.
 
-    The three do a bounded piece of work and say whether there was any. They raise TrackingError, SpoolError or OSError.
+    Each of the three does a bounded piece of work and returns whether there was any. Raises TrackingError, SpoolError, OSError.
     """
 
     def __init__(self, folder: MissionFolder, tracking: Tracking, spooler: Spooler, pictures: Pictures = nothing,
@@ -56,8 +55,8 @@ class Delivery:
         self.run: Run | None = folder.run()
         self._agent = JournalDelivery(folder, folder, folder.lines)
         self._node = JournalDelivery(folder, folder.node, folder.node_lines, self._is_agents)
-        self._story = self._agent.story
-        self._story.node = self._node.story
+        self._state = self._agent.state
+        self._state.node = self._node.state
         self._tracking = tracking
         self._spooler = spooler
         self._pictures = pictures
@@ -73,7 +72,7 @@ class Delivery:
         return self._agent.sent
 
     def track(self) -> bool:
-        """Send the next batch of metrics; make the run first, end it after the last."""
+        """Send the next batch of metrics; create the run before the first and end it after the last."""
         self._recall()
         if self.sent.ended:
             return self._track_node()
@@ -81,15 +80,15 @@ class Delivery:
             return False
         batch = self._agent.points(self._is_node_over)
         if batch is None:
-            return self._track_node() or self._end_abandoned()
+            return self._track_node() or self._close_abandoned()
         run, is_last = self._run_of(), batch.last == 'end'
-        params = self._story.params() if batch.last == 'start' else self._story.final_params() if is_last else {}
-        self._send(run, batch.points, params, _last_words(self._story) if is_last else {})
+        params = self._state.params() if batch.last == 'start' else self._state.final_params() if is_last else {}
+        self._send(run, batch.points, params, _error_tag(self._state) if is_last else {})
         if is_last:
-            end = self._story.end
+            end = self._state.end
             self._tracking.finish(run.run_id, self.folder.mission_id, end['status'], int(end['t']) // 1_000_000)
         self._agent.move(metrics=batch.end, ended=is_last)
-        if batch.is_all:  # the agent's first: what it logs itself is not sent for the node
+        if batch.is_all:  # after the agent's points: what it logs itself is not sent for the node
             self._track_node()
         return True
 
@@ -106,22 +105,22 @@ class Delivery:
         return done > 0 or (self._agent.attached, self._node.attached) != before
 
     def spool(self, *, hold: bool = False) -> bool:
-        """Hand the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
+        """Pass the next frames, trajectories and the summary to the spool; without a run only with ``hold``, to be held there."""
         self._recall()
         if self.run is not None and self.sent.held:
             if not self._spooler.bind(self.folder.mission_id, self.run.run_id):
                 self._agent.move(held=False)
             return True
-        if self.run is None and not (hold and self._story.start):
+        if self.run is None and not (hold and self._state.start):
             return False
         before = self._agent.sent, self._node.sent
         lines = self._lines(self.sent.objects) if self.run else self._lines_before_a_run()
-        own = self._agent.objects(lines, self._story.start, self.run, OBJECTS_A_STEP, BYTES_A_STEP)
+        own = self._agent.objects(lines, self._state.start, self.run, OBJECTS_A_STEP, BYTES_A_STEP)
         if self.run is None and own.items:
             self._agent.move(held=True)
         rest = self._node.lines(self._node.sent.objects, self._node.sent.metrics if self.run else 0)
         left = OBJECTS_A_STEP - len(own.items), BYTES_A_STEP - own.bytes
-        nodes = self._node.objects(rest, self._story.start, self.run, *left)
+        nodes = self._node.objects(rest, self._state.start, self.run, *left)
         self._spooler.add([item.content for item in (*own.items, *nodes.items)])
         for part, batch in ((self._node, nodes), (self._agent, own)):
             part.move(objects=batch.end, missing=part.sent.missing + batch.missing)
@@ -131,7 +130,7 @@ class Delivery:
         return (self._agent.sent, self._node.sent) != before
 
     def complete(self) -> bool:
-        """Whether everything has arrived; what was kept for sending goes then."""
+        """Whether everything has arrived; files that were kept for sending are then deleted."""
         sent, nodes = self._agent.sent, self._node.sent
         if (
             sent.ended
@@ -139,7 +138,7 @@ class Delivery:
             and not sent.complete
             and sent.artifacts == sent.objects == sent.metrics
             and self._node.is_closed()
-            and nodes.artifacts == nodes.objects == nodes.metrics == self._node.whole()
+            and nodes.artifacts == nodes.objects == nodes.metrics == self._node.complete_bytes()
         ):
             self._agent.move(complete=True)
             for folder in (self.folder, self.folder.node):
@@ -147,7 +146,7 @@ class Delivery:
         return self.sent.complete
 
     def give_up(self, error: str) -> None:
-        """Say why nothing more of it can be sent; the next start tries again."""
+        """Record why nothing more of it can be sent; the next sender tries again."""
         self._agent.move(error=error)
 
     # -- the node's part -------------------------------------------------------------------------------------------
@@ -163,18 +162,18 @@ class Delivery:
 
     def _is_agents(self, point: Point) -> bool:
         """Whether the agent logs this metric itself: then the node's points are not sent. Frames of both are kept."""
-        return point.key in self._story.first or (point.key == FRAMES and bool(self._story.counts['frame']))
+        return point.key in self._state.first or (point.key == FRAMES and bool(self._state.counts['frame']))
 
     def _is_node_over(self) -> bool:
-        """Whether the run has all its points, or it has taken too long to let go of its journal: the mission may end."""
+        """Whether the run has all of the node's points, or the node has taken too long to close its journal."""
         if self._node.is_closed():
-            return self._node.sent.metrics == self._node.whole()
+            return self._node.sent.metrics == self._node.complete_bytes()
         self._asked_s = self._monotonic() if self._asked_s is None else self._asked_s
         return self._monotonic() - self._asked_s > NODE_S
 
     def _write_trajectory(self) -> None:
         """Once: trajectory.csv of all poses, in seconds since 1970, metres and radians."""
-        if not self._node.story.counts['poses'] or self.folder.trajectory.exists():
+        if not self._node.state.counts['poses'] or self.folder.trajectory.exists():
             return
         with replacing(self.folder.trajectory) as binary, io.TextIOWrapper(binary, 'ascii', newline='') as file:
             rows = csv.writer(file, lineterminator='\n')
@@ -186,28 +185,28 @@ class Delivery:
     # -- the journal -----------------------------------------------------------------------------------------------
 
     def _recall(self) -> None:
-        """After a restart: tell the stories what was sent before."""
+        """After a restart: read what was sent before."""
         self._node.recall()
         self._agent.recall()
         self.run = self.run or self.folder.run()
 
-    def _end_abandoned(self) -> bool:
-        """Where the agent died in the middle, say so in its place; whether that was so."""
-        if not self._story.start or self._story.end or not self._is_node_over():
+    def _close_abandoned(self) -> bool:
+        """If the agent was killed, append the end in its place; returns whether it was."""
+        if not self._state.start or self._state.end or not self._is_node_over():
             return False
         with journal.abandoned(self.folder.journal) as descriptor:
-            if descriptor is None or any(True for _ in self.folder.lines(self._agent.told)):
+            if descriptor is None or any(True for _ in self.folder.lines(self._agent.read_to)):
                 return descriptor is not None
-            error = 'the agent ended without ending its mission'
-            last_ns = max(self._story.last_ns, self._node.story.last_ns)
+            error = 'the agent exited without ending its mission'
+            last_ns = max(self._state.last_ns, self._node.state.last_ns)
             record = {'k': 'end', 't': last_ns, 'status': KILLED, 'success': False, 'by': 'replayer', 'error': error}
-            torn = journal.finish(self.folder.journal, descriptor, self._agent.told, record)
+            torn = journal.finish(self.folder.journal, descriptor, self._agent.read_to, record)
         cut = f', {torn} bytes of a record that was being written are cut off' if torn else ''
         log.warning('mission %s: %s; it is closed as %s%s', self.folder.mission_id, error, KILLED, cut)
         return True
 
     def _lines(self, offset: int) -> Iterator[journal.Line]:
-        """As far as the run has everything, so that the story is known at the end."""
+        """The lines that the run has, so that the state is complete at the end."""
         for line in self.folder.lines(offset):
             if line.end > self.sent.metrics:
                 return
@@ -217,7 +216,7 @@ class Delivery:
             yield line
 
     def _lines_before_a_run(self) -> Iterator[journal.Line]:
-        """Up to the end, which needs the run for its summary."""
+        """The lines before the end, for which the summary needs the run."""
         for line in self.folder.lines(self.sent.objects):
             if (line.record or {}).get('k') == 'end':
                 return
@@ -227,7 +226,7 @@ class Delivery:
 
     def _run_of(self) -> Run:
         if self.run is None:
-            run = self._tracking.run_of(self.folder.mission_id, *run_request(self._story.start))
+            run = self._tracking.run_of(self.folder.mission_id, *run_request(self._state.start))
             self.folder.set_run(run)
             self.run = run
         return self.run
@@ -236,7 +235,7 @@ class Delivery:
         """Whether the agent is creating the run at this moment (new_run.py)."""
         self.awaits_agent = False
         if self.run is None and self._monotonic() <= self._made_by_s:
-            with suppress(OSError):  # a file system that locks no folders: there the agent leaves it to this process
+            with suppress(OSError):  # a file system that cannot lock folders: there the agent leaves it to this process
                 self.awaits_agent = journal.is_locked(self.folder.path)
         if not self.awaits_agent:
             self.run = self.run or self.folder.run()
@@ -252,7 +251,7 @@ class Delivery:
     # -- artifacts -------------------------------------------------------------------------------------------------
 
     def _attach(self, run: Run, artifact: Artifact) -> bool:
-        """Send one file; that it is gone, or refused, is counted. Returns whether the server took it."""
+        """Send one file; counts one that was deleted or refused. Returns whether the server accepted it."""
         try:
             self._tracking.artifact(run, prepared(self.folder, artifact), artifact.folder)
         except (FileNotFoundError, TrackingRefused) as error:
@@ -263,17 +262,17 @@ class Delivery:
     def _summarize(self) -> bool:
         """Once: artifact and object must be the same. False while the pictures are being made."""
         assert self.run is not None
-        if not self._story.counts['trajectory']:
+        if not self._state.counts['trajectory']:
             self._write_trajectory()
         if not self.folder.summary.exists():
-            made = self._pictures(self.folder, stamped(self._story.start['type'], int(self._story.start['t'])))
+            made = self._pictures(self.folder, stamped(self._state.start['type'], int(self._state.start['t'])))
             if made is None:
                 return False
-            content = summary_of(self._story, self.folder.mission_id, self.run, self.sent, made)
+            content = summary_of(self._state, self.folder.mission_id, self.run, self.sent, made)
             write_json(self.folder.summary, content, durable=True)
         return True
 
 
-def _last_words(story: Story) -> dict[str, str]:
-    error: Any = story.end.get('error')
+def _error_tag(state: MissionState) -> dict[str, str]:
+    error: Any = state.end.get('error')
     return {'shadowhound.error': str(error)[:MAX_TAG]} if error else {}

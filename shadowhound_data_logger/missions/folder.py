@@ -34,7 +34,7 @@ from shadowhound_data_logger.missions.journal import Line, dated, read
 
 MISSIONS: Final = 'missions'
 UNIQUE_BYTES: Final = 4
-"""Of the random end of a mission's id: another robot may begin a patrol in the same second."""
+"""Of the random end of a mission's id: another robot may start a patrol in the same second."""
 _UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
 
 
@@ -60,18 +60,18 @@ class MissionSent:
     """Whether the run has its last state."""
     complete: bool = False
     refused: int = 0
-    """Points, params and tags that the tracking server will never take."""
+    """Points, params and tags that the tracking server refused permanently."""
     unattached: int = 0
-    """Artifacts that it will never take, or whose file is gone."""
+    """Artifacts that it refused permanently, or that have no file any more."""
     missing: int = 0
-    """Frames and trajectories that were logged and whose file was gone before the spool had it."""
+    """Frames and trajectories with a file that was deleted before it was spooled."""
     error: str = ''
-    """What was refused last."""
+    """The last refusal."""
 
 
 @dataclass(frozen=True, slots=True)
 class MissionFolder:
-    """Paths and small files of one mission; no state of its own."""
+    """Paths and small files of one mission; stateless."""
 
     path: Path
 
@@ -105,20 +105,20 @@ class MissionFolder:
 
     @property
     def node(self) -> MissionFolder:
-        """What the node logged beside the agent."""
+        """What the node logged in addition to the agent."""
         return MissionFolder(self.path / 'node')
 
     def lines(self, offset: int = 0) -> Iterator[Line]:
-        """The agent's journal from there on, with the times that ``clock.json`` makes of them. Raises OSError."""
+        """The agent's journal from ``offset`` on, with times corrected by ``clock.json``. Raises OSError."""
         return dated(read(self.journal, offset), self.clock_offset_ns() or 0)
 
     def node_lines(self, offset: int = 0) -> Iterator[Line]:
-        """The same of what the node logged, empty where it logged nothing. Raises OSError."""
+        """The same of the node's journal, empty if there is none. Raises OSError."""
         journal = self.node.journal
         return dated(read(journal, offset), self.clock_offset_ns() or 0) if journal.exists() else iter(())
 
     def clock_offset_ns(self) -> int | None:
-        """What is added to times of before the clock was set; None while that is not decided."""
+        """What is added to times from before the clock was set; None until that is decided."""
         found = read_json(self.path / 'clock.json').get('offset_ns')
         return found if isinstance(found, int) else None
 
@@ -127,7 +127,7 @@ class MissionFolder:
         write_json(self.path / 'clock.json', {'offset_ns': offset_ns}, durable=True)
 
     def run(self) -> Run | None:
-        """The run, once the replayer made it."""
+        """The run, once it was created."""
         found = read_json(self.path / 'run.json')
         try:
             return Run(**{spec.name: str(found[spec.name]) for spec in fields(Run)})
@@ -138,7 +138,7 @@ class MissionFolder:
         write_json(self.path / 'run.json', {**asdict(run), 'mission_id': self.mission_id}, durable=True)
 
     def sent(self) -> MissionSent:
-        """From the beginning where nothing readable says otherwise: what is sent again changes nothing."""
+        """All zero if the file is missing or unreadable: sending again changes nothing."""
         found = read_json(self.path / 'sent.json')
         try:
             return MissionSent(**found)
@@ -146,7 +146,7 @@ class MissionFolder:
             return MissionSent()
 
     def age_s(self) -> float:
-        """Since something of it was sent last. Raises OSError where nothing was."""
+        """Time since something of it was last sent. Raises OSError if nothing was."""
         return time.time() - (self.path / 'sent.json').stat().st_mtime
 
     def set_sent(self, sent: MissionSent, *, durable: bool = False) -> None:
@@ -154,7 +154,7 @@ class MissionFolder:
 
 
 def missions(home: Path) -> Iterator[MissionFolder]:
-    """All missions of a home, the newest last as far as their names tell. Raises OSError but for a missing folder."""
+    """All missions of a home, by name, which puts the newest of a type last. Raises OSError, but not for a missing folder."""
     try:
         names = sorted(entry.name for entry in os.scandir(home / MISSIONS) if entry.is_dir() and not entry.name.startswith('.'))
     except FileNotFoundError:
@@ -197,7 +197,7 @@ def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Empty where there is none, or none that is whole."""
+    """Empty if the file is missing or incomplete."""
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):
@@ -206,6 +206,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any], *, durable: bool = False) -> None:
-    """Replace a file as a whole: a reader sees the old or the new one. Raises OSError."""
+    """Replace a file atomically: a reader sees the old or the new one. Raises OSError."""
     with replacing(path, is_synced=durable, mode=0o600) as file:
         file.write(json.dumps(content, indent=1).encode())

@@ -1,7 +1,7 @@
-"""The journal of one mission: an append-only file that has what was logged when the call returns.
+"""The journal of one mission: an append-only file that contains what was logged when the call returns.
 
-A line a record: eight hex digits, the CRC-32 of what follows the space, then JSON in ASCII. A line break cannot occur in such
-JSON, so that a torn or rotten line costs itself alone. The file is locked (flock) for as long as its writer lives.
+One record per line: eight hex digits, the CRC-32 of what follows the space, then JSON in ASCII. A line break cannot occur in such
+JSON, so a torn or corrupt line affects no other. The file is locked (flock) as long as its writer runs.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from shadowhound_data_logger.core.durable_files import lock
 
 CHUNK: Final = 1 << 20
 TAIL_BYTES: Final = 64 << 10
-"""Within it lies the last record of a mission: what an agent states at the end is short."""
+"""Contains the last record of a mission, which is short."""
 MAX_LINE_BYTES: Final = 16 << 20
-"""More without a line break is damage: what a call may say is cut far below."""
+"""More without a line break is damage: records are limited to far less."""
 
 
 class Line(NamedTuple):
     """One line of the journal."""
 
     end: int
-    """Offset of the first byte after it: where reading goes on."""
+    """Offset of the first byte after it, where reading continues."""
     record: Mapping[str, Any] | None
     """None for a line that is damaged."""
 
 
 class Journal:
-    """Writes the journal of a mission. Life: New; create once; append from any thread; sync from one; close once.
+    """Writes the journal of a mission. Lifecycle: New; create once; append from any thread; sync from one; close once.
 
     ``_lock`` guards the descriptor and makes a line one write.
     """
@@ -49,13 +49,13 @@ class Journal:
         self._torn = False
 
     def create(self) -> None:
-        """Raises FileExistsError where there is one, OSError where there is no room or right for it."""
+        """Raises FileExistsError if there is one, OSError if the disk is full or does not permit it."""
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
         lock(self._descriptor)
         _open.add(self)
 
     def reopen(self) -> None:
-        """Go on with what a writer that is gone wrote, or begin. Raises BlockingIOError while there is another, or OSError."""
+        """Continue the journal of an earlier writer, or start one. Raises BlockingIOError while another writer runs, OSError."""
         descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
             if not lock(descriptor, wait=False):
@@ -67,7 +67,7 @@ class Journal:
         _open.add(self)
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Survives the death of the process when it returns, that of the power after ``sync``. Raises OSError (a full disk)."""
+        """After it, the record survives a kill of the process; after ``sync``, a power cut. Raises OSError (a full disk)."""
         data = line_of(record)
         with self._lock:
             if self._descriptor < 0:
@@ -96,14 +96,14 @@ class Journal:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Let go of the file and of its lock; idempotent. What was appended stays."""
+        """Close the file and release its lock; idempotent."""
         with self._lock:
             descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
     def forget(self) -> None:
-        """In a forked child: the parent alone writes, and its death must not be hidden by the child's copy of the lock."""
+        """In a forked child: only the parent writes, and its exit must not be hidden by the child's copy of the lock."""
         self._lock = threading.Lock()
         with suppress(OSError):
             self.close()
@@ -121,13 +121,13 @@ os.register_at_fork(after_in_child=_forget_all)
 
 
 def line_of(record: Mapping[str, Any]) -> bytes:
-    """A record as it stands in the file."""
+    """A record as a line of the file."""
     text = json.dumps(record, separators=(',', ':'), allow_nan=False).encode('ascii')
     return b'%08x %s\n' % (zlib.crc32(text), text)
 
 
 def read(path: Path, offset: int = 0) -> Iterator[Line]:
-    """The lines from ``offset`` on that are whole; one that is still being written, or torn, is left out. Raises OSError."""
+    """The complete lines from ``offset`` on, without one that is torn or still being written. Raises OSError."""
     with path.open('rb') as file:
         file.seek(offset)
         rest = b''
@@ -153,7 +153,7 @@ def dated(lines: Iterable[Line], offset_ns: int) -> Iterator[Line]:
 
 
 def parse(line: bytes) -> Mapping[str, Any] | None:
-    """The record of a line, None where its checksum says that it is not what was written."""
+    """The record of a line, None if the checksum does not match."""
     try:
         if int(line[:8], 16) != zlib.crc32(line[9:]) or line[8:9] != b' ':
             return None
@@ -164,7 +164,7 @@ def parse(line: bytes) -> Mapping[str, Any] | None:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether its writer lives. Raises OSError (there is no such file)."""
+    """Whether its writer runs. Raises OSError (there is no such file)."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         return not lock(descriptor, wait=False, shared=True)
@@ -173,13 +173,13 @@ def is_locked(path: Path) -> bool:
 
 
 def first(path: Path) -> Mapping[str, Any]:
-    """The first record; empty where there is none yet. Raises OSError."""
+    """The first record; empty if there is none yet. Raises OSError."""
     line = next(read(path), None)
     return (line and line.record) or {}
 
 
 def last(path: Path) -> Mapping[str, Any]:
-    """The last record; empty where it is damaged or longer than any end. Raises OSError."""
+    """The last record; empty if it is damaged or too long to be an end. Raises OSError."""
     with path.open('rb') as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
         lines = file.read().split(b'\n')
@@ -188,7 +188,7 @@ def last(path: Path) -> Mapping[str, Any]:
 
 @contextmanager
 def abandoned(path: Path) -> Iterator[int | None]:
-    """The journal of a writer that is dead, opened to be finished and locked meanwhile; None while the writer lives."""
+    """The journal of a writer that exited, opened and locked to be finished; None while the writer runs."""
     descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
     try:
         yield descriptor if lock(descriptor, wait=False) else None
@@ -197,7 +197,7 @@ def abandoned(path: Path) -> Iterator[int | None]:
 
 
 def finish(path: Path, descriptor: int, end: int, record: Mapping[str, Any]) -> int:
-    """Cut what is torn after ``end`` and append the last record; returns how many bytes were cut. Raises OSError."""
+    """Truncate a torn line after ``end`` and append the last record; returns the number of bytes removed. Raises OSError."""
     torn = path.stat().st_size - end
     os.ftruncate(descriptor, end)
     data = line_of(record)

@@ -1,7 +1,7 @@
-"""One journal of a mission, the agent's or the node's, being sent: what it says so far, and a position for each receiver.
+"""Sends one journal of a mission, the agent's or the node's: its state so far, and a position for each receiver.
 
-Each receiver has its own place, so that artifacts that cannot be stored hold up no metric. A place moves on after what lies
-before it has arrived; whatever is sent again after a crash changes nothing. The places lie beside the journal (``sent.json``).
+Each receiver has its own position, so that artifacts that cannot be stored do not delay metrics. A position moves when what comes
+before it has arrived; sending again after a crash changes nothing. The positions are next to the journal (``sent.json``).
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ from typing import Any, Final
 from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.artifacts import Artifact, artifacts_of
-from shadowhound_data_logger.missions.batch import MOST_POINTS
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
 from shadowhound_data_logger.missions.objects import Item, objects_of
-from shadowhound_data_logger.missions.story import Point, Story
+from shadowhound_data_logger.missions.state import MissionState, Point
+from shadowhound_data_logger.missions.tracking import MOST_POINTS
 from shadowhound_data_logger.missions.values import MAX_KEYS
 
 TRIES: Final = 3
-"""How often a server must refuse an artifact, and take others meanwhile, before it is skipped."""
+"""How often a server must refuse an artifact, while it accepts others, before the artifact is skipped."""
 
 
 @dataclass(slots=True)
 class PointBatch:
-    """What goes to the run in one request."""
+    """What is sent to the run in one request."""
 
     end: int
     points: list[Point] = field(default_factory=list)
     last: str = ''
     """``start`` or ``end`` where the batch ends with such a record."""
     is_all: bool = False
-    """Whether nothing more is in the journal."""
+    """Whether the journal contains nothing after it."""
 
 
 @dataclass(slots=True)
 class ObjectBatch:
-    """What goes to the store in one commit; the place ``end`` moves on after that."""
+    """What is spooled in one commit, after which the position moves to ``end``."""
 
     end: int
     items: list[Item] = field(default_factory=list)
     bytes: int = 0
     missing: int = 0
-    """Frames and trajectories whose file is gone."""
+    """Frames and trajectories with a file that was deleted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,55 +52,55 @@ class _Waiting:
     """An artifact that is to be sent."""
 
     start: int
-    """The place of its record."""
+    """The position of its record."""
     artifact: Artifact
     tries: int = 0
     taken: int = 0
-    """How many others the server had taken when it failed first."""
+    """How many others the server had accepted when it first failed."""
 
 
 class JournalDelivery:
     """Reads one journal of a mission, and sends what is new in it.
 
-    Life: New; the rest in turns, each a bounded piece of work. Not thread-safe. Its methods raise OSError.
+    Lifecycle: New; the other methods in turns, each a bounded piece of work. Not thread-safe. They raise OSError.
     """
 
     def __init__(self, mission: MissionFolder, folder: MissionFolder, read: Callable[[int], Iterator[journal.Line]],
-                 leaves_out: Callable[[Point], bool] = lambda _: False) -> None:  # fmt: skip
-        """``folder`` has the journal, its files and its places; ``read`` gives its lines from an offset on.
+                 is_skipped: Callable[[Point], bool] = lambda _: False) -> None:  # fmt: skip
+        """``folder`` has the journal, its files and positions; ``read`` returns its lines from an offset on.
 
-        ``leaves_out`` says which points are not sent, because somebody else tells the same.
+        Points for which ``is_skipped`` returns True are not sent: the other journal has the same.
         """
-        self.story = Story()
+        self.state = MissionState()
         self.sent = folder.sent()
-        self.told = 0
-        """Up to here the story knows the journal."""
+        self.read_to = 0
+        """The journal was read up to here."""
         self._mission = mission
         self._folder = folder
         self._read = read
-        self._leaves_out = leaves_out
+        self._is_skipped = is_skipped
         self._batch: PointBatch | None = None
         self.attached = self.sent.artifacts
-        """Up to here the artifacts of the journal were tried."""
+        """The artifacts of the journal were tried up to here."""
         self._waiting: deque[_Waiting] = deque()
         self._taken = 0
 
     def recall(self) -> None:
-        """After a restart: tell the story what was sent before."""
-        if self.told < self.sent.metrics:
-            for line in self.lines(self.told, self.sent.metrics):
-                self.story.add(line.record)
-                self.told = line.end
+        """After a restart: read what was sent before."""
+        if self.read_to < self.sent.metrics:
+            for line in self.lines(self.read_to, self.sent.metrics):
+                self.state.add(line.record)
+                self.read_to = line.end
 
     def lines(self, offset: int, end: int | None = None) -> Iterator[journal.Line]:
-        """The lines between two places, or to the end of the journal."""
+        """The lines between two positions, or to the end of the journal."""
         for line in self._read(offset):
             if end is not None and line.end > end:
                 return
             yield line
 
     def points(self, may_end: Callable[[], bool] = lambda: True) -> PointBatch | None:
-        """The next points, the same until they are sent; None where there are none. ``may_end`` holds back the last record."""
+        """The next points, the same until they are sent; None if there are none. The last record waits for ``may_end``."""
         if self._batch is None or self._batch.end <= self.sent.metrics:
             self._batch = self._next_points(may_end)
         return self._batch
@@ -109,13 +109,13 @@ class JournalDelivery:
                most: int) -> int:  # fmt: skip
         """Send the artifacts of the next lines (from ``attached`` on); returns how many there were.
 
-        ``send`` says whether the server took it. One that fails is tried again after all others, so that it delays none; what the
-        server refuses again (``data['of_object']`` of the error) after it took another one is passed to ``refuse`` and skipped.
+        ``send`` returns whether the server accepted it. One that fails is retried after all others, so that it delays none; what
+        the server refuses again (``data['of_object']`` of the error) after accepting another is passed to ``refuse`` and skipped.
         """
         done = 0
         try:
             for line in lines:
-                found = deque(_Waiting(self.attached, each) for each in artifacts_of(line.record or {}, self._folder, self.story))
+                found = deque(_Waiting(self.attached, each) for each in artifacts_of(line.record or {}, self._folder, self.state))
                 self.attached = line.end
                 done += self._send(found, send, refuse)
                 if done >= most:
@@ -128,7 +128,7 @@ class JournalDelivery:
 
     def objects(self, lines: Iterable[journal.Line], start: Mapping[str, Any], run: Run | None, most: int,
                 most_bytes: int) -> ObjectBatch:  # fmt: skip
-        """The objects of the next lines, of a mission that began so."""
+        """The objects of the next lines, of a mission with this first record."""
         batch = ObjectBatch(self.sent.objects)
         for line in lines:
             record = line.record or {}
@@ -142,29 +142,29 @@ class JournalDelivery:
         return batch
 
     def is_closed(self) -> bool:
-        """Whether nothing more can come: its writer is gone, or there never was one."""
+        """Whether nothing more will be written: its writer has exited, or there never was one."""
         try:
             return not journal.is_locked(self._folder.journal)
         except FileNotFoundError:
             return True
 
-    def whole(self) -> int:
-        """Where its last whole line ends."""
-        end = self.told
-        for line in self.lines(self.told):
+    def complete_bytes(self) -> int:
+        """The end of its last complete line."""
+        end = self.read_to
+        for line in self.lines(self.read_to):
             end = line.end
         return end
 
     def move(self, **changes: Any) -> None:
-        """Move places, or note what else became of it."""
+        """Change positions and other fields of ``sent``."""
         moved = replace(self.sent, **changes)
         if moved != self.sent:
-            durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files go
+            durable = not changes.keys().isdisjoint({'objects', 'held', 'complete'})  # after these, files are deleted
             self._folder.set_sent(moved, durable=durable)
             self.sent = moved
 
     def _send(self, items: deque[_Waiting], send: Callable[[Artifact], bool], refuse: Callable[[Exception], None]) -> int:
-        """Send them until one fails: that one waits, and those behind it."""
+        """Send them until one fails: it and those after it wait."""
         done = 0
         while items:
             item = items.popleft()
@@ -184,13 +184,13 @@ class JournalDelivery:
         return done
 
     def _next_points(self, may_end: Callable[[], bool]) -> PointBatch | None:
-        batch = PointBatch(self.told)
-        for line in self.lines(self.told):
+        batch = PointBatch(self.read_to)
+        for line in self.lines(self.read_to):
             kind = str((line.record or {}).get('k'))
             if kind == 'end' and not may_end():
                 break
-            batch.points += [point for point in self.story.add(line.record) if not self._leaves_out(point)]
-            self.told = batch.end = line.end
+            batch.points += [point for point in self.state.add(line.record) if not self._is_skipped(point)]
+            self.read_to = batch.end = line.end
             if kind in {'start', 'end'}:
                 batch.last = kind
                 break
@@ -198,4 +198,4 @@ class JournalDelivery:
                 break
         else:
             batch.is_all = True
-        return batch if self.told > self.sent.metrics else None
+        return batch if self.read_to > self.sent.metrics else None

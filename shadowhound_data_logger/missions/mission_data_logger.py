@@ -1,4 +1,4 @@
-"""MissionDataLogger: what the mission agent uses. No call waits for Tower, and none raises because of it.
+"""MissionDataLogger, the mission agent's API. No call waits for Tower or raises because of it.
 
 logger = MissionDataLogger()
 with logger.mission('patrol', 'go round the house') as mission:
@@ -27,24 +27,24 @@ from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.new_run import RunRequests
 from shadowhound_data_logger.missions.overview import Report, has_arrived, report, sizes
-from shadowhound_data_logger.missions.recorder import Beginning, Mission
-from shadowhound_data_logger.missions.story import FAILED, KILLED
+from shadowhound_data_logger.missions.recorder import Mission, MissionStarter
+from shadowhound_data_logger.missions.state import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
 
 log = logging.getLogger(__name__)
 
 SYNC_S: Final = 0.1
-"""How often the disk is asked to hold what was logged: with a slow fsync it has it after 250 ms."""
+"""How often the journal is synced: with a slow fsync, what was logged is on the disk after 250 ms."""
 IDLE_S: Final = 1.0
 POLL_S: Final = 0.01
 CLOSE_S: Final = 5.0
 
 
 class MissionDataLogger:
-    """Logs the missions of one agent. Life: New; any number of missions, one at a time; close once, or never.
+    """Logs the missions of one agent. Lifecycle: New; any number of missions, one at a time; close once, or never.
 
-    The constructor starts the process that sends (it takes seconds to load MLflow, and a mission's start should not wait for
-    that) and the thread ``missions``, which syncs journals. In a program without a Python interpreter (embedded or frozen)
+    The constructor starts the sender, a child process (loading MLflow takes seconds, for which the start of a mission should not
+    wait), and the thread ``missions``, which syncs journals. In a program without a Python interpreter (embedded or frozen)
     missions are only journaled, with one warning. All methods may be called from any thread. ``_lock`` guards the active mission.
     Raises SettingError for an invalid argument or variable, such as a robot name that cannot be in a key, and nothing else.
     """
@@ -54,7 +54,7 @@ class MissionDataLogger:
         experiment: str | None = None, start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
         replay: bool = True,
     ) -> None:  # fmt: skip
-        """What is not given is read from SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI; experiment: ROBOT_missions.
+        """Defaults: SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI; experiment: ROBOT_missions.
 
         Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
         journals: another logger of the same home sends them.
@@ -68,7 +68,7 @@ class MissionDataLogger:
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)
         every_s = _seconds('frame_artifact_every_s', frame_artifact_every_s)
         self._runs = RunRequests(self._environ, experiment) if replay and RunRequests.can_ask(self._environ) else None
-        self._beginning = Beginning(self.home, self.robot, every_s, SystemClock.of_this_machine(), self._runs)
+        self._starter = MissionStarter(self.home, self.robot, every_s, SystemClock.of_this_machine(), self._runs)
         self._lock = threading.RLock()
         self._mission: Mission | None = None
         self._ended: list[Mission] = []
@@ -93,7 +93,7 @@ class MissionDataLogger:
     # -- a mission's life ------------------------------------------------------------------------------------------
 
     def start_mission(self, mission_type: str, mission_command: str) -> str:
-        """Begin a mission; a mission that is active ends as KILLED.
+        """Start a mission; an active mission ends as KILLED.
 
         Returns the MLflow run's id, or the mission's own id if no server answers or ``start_timeout_s`` is over: both find the
         mission from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). The type keeps
@@ -105,7 +105,7 @@ class MissionDataLogger:
 
     @contextmanager
     def mission(self, mission_type: str, mission_command: str) -> Iterator[Mission]:
-        """A mission for a ``with``: what is raised in it ends it as FAILED, is recorded, and goes on."""
+        """A mission as a context manager: an exception ends it as FAILED, is recorded, and is raised again."""
         mission = self._start(mission_type, mission_command)
         try:
             yield mission
@@ -120,7 +120,7 @@ class MissionDataLogger:
             self._leave(mission)
 
     def end_mission(self, success: bool, distance_m: float, duration_s: float) -> None:
-        """End the active mission as FINISHED or FAILED. Where 0 is stated and something else was measured, that stands."""
+        """End the active mission as FINISHED or FAILED. Where 0 is stated, a measured value is used."""
         if mission := self._active('end_mission'):
             mission.end(success, distance_m, duration_s)
             self._leave(mission)
@@ -155,7 +155,7 @@ class MissionDataLogger:
     # -- sending ---------------------------------------------------------------------------------------------------
 
     def flush(self, deadline_s: float = 10.0) -> Report:
-        """Have all sent that agent and node have logged, in at most ``deadline_s``; says how far it came. Never raises."""
+        """Wait until everything that agent and node have logged is sent, at most ``deadline_s``. Never raises."""
         self._sync()
         if self._replayer:
             self._replayer.wake()
@@ -166,12 +166,12 @@ class MissionDataLogger:
         return report(folder)
 
     def close(self, deadline_s: float = 0.0) -> Report:
-        """End what is active as KILLED, wait for the sending for at most ``deadline_s``, and let go; idempotent.
+        """End an active mission as KILLED, wait for the sender for at most ``deadline_s``, and release it; idempotent.
 
-        What is not sent yet is sent by the process that goes on without us, or at the next start.
+        What is unsent then is sent by the sender, which keeps running, or by the next one.
         """
         if mission := self._mission:
-            log.warning('mission %s is still active while its logger is closed: it ends as KILLED', mission.id)
+            log.warning('mission %s is still active when its logger is closed: it ends as KILLED', mission.id)
             mission.end(success=False, status=KILLED, error='the logger was closed')
             self._leave(mission)
         found = self.flush(0.0 if self._closed else deadline_s)
@@ -180,7 +180,7 @@ class MissionDataLogger:
         self._wake.set()
         self._worker.join(CLOSE_S)
         if self._replayer:
-            self._replayer.let_go()
+            self._replayer.release()
         return found
 
     # -- within ----------------------------------------------------------------------------------------------------
@@ -197,21 +197,21 @@ class MissionDataLogger:
         if new is not None:
             new.is_settled.wait(self._start_timeout_s)
         replayer.wake()
-        if new is not None and (new.run is not None or new.is_hopeless):
+        if new is not None and (new.run is not None or new.is_unreachable):
             return
         _until(lambda: mission.run_id is not None, end - time.monotonic())
 
     def _begin(self, mission_type: str, mission_command: str) -> Mission:
-        """Make it the active one; when the disk takes nothing, the mission goes on unlogged."""
+        """Make it the active mission; on a full disk, the mission is not logged."""
         with self._lock:
             before, self._mission = self._mission, None
             if before is not None:
                 log.warning('mission %s is still active: it ends as KILLED', before.id)
                 before.end(success=False, status=KILLED, error='another mission was started')
                 self._ended.append(before)
-            mission = self._beginning.mission(mission_type, mission_command)
+            mission = self._starter.mission(mission_type, mission_command)
             if mission is None:
-                return self._beginning.nothing(mission_type)
+                return self._starter.nothing(mission_type)
             self._newest, self._mission = mission.folder, mission
             self._wake.set()
             return mission
@@ -224,7 +224,7 @@ class MissionDataLogger:
         return mission
 
     def _leave(self, mission: Mission) -> None:
-        """Let the thread sync and close what has ended."""
+        """Have the thread sync and close the ended mission."""
         with self._lock:
             if self._mission is mission:
                 self._mission = None
@@ -232,7 +232,7 @@ class MissionDataLogger:
         self._wake.set()
 
     def _step(self) -> None:
-        """The thread's round: sync the journal, look after the replayer."""
+        """One round of the thread: sync the journal, supervise the sender."""
         self._wake.wait(SYNC_S if self._mission else IDLE_S)
         self._wake.clear()
         self._sync()
@@ -251,14 +251,14 @@ class MissionDataLogger:
             self._replayer.wake()
 
     def _forget_all(self) -> None:
-        """In a forked child: threads, journal and replayer are the parent's."""
+        """In a forked child: threads, journal and sender belong to the parent."""
         self._lock = threading.RLock()
         for mission in (*self._ended, *((self._mission,) if self._mission else ())):
             mission.forget()
         self._mission, self._ended = None, []
         if self._runs:
             self._runs.forget()
-            self._runs, self._beginning = None, replace(self._beginning, runs=None)
+            self._runs, self._starter = None, replace(self._starter, runs=None)
         if self._replayer:
             self._replayer.forget()
             self._replayer = None
@@ -276,7 +276,7 @@ os.register_at_fork(after_in_child=_after_fork)
 
 
 def _text(name: str, value: object) -> str:
-    """A text or path as it was given, empty for None. Raises SettingError."""
+    """A text or path, empty for None. Raises SettingError."""
     try:
         found = os.fspath(value) if value is not None else ''  # type: ignore[call-overload]
     except TypeError as error:
@@ -307,7 +307,7 @@ def _robot(name: str) -> str:
 
 
 def _until(done: Callable[[], bool], seconds: float) -> None:
-    """Wait for another process, whose only sign is a file."""
+    """Poll for the result of another process, which is a file."""
     end = time.monotonic() + seconds
     while not done() and time.monotonic() < end:
         time.sleep(POLL_S)

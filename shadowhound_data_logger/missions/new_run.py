@@ -1,8 +1,8 @@
-"""Creates the run of a new mission in the agent's own process, by one request, before its sender has loaded MLflow.
+"""Creates the run of a new mission in the agent's process, with one request, before the sender has loaded MLflow.
 
-This is a shortcut: whatever fails here is left to the sender, which looks for a run with the mission's id before it creates one,
-and reports errors. While a request is under way the mission's folder is locked (flock), and the sender leaves it alone; the lock
-ends with the process. Stores without a server (``sqlite:``, ``file:``) and logins of MLflow's client alone have no shortcut.
+This is a shortcut: if it fails, the sender creates the run, after looking for one with the mission's id, and reports errors.
+During the request the mission's folder is locked (flock), and the sender leaves it alone; the lock ends with the process.
+Stores without a server (``sqlite:``, ``file:``) and logins that only MLflow's client supports have no shortcut.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavail
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.mlflow_rest import LOGIN, MlflowRest
 from shadowhound_data_logger.missions.folder import MissionFolder, Run
-from shadowhound_data_logger.missions.story import run_request
+from shadowhound_data_logger.missions.state import run_request
 from shadowhound_data_logger.missions.tracking import MISSION_TAG
 
 log = logging.getLogger(__name__)
 
 OTHER_LOGINS: Final = ('MLFLOW_TRACKING_AUTH', 'MLFLOW_TRACKING_AWS_SIGV4')
-"""Variables of MLflow's client that its own code has to carry out."""
+"""Variables for logins that only MLflow's client supports."""
 
 
 class NewRun:
     """The run of one mission while it is being created.
 
-    Lifecycle: New, before the mission's journal is there; ``settle`` once, from any thread. The folder is locked in between.
+    Lifecycle: New, before the mission's journal exists; ``settle`` once, from any thread. In between the folder is locked.
     """
 
     def __init__(self, folder: MissionFolder) -> None:
         """Raises OSError."""
         self.folder = folder
         self.run: Run | None = None
-        self.is_hopeless = False
-        """Whether no server answered: nobody else will have a run soon."""
+        self.is_unreachable = False
+        """Whether no server answered: the sender cannot create a run either."""
         self.is_settled = threading.Event()
         self._descriptor = os.open(folder.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -51,33 +51,33 @@ class NewRun:
             os.close(self._descriptor)
             raise
 
-    def settle(self, run: Run | None = None, *, is_hopeless: bool = False) -> None:
-        """Note the run, if there is one, and unlock the folder."""
-        self.run, self.is_hopeless = run, is_hopeless
-        self.is_settled.set()  # the agent does not wait for the disk: a run that was not noted is found by the mission's id
+    def settle(self, run: Run | None = None, *, is_unreachable: bool = False) -> None:
+        """Write down the run, if there is one, and unlock the folder."""
+        self.run, self.is_unreachable = run, is_unreachable
+        self.is_settled.set()  # the agent does not wait for the disk: a run that was not written down is found by the mission's id
         try:
             if run is not None:
                 self.folder.set_run(run)
         except OSError as error:
-            log.warning('the run of mission %s cannot be noted: %s', self.folder.mission_id, error)
+            log.warning('the run of mission %s cannot be written down: %s', self.folder.mission_id, error)
         finally:
             descriptor, self._descriptor = self._descriptor, -1
             if descriptor >= 0:
                 with suppress(OSError):
-                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # for the copies that forked processes have as well
+                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # also releases the copies in forked processes
                 os.close(descriptor)
 
     def forget(self) -> None:
-        """In a forked child: the parent alone creates it."""
+        """In a forked child: only the parent creates it."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
 
 class RunRequests:
-    """Asks one MLflow server for runs.
+    """Creates runs on one MLflow server.
 
-    Lifecycle: New; ``prepare`` once; ``create`` any number of times. Each request has a thread of its own, which ends with it.
+    Lifecycle: New; ``prepare`` once; ``create`` any number of times. Each request has its own thread.
     ``_lock`` guards the connection's settings and the experiment's id.
     """
 
@@ -91,18 +91,18 @@ class RunRequests:
 
     @staticmethod
     def can_ask(environ: Mapping[str, str]) -> bool:
-        """Whether the environment names a server that takes plain requests."""
+        """Whether the environment names a server that accepts plain requests."""
         is_server = environ.get('MLFLOW_TRACKING_URI', '').startswith(('http://', 'https://'))
         return is_server and not any(environ.get(name, '').lower() not in {'', 'false'} for name in OTHER_LOGINS)
 
     def prepare(self) -> None:
         """Look for the experiment now; returns immediately."""
-        self._begin(self._prepare)
+        self._start_thread(self._prepare)
 
     def create(self, new: NewRun, start: Mapping[str, Any]) -> None:
-        """Create the run of a mission that started so; returns immediately."""
+        """Create the run of a mission with this first record; returns immediately."""
         self._open.add(new)
-        if not self._begin(self._create, new, start):
+        if not self._start_thread(self._create, new, start):
             self._settle(new)
 
     def forget(self) -> None:
@@ -112,11 +112,11 @@ class RunRequests:
 
     # -- within ----------------------------------------------------------------------------------------------------
 
-    def _begin(self, work: Any, *arguments: object) -> bool:
+    def _start_thread(self, work: Any, *arguments: object) -> bool:
         try:
             threading.Thread(target=work, args=arguments, name='mission-run', daemon=True).start()
         except RuntimeError as error:  # no more threads
-            log.warning('MLflow is not asked for a run by this process: %s', error)
+            log.warning('this process creates no run in MLflow: %s', error)
             return False
         return True
 
@@ -129,15 +129,15 @@ class RunRequests:
             self._settle(new, self._created(new.folder.mission_id, start))
         except TrackingUnavailable as error:
             log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
-            self._settle(new, is_hopeless=True)
-        except Exception as error:  # noqa: BLE001 - of any kind: the sender tries again, and reports it
+            self._settle(new, is_unreachable=True)
+        except Exception as error:  # noqa: BLE001 - any kind: the sender tries again, and reports it
             log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
             with self._lock:
                 self._rest, self._experiment_id = None, ''  # another password, another experiment
             self._settle(new)
 
-    def _settle(self, new: NewRun, run: Run | None = None, *, is_hopeless: bool = False) -> None:
-        new.settle(run, is_hopeless=is_hopeless)
+    def _settle(self, new: NewRun, run: Run | None = None, *, is_unreachable: bool = False) -> None:
+        new.settle(run, is_unreachable=is_unreachable)
         self._open.discard(new)
 
     def _created(self, mission_id: str, start: Mapping[str, Any]) -> Run | None:
@@ -171,13 +171,13 @@ class RunRequests:
         try:
             rest.create(self._experiment)
         except TrackingRefused as error:
-            if error.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # of another process, just now
+            if error.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # another process has just created it
                 raise
         return self._find(rest)
 
 
 def _address(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The server's URL without user and password, and the environment with those that were in it, as MLflow's client has them."""
+    """The server's URL without user and password, and the environment with those that were in it."""
     parts = urlsplit(environ['MLFLOW_TRACKING_URI'])
     login, _, server = parts.netloc.rpartition('@')
     user, _, password = login.partition(':')

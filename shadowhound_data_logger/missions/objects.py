@@ -1,4 +1,4 @@
-"""A mission's objects for the store: its frames, trajectory and summary, handed to the spool and, without a node, delivered.
+"""A mission's objects for the store: its frames, trajectory and summary, passed to the spool and, without a node, delivered.
 
 sensor-data/<robot>/missions/<run id>/camera/frame_NNNNNN.jpg, trajectory.csv, summary.json
 trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv
@@ -21,8 +21,8 @@ from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError, StoreUnavailable
 from shadowhound_data_logger.core.model import Binding, DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
-from shadowhound_data_logger.missions.story import BUCKET, TRAJECTORIES
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.missions.state import BUCKET, TRAJECTORIES
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
@@ -30,12 +30,12 @@ from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
-"""As the camera's own images."""
+"""The same as that of camera images."""
 CONTENT_TYPES: Final = {'jpg': 'image/jpeg', 'csv': 'text/csv', 'json': 'application/json'}
 REST_S: Final = 30.0
-"""Without use for so long, the spool is closed again."""
+"""An unused spool is closed after this time."""
 SLICE_S: Final = 3.0
-"""How long the drain is kept from a node that starts."""
+"""How long the drain lock is held at a time: a starting node waits that long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +45,20 @@ class Item:
     content: DataObject
     path: Path
     is_done_with: bool
-    """Whether nobody else needs the file."""
+    """Whether the file is not needed any more."""
 
 
 def held_reason(mission_id: str) -> str:
-    """Under which the spool keeps what waits for the mission's run."""
+    """The reason under which the spool holds objects until the mission has a run."""
     return f'mission-{mission_id}'
 
 
 def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: MissionFolder, run: Run | None,
                files: Path | None = None) -> Iterator[Item]:  # fmt: skip
-    """What a record of the journal gives to the store; a file that is gone gives nothing. Raises OSError.
+    """The objects of a record of the journal; none if its file was deleted. Raises OSError.
 
-    ``files`` is where those of the journal lie, if not in the mission's own ``files/``. Without a run it is held under the
-    mission's id, which ``Spooler.bind`` replaces.
+    ``files`` is the folder of the journal's files, by default the mission's ``files/``. Without a run the keys have the mission's
+    id, which ``Spooler.bind`` replaces.
     """
     kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
@@ -111,11 +111,11 @@ class Spooler:
         self._used_s = 0.0
         self._node_drains = False
         self._is_new = True
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, clock, monotonic)
+        self._catalogue = CatalogWriter(settings.spool_path, settings.catalog, settings.robot, clock, monotonic)
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:
-        """Make them durable in the spool; what is or was there already is left out. Raises SpoolError."""
+        """Commit them to the spool; what is or was there already is skipped. Raises SpoolError."""
         if not objects:
             return
         with self._using(self._opened()) as spool, closing(Index(spool.root / 'index.db', read_only=True)) as known:
@@ -125,7 +125,7 @@ class Spooler:
                 spool.commit(new[begin : begin + MOST_OBJECTS])
 
     def bind(self, mission_id: str, run_id: str) -> bool:
-        """Give what is held for a mission its final names; False when nothing is held any more. Raises SpoolError."""
+        """Give the held objects of a mission their final keys; False if nothing is held any more. Raises SpoolError."""
         with self._using(self._opened()) as spool:
             found = spool.held(held_reason(mission_id))
             spool.bind([
@@ -136,7 +136,7 @@ class Spooler:
         return bool(found)
 
     def pending(self) -> int:
-        """What waits for delivery, as far as this process has the spool open. Raises SpoolError."""
+        """Objects that wait for delivery, if this process has the spool open. Raises SpoolError."""
         if self._spool is None:
             return 0
         with self._using(self._spool) as spool:
@@ -150,15 +150,15 @@ class Spooler:
         except SpoolError:
             return True
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         """Write the rows of the catalog soon: a mission has ended."""
-        self._catalogue.hasten()
+        self._catalogue.expedite()
 
     def drain(self) -> None:
-        """Deliver for a moment where no node does. Raises StoreError, SettingError or SpoolError when that does not work."""
+        """Deliver for up to ``SLICE_S`` if no node does. Raises StoreError, SettingError or SpoolError."""
         if self._spool is None:
             if self._is_new and (self._settings.spool_path / 'index.db').exists():
-                self._opened()  # for what an earlier process left
+                self._opened()  # for the objects of an earlier process
             self._is_new = False
             return
         if not self._has_work():
@@ -180,10 +180,10 @@ class Spooler:
         """Raises SpoolError."""
         if self.pending():
             return True
-        if self._spool is None or not self._settings.catalogue.enabled:
+        if self._spool is None or not self._settings.catalog.enabled:
             return False
         with self._using(self._spool) as spool:
-            return spool.has_uncatalogued()
+            return spool.has_uncataloged()
 
     def _drain(self, spool: Spool) -> None:
         with delivering(spool, self._settings, SLICE_S) as (uploader, writer):
@@ -199,7 +199,7 @@ class Spooler:
 
     @contextmanager
     def _using(self, spool: Spool) -> Iterator[Spool]:
-        """The spool, which is closed where its index is lost or damaged: it is rebuilt when it is opened the next time."""
+        """The spool, which is closed if its index is lost or damaged: the index is rebuilt at the next open."""
         try:
             yield spool
         except (OSError, sqlite3.OperationalError) as error:
@@ -221,9 +221,9 @@ class Spooler:
 
 
 def _has(index: Index, item: DataObject) -> bool:
-    """Whether the very same content was spooled before, under this key or one of its ``_1``, ``_2``, ... (``keys.unique``).
+    """Whether the same content was spooled before, under this key or with ``_1``, ``_2``, ... appended (``keys.unique``).
 
-    In one question: where all frames of an agent have one number there are very many of these.
+    One query: an agent that gives all frames the same number makes many such keys.
     """
     folder, slash, name = item.key.rpartition('/')
     stem, dot, extension = name.partition('.')

@@ -10,11 +10,11 @@ from shadowhound_data_logger.core.clock import SECOND
 MAX_SPEED_MPS: Final = 5.0
 """No Go2 walks faster."""
 REST_M: Final = 0.02
-"""Movements that stay within this are the noise of a robot that stands: at 50 Hz a millimetre each would be 3 m a minute."""
+"""Smaller movements are noise of a robot at rest: one millimeter at 50 Hz would be 3 m per minute."""
 
 
 class Pose(NamedTuple):
-    """Where it is: metres and radians in the frame of odometry."""
+    """A pose in the odometry frame: meters and radians."""
 
     stamp_ns: int
     x: float
@@ -29,18 +29,18 @@ class Pose(NamedTuple):
 
 
 class Odometer:
-    """Adds up the way over the ground. New, with what was gone before; ``add`` poses as they come."""
+    """Sums up the distance over the ground. Lifecycle: New, with the distance so far; ``add`` poses in their order."""
 
     def __init__(self, max_speed_mps: float = MAX_SPEED_MPS, distance_m: float = 0.0) -> None:
-        """A step that implies more than ``max_speed_mps`` is a jump of the estimate and no way."""
+        """A step faster than ``max_speed_mps`` is a jump of the estimate and is not counted."""
         self.distance_m = distance_m
         self.jumps = 0
         self._max_speed_mps = max_speed_mps
         self._last: Pose | None = None
-        self._from: Pose | None = None  # up to here the way is counted
+        self._from: Pose | None = None  # the distance is counted up to here
 
     def add(self, pose: Pose) -> bool:
-        """Whether the pose is one: finite, and later than the one before."""
+        """Returns whether the pose is valid: finite, and later than the previous one."""
         last = self._last
         if not pose.is_finite or (last is not None and pose.stamp_ns <= last.stamp_ns):
             return False

@@ -11,21 +11,21 @@ from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json
-from shadowhound_data_logger.missions.story import Point, Story
+from shadowhound_data_logger.missions.state import MissionState, Point
 
 ACTIVE, UNFINISHED = 'active', 'unfinished'
-"""Results of missions without an end: the agent lives; it died, and no sender has closed the mission yet."""
+"""Results of missions without an end: the agent runs; it was killed, and no sender has closed the mission yet."""
 BRIEF: Final = (
     'mission_id', 'run_id', 'type', 'command', 'robot', 'started', 'ended', 'duration_s', 'result', 'errors', 'distance_m',
     'battery_consumed_pct', 'complete', 'unsent', 'refused_by_server', 'last_error', 'remedy', 'folder',
 )  # fmt: skip
-"""What a list says of each mission."""
+"""The fields of a mission in a list."""
 FILES: Final = frozenset({'frame', 'trajectory', 'artifact'})
-"""Records that have a file."""
+"""Records with a file."""
 STATE: Final = 'replay.json'
-"""Beside the missions: what the replayer says of itself."""
+"""Next to the missions: the state of the sender."""
 LOCK: Final = 'replay.lock'
-"""Beside the missions: who holds it sends them."""
+"""Next to the missions: its owner sends them."""
 
 
 def overviews(home: Path) -> list[dict[str, Any]]:
@@ -35,34 +35,34 @@ def overviews(home: Path) -> list[dict[str, Any]]:
 
 
 def find(home: Path, wanted: str) -> list[MissionFolder]:
-    """The missions whose id, or whose run's id, begins with this; the one alone that has it exactly. Raises OSError."""
+    """The missions with an id, or a run id, that begins with this; only the exact match if there is one. Raises OSError."""
     names = {folder: (folder.mission_id, run.run_id if (run := folder.run()) else '') for folder in missions(home)}
     exact = [folder for folder, ids in names.items() if wanted in ids]
     return exact or [folder for folder, ids in names.items() if any(name.startswith(wanted) for name in ids)]
 
 
 def overview(folder: MissionFolder) -> dict[str, Any] | None:
-    """What there is to say of a mission; None for a folder without the beginning of one. Raises OSError."""
-    story = told(folder)
-    if not story.start:
+    """Everything about a mission; None for a folder without a first record. Raises OSError."""
+    state = state_of(folder)
+    if not state.start:
         return None
     sent, run, far = folder.sent(), folder.run(), report(folder)
     return {
-        'mission_id': folder.mission_id, 'run_id': run.run_id if run else None, 'type': story.start['type'],
-        'command': story.start['command'], 'robot': story.start['robot'], 'policies': story.policy_names or None,
-        'started': iso(int(story.start['t'])),
-        'ended': iso(int(story.end['t'])) if story.end else None, 'duration_s': round(story.duration_s, 3),
-        'result': story.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
-        'errors': [*story.errors, *([story.end['error']] if story.end.get('error') else [])],
-        'distance_m': story.distance_m, 'battery_consumed_pct': story.battery_consumed_pct,
-        'last': dict(sorted(story.newest.items())), 'counts': _counts(story), 'refused': dict(story.refused),
+        'mission_id': folder.mission_id, 'run_id': run.run_id if run else None, 'type': state.start['type'],
+        'command': state.start['command'], 'robot': state.start['robot'], 'policies': state.policy_names or None,
+        'started': iso(int(state.start['t'])),
+        'ended': iso(int(state.end['t'])) if state.end else None, 'duration_s': round(state.duration_s, 3),
+        'result': state.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
+        'errors': [*state.errors, *([state.end['error']] if state.end.get('error') else [])],
+        'distance_m': state.distance_m, 'battery_consumed_pct': state.battery_consumed_pct,
+        'last': dict(sorted(state.newest.items())), 'counts': _counts(state), 'refused': dict(state.refused),
         'complete': sent.complete, 'unsent': _unsent(folder, sent), 'refused_by_server': sent.refused,
         'last_error': far.last_error, 'remedy': far.remedy, 'folder': str(folder.path),
     }  # fmt: skip
 
 
 def _summarized(folder: MissionFolder) -> dict[str, Any] | None:
-    """The same of a mission that is sent whole, by its summary: its journal may be long. None for any other."""
+    """The same of a mission that is completely sent, from its summary, because its journal may be long. None for any other."""
     sent, summary = folder.sent(), read_json(folder.summary)
     if not sent.complete:
         return None
@@ -78,48 +78,48 @@ def _summarized(folder: MissionFolder) -> dict[str, Any] | None:
         return None
 
 
-def told(folder: MissionFolder) -> Story:
-    """The story of a mission as far as it is journalled, the node's with it."""
-    story = Story(node=Story())
+def state_of(folder: MissionFolder) -> MissionState:
+    """The state of a mission by its journals, the node's included."""
+    state = MissionState(node=MissionState())
     for source, record in records(folder):
-        (story if source == 'agent' else story.node or story).add(record)
-    return story
+        (state if source == 'agent' else state.node or state).add(record)
+    return state
 
 
 def records(folder: MissionFolder) -> Iterator[tuple[str, Mapping[str, Any] | None]]:
-    """``node`` or ``agent``, and what it logged; the node's first, because the agent's end sums up both."""
+    """``node`` or ``agent``, and its records; the node's first, because the agent's end sums up both."""
     for source, lines in (('node', folder.node_lines), ('agent', folder.lines)):
         if source == 'node' or folder.journal.exists():
             yield from ((source, line.record) for line in lines())
 
 
 def export(folder: MissionFolder) -> dict[str, Any]:
-    """All that was logged: parameters, every metric point, events; the points of ``agent`` and ``node`` beside each other."""
-    story = Story(node=Story())
+    """Everything that was logged: parameters, every metric point of ``agent`` and ``node``, events."""
+    state = MissionState(node=MissionState())
     points: list[dict[str, Any]] = []
     events: list[dict[str, Any]] = []
     for source, record in records(folder):
-        found: list[Point] = (story if source == 'agent' else story.node or story).add(record)
+        found: list[Point] = (state if source == 'agent' else state.node or state).add(record)
         points += [{**point._asdict(), 'source': source} for point in found]
         if record and record.get('k') == 'event':
             events.append({'time': iso(int(record['t'])), 'name': record['name'], 'data': record['data']})
     points.sort(key=lambda point: point['time_ms'])
-    params = story.params() | (story.final_params() if story.end else {}) if story.start else {}
+    params = state.params() | (state.final_params() if state.end else {}) if state.start else {}
     return {'mission': overview(folder), 'params': params, 'points': points, 'events': events,
             'summary': read_json(folder.summary) or None}  # fmt: skip
 
 
-def _counts(story: Story) -> dict[str, int]:
-    node = story.node.counts if story.node else story.counts
+def _counts(state: MissionState) -> dict[str, int]:
+    node = state.node.counts if state.node else state.counts
     return {
-        'metric_points': story.counts['points'] + node['points'], 'camera_frames': story.frames,
-        'trajectories': story.counts['trajectory'] or int(node['poses'] > 0),
-        'artifacts': story.counts['artifact'], 'events': story.counts['event'],
+        'metric_points': state.counts['points'] + node['points'], 'camera_frames': state.frames,
+        'trajectories': state.counts['trajectory'] or int(node['poses'] > 0),
+        'artifacts': state.counts['artifact'], 'events': state.counts['event'],
     }  # fmt: skip
 
 
 def _unsent(folder: MissionFolder, sent: MissionSent) -> dict[str, int]:
-    """Records that the run has not, and files that are not among its artifacts, or not in the spool."""
+    """Records that are not in the run yet, and files that are not among its artifacts or not in the spool yet."""
     count = {'records': 0, 'artifacts': 0, 'objects': 0}
     if sent.complete:
         return count
@@ -144,30 +144,30 @@ def _is_locked(folder: MissionFolder) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """How far one mission has come."""
+    """How far one mission is sent."""
 
     mission_id: str
     run_id: str | None
     sent: int
-    """Records that the run has: the agent's, and the node's where one joined in."""
+    """Records of the agent and of a node that are in the run."""
     unsent: int
     complete: bool
     """Whether everything has arrived: metrics and artifacts in the run, objects in the spool."""
     missing: int = 0
-    """Frames and trajectories whose file was gone before it was handed on."""
+    """Frames and trajectories with a file that was deleted before it was spooled."""
     last_error: str = ''
     """What delays it now, or was refused last; empty if nothing was."""
     remedy: str = ''
     refused: int = 0
-    """Points, params and tags that the tracking server will never take."""
+    """Points, params and tags that the tracking server refused permanently."""
     unattached: int = 0
-    """Artifacts that it will never take, or whose file is gone."""
+    """Artifacts that it refused permanently, or that have no file any more."""
     waiting_for: str = ''
-    """What is still to be done where it is not complete."""
+    """What remains to be done if it is not complete."""
 
 
 def report(folder: MissionFolder) -> Report:
-    """Reads the whole journals; they are there for as long as the mission is not complete."""
+    """Reads the journals completely; they exist until the mission is complete."""
     sent, run = folder.sent(), folder.run()
     count, unsent = map(sum, zip(_counted(folder.journal, sent), _counted(folder.node.journal, folder.node.sent()), strict=True))
     error, remedy = (WAITS, REMEDY) if folder.journal.exists() and waits(folder) else ('', '')
@@ -182,14 +182,14 @@ def report(folder: MissionFolder) -> Report:
 
 
 def _waiting_for(folder: MissionFolder, unsent: int) -> tuple[str, str]:
-    """What a mission that is not complete waits for, and what can be done about it."""
+    """What an incomplete mission waits for, and what can be done about it."""
     sent, node = folder.sent(), folder.node.sent()
     if not folder.journal.exists():
-        return 'its journal, which is gone', 'was the folder of the mission deleted?'
+        return 'its journal, which is missing', 'was the folder of the mission deleted?'
     if _is_locked(folder):
         return 'its end: the mission is active', ''
     if not is_sending(folder.path.parent):
-        return 'a process that sends it', 'if none is starting, run `shadowhound-data missions resume`'
+        return 'a sender', 'if none is starting, run `shadowhound-data missions resume`'
     left = [f'{unsent} records to be in its run'] if unsent else []
     if _is_locked(folder.node):
         return ', '.join([*left, 'the node to finish its part']), 'it takes a second, at most 30 s; is the node stopped?'
@@ -202,11 +202,11 @@ def _waiting_for(folder: MissionFolder, unsent: int) -> tuple[str, str]:
         left.append('its last artifacts and its summary')
     if sent.held:
         left.append('its objects to get their names')
-    return ', '.join(left) or 'its run to be closed', 'wait longer, with close(seconds); the sending goes on in the background'
+    return ', '.join(left) or 'its run to be closed', 'wait longer, with close(seconds); the sender continues in the background'
 
 
 def _counted(path: Path, sent: MissionSent) -> tuple[int, int]:
-    """Records of a journal, and those that the run has not."""
+    """Records of a journal, and those that are not in the run yet."""
     try:
         ends = [line.end for line in journal.read(path)]
     except FileNotFoundError:
@@ -215,12 +215,12 @@ def _counted(path: Path, sent: MissionSent) -> tuple[int, int]:
 
 
 def sizes(folder: MissionFolder) -> tuple[int, int]:
-    """How long the journals of agent and node are; 0 for one that is not there."""
+    """The sizes of the journals of agent and node; 0 if missing."""
     return _size(folder.journal), _size(folder.node.journal)
 
 
 def has_arrived(folder: MissionFolder, sizes_: tuple[int, int] | None) -> bool:
-    """Whether the journals are sent as far as they had come then; with None, whether a mission that is over has arrived whole."""
+    """Whether the journals are sent up to these sizes; with None, whether an ended mission has arrived completely."""
     if sizes_ is None:
         return folder.sent().complete
     places = (folder.sent(), folder.node.sent())
@@ -235,7 +235,7 @@ def _size(path: Path) -> int:
 
 
 def is_sending(missions: Path) -> bool:
-    """Whether a replayer of this folder runs."""
+    """Whether a sender of this folder runs."""
     try:
         return journal.is_locked(missions / LOCK)
     except OSError:
@@ -243,7 +243,7 @@ def is_sending(missions: Path) -> bool:
 
 
 def errors(missions: Path) -> dict[str, tuple[str, str]]:
-    """What holds the replayer of this folder up now: receiver -> (error, remedy)."""
+    """What delays the sender of this folder now: receiver -> (error, remedy)."""
     found = read_json(missions / STATE).get('errors')
     if not isinstance(found, dict):
         return {}

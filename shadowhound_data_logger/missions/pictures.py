@@ -1,9 +1,10 @@
-"""Makes the pictures of a mission that has ended, from its folder, in a separate process.
+"""The pictures of a mission that has ended, made from its folder by a child process of the sender.
 
     camera_summary.jpg   trajectory.png   battery.png
 
-``python -m shadowhound_data_logger.missions.pictures FOLDER TITLE`` makes them in files/ and then writes pictures.json: each name
-with '' or what there is to say about it. One that cannot be made costs only itself.
+``python -m shadowhound_data_logger.missions.pictures FOLDER TITLE`` writes them to files/, and then pictures.json: each name with
+'' or a note about it. A picture that cannot be made does not affect the others. matplotlib's second and 60 MB, and whatever a
+hostile file does to a decoder, stay in that process: the sender continues with other missions and polls it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import csv
 import logging
 import math
 import os
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -21,26 +24,86 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.untrusted import check_commas, csv_encoding
-from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
-from shadowhound_data_logger.missions.drawing import CHARGE, SHEET, TRAJECTORY
-from shadowhound_data_logger.missions.folder import MissionFolder, write_json
-from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE, named
+from shadowhound_data_logger.missions.folder import MissionFolder, read_json, write_json
+from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE, named
 
 log = logging.getLogger(__name__)
 
 NS_SECONDS: Final = 1e17
-"""A timestamp above it is in nanoseconds: in seconds it would lie three billion years from now."""
+"""A timestamp above it is in nanoseconds: in seconds it would be three billion years from now."""
 MOST_STATES: Final = 20_000
+SHEET, TRAJECTORY, CHARGE = NAMES = ('camera_summary.jpg', 'trajectory.png', 'battery.png')
+PROGRAM: Final = 'shadowhound_data_logger.missions.pictures'
+DEADLINE_S: Final = 60.0
+"""After it the process is killed."""
+Pictures = Callable[[MissionFolder, str], 'Mapping[str, str] | None']
+"""Notes about the pictures of a mission with this title; None while they are being made."""
+
+
+class Drawing:
+    """Has the pictures of missions made by a child process, one mission at a time.
+
+    Lifecycle: New; ``of`` any number of times; close once. Not thread-safe.
+    """
+
+    def __init__(self, *, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._monotonic = monotonic
+        self._process: subprocess.Popen[bytes] | None = None
+        self._folder: MissionFolder | None = None
+        self._end_s = 0.0
+
+    @property
+    def busy(self) -> bool:
+        return self._process is not None
+
+    def of(self, folder: MissionFolder, title: str) -> Mapping[str, str] | None:
+        """Notes about a mission's pictures, None while they are being made. Raises OSError if no process can be started."""
+        if self._process is None:
+            if notes := _notes(folder):
+                return notes
+            self._start(folder, title)
+            return None
+        ended = self._process.poll() is not None
+        if not ended and self._monotonic() > self._end_s:
+            self._process.kill()
+            self._process.wait()
+            ended = True
+        if not ended or self._folder is None:
+            return None
+        code, self._process = self._process.returncode, None
+        if not _notes(self._folder):
+            write_json(self._folder.pictures, dict.fromkeys(NAMES, f'the process that makes them exited with {code}'))
+        return _notes(folder) if folder == self._folder else None
+
+    def close(self) -> None:
+        """A running process finishes on its own."""
+        if self._process is not None:
+            self._process.poll()
+            self._process = None
+
+    def _start(self, folder: MissionFolder, title: str) -> None:
+        command = [sys.executable, '-m', PROGRAM, str(folder.path), title]
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=folder.path)  # where no module is found
+        self._folder, self._end_s = folder, self._monotonic() + DEADLINE_S
+
+
+def nothing(folder: MissionFolder, title: str) -> Mapping[str, str]:  # noqa: ARG001 - the place of Drawing.of
+    """No pictures at all."""
+    return {}
+
+
+def _notes(folder: MissionFolder) -> dict[str, str]:
+    return {name: str(note) for name, note in read_json(folder.pictures).items() if name in NAMES}
 
 
 @dataclass(slots=True)
 class Material:
-    """What the pictures are made of."""
+    """The data for the pictures."""
 
     start_ns: int = 0
-    frames: list[LoggedFrame] = field(default_factory=list)
+    frames: list[tuple[int, int, Path]] = field(default_factory=list)
     states: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {BATTERY: [], TEMPERATURE: []})
-    """Of each metric: seconds since the start, and the value."""
+    """For each metric: seconds since the start, and the value."""
     trajectory: Path | None = None
     policies: list[str | None] = field(default_factory=list)
 
@@ -52,7 +115,7 @@ class Material:
         elif kind == 'policy':
             self.policies.append(record.get('policy'))
         elif kind == 'frame' and record.get('artifact'):
-            self.frames.append(LoggedFrame(time_ns, int(record['id']), files / record['file']))
+            self.frames.append((time_ns, int(record['id']), files / record['file']))
         elif kind == 'trajectory':
             self.trajectory = files / record['file']
         elif kind == 'metrics':
@@ -61,7 +124,7 @@ class Material:
 
 
 def material_of(folder: MissionFolder) -> Material:
-    """From the agent's journal, and from the node's what the agent did not log. Raises OSError."""
+    """From the agent's journal, and from the node's if the agent did not log it. Raises OSError."""
     found, node = Material(), Material()
     for line in folder.lines():
         found.add(line.record or {}, folder.files)
@@ -78,9 +141,11 @@ def material_of(folder: MissionFolder) -> Material:
 
 
 def make(folder: MissionFolder, title: str) -> dict[str, str]:
-    """Make what can be made; each name with '' or what there is to say about it."""
+    """Make the pictures; each name with '' or a note about it."""
+    from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet  # noqa: PLC0415 - the sender needs no Pillow
+
     material = material_of(folder)
-    frames, start_ns, below = material.frames, material.start_ns, named(material.policies)
+    frames, start_ns, below = [LoggedFrame(*each) for each in material.frames], material.start_ns, named(material.policies)
     return {
         SHEET: _made(folder.files / SHEET, lambda target: contact_sheet(frames, title, start_ns, target, below=below)),
         TRAJECTORY: _made(folder.files / TRAJECTORY, lambda target: _trajectory(material, folder.floor, title, target)),
@@ -89,7 +154,7 @@ def make(folder: MissionFolder, title: str) -> dict[str, str]:
 
 
 def read_path(path: Path) -> list[tuple[float, float, float]]:
-    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines that have no such numbers are left out.
+    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines without such numbers are skipped.
 
     Raises OSError, or ValueError for a file without these columns.
     """
@@ -112,12 +177,12 @@ def read_path(path: Path) -> list[tuple[float, float, float]]:
 
 
 def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
-    """Draw it; what there is to say about it. A file appears under its name only when it is whole."""
+    """Draw a picture; returns a note about it. The file gets its name only when it is complete."""
     part = target.with_name(f'.{os.getpid()}.{target.name}')
     try:
         note = draw(part) or ''
         os.replace(part, target)
-    except ValueError as error:  # there is nothing to show
+    except ValueError as error:  # there is nothing to draw
         note = f'not made: {error}'
     except ImportError as error:
         note = f'not made: {error} (pip install shadowhound_data_logger[missions])'
@@ -131,7 +196,7 @@ def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
 def _trajectory(material: Material, floor: Path, title: str, target: Path) -> None:
     if material.trajectory is None:
         raise ValueError('no trajectory was logged')
-    import numpy as np  # noqa: PLC0415 - nobody else here needs it
+    import numpy as np  # noqa: PLC0415 - unused elsewhere
 
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - a second, and not installed everywhere
 
@@ -158,7 +223,7 @@ def _seconds(text: str) -> float:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Make the pictures of the mission whose folder is given."""
+    """Make the pictures of the mission in the given folder."""
     folder = MissionFolder(Path(arguments[0]))
     write_json(folder.pictures, make(folder, arguments[1]))
     return 0

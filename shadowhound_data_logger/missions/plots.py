@@ -29,7 +29,7 @@ STYLE: Final = {
 }  # fmt: skip
 DPI: Final = 120
 MOST_POINTS: Final = 4000
-"""Of a line: more cannot be told apart at this size."""
+"""Of a line: more cannot be distinguished at this size."""
 SPEED_WINDOW_S: Final = 1.0
 """Over which a speed is taken: odometry's noise from one sample to the next would be all that one saw."""
 CELL_M: Final = 0.05

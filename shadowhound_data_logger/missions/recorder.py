@@ -1,6 +1,6 @@
-"""An active mission as its agent holds it: every method writes to the journal, returns within a millisecond and never raises.
+"""An active mission, as the agent sees it: every method writes to the journal, returns within a millisecond and never raises.
 
-What cannot be taken (no number, no room on the disk) is counted in the mission's summary and said once a reason.
+What cannot be logged (not a number, a full disk) is counted in the mission's summary, with one warning per reason.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, new_folder, stamped
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.missions.new_run import NewRun, RunRequests
-from shadowhound_data_logger.missions.story import BATTERY, FAILED, FINISHED, TEMPERATURE
+from shadowhound_data_logger.missions.state import BATTERY, FAILED, FINISHED, TEMPERATURE
 from shadowhound_data_logger.policies.folder import PolicyFolder
 
 log = logging.getLogger(__name__)
 
 MOST_FRAME_ARTIFACTS: Final = 500
-"""Of one run: MLflow's page lists them all; the store has every frame."""
+"""Per run, because MLflow's page lists them all; the store has every frame."""
 
 
 class Mission:
     """The calls by which an agent logs one mission.
 
-    Life: made by MissionDataLogger; log_... from any thread; end once, after which calls do nothing but warn once.
+    Lifecycle: made by MissionDataLogger; log_... from any thread; end once, after which calls only warn once.
 
-    ``_lock`` makes a record one step with what is remembered of it: that it is to be synced, and that the last one was written.
+    ``_lock`` guards the journal together with the list of what must be synced and the flag that the mission has ended.
     """
 
     def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock,
                  policy: str | None = None, new_run: NewRun | None = None) -> None:  # fmt: skip
         self.folder = folder
         self.new_run = new_run
-        """The run that this process asks MLflow for; None where it leaves that to the sender."""
+        """The run that this process creates; None if it leaves that to the sender."""
         self._clock = clock
         self._policies = PolicyFolder(folder.path.parents[1])
         self._policy = policy
@@ -68,12 +68,12 @@ class Mission:
 
     @property
     def id(self) -> str:
-        """The mission's own id, which it has whether MLflow answers or not."""
+        """The mission's own id, which does not depend on MLflow."""
         return self.folder.mission_id
 
     @property
     def run_id(self) -> str | None:
-        """The MLflow run's id; None until it is made."""
+        """The MLflow run's id; None until the run is created."""
         run = (self.new_run and self.new_run.run) or self.folder.run()
         return run.run_id if run else None
 
@@ -84,10 +84,10 @@ class Mission:
     def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
         """The bytes of a JPEG, or an array of pixels, which this call encodes: uint8, gray, RGB or RGBA (see ``values.jpeg``).
 
-        All frames are stored, a sample of them (``frame_artifact_every_s``) becomes artifacts of the run as well.
+        All frames are stored; a sample of them (``frame_artifact_every_s``) also becomes artifacts of the run.
         """
         try:
-            number = values.whole(frame_id, 'frame_id')
+            number = values.integer(frame_id, 'frame_id')
             data = values.jpeg(frame_data, f'frame {number}')
             if self._is_over():
                 return
@@ -98,7 +98,7 @@ class Mission:
             self._lose(error)
 
     def log_robot_state(self, battery_pct: float, temperature_c: float, step: int) -> None:
-        """Two points of one time: percent and degrees Celsius."""
+        """Two points with the same time: percent and degrees Celsius."""
         self._log({BATTERY: battery_pct, TEMPERATURE: temperature_c}, step)
 
     def log_metric(self, key: str, value: float, step: int | None = None) -> None:
@@ -106,7 +106,7 @@ class Mission:
         self._log({key: value}, 0 if step is None else step)
 
     def log_event(self, name: str, /, **data: Any) -> None:
-        """Something that happened; all of them are the run's ``events.jsonl``, those named ``error`` stand in the summary."""
+        """An event; the run's ``events.jsonl`` has all of them, the summary also lists those named ``error``."""
         try:
             self._append('event', name=values.text(name, values.MAX_KEY), data=values.bounded(values.plain(data)))
         except Rejected as error:
@@ -115,11 +115,11 @@ class Mission:
             self._lose(error)
 
     def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
-        """Copy a CSV file with the header ``timestamp,x,y,yaw`` and what it has now; it is stored as it is."""
+        """Copy the current content of a CSV file with the header ``timestamp,x,y,yaw``; it is stored unchanged."""
         self._log_file('trajectory', trajectory_csv_path, {})
 
     def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
-        """Copy a file as it is now, for the run's artifacts, in the folder ``artifact_path``.
+        """Copy the current content of a file to the run's artifacts, in the folder ``artifact_path``.
 
         A name that MLflow cannot hold, such as ``map#1.png``, is changed (``values.artifact_name``), with a warning; the summary
         has both names.
@@ -140,9 +140,9 @@ class Mission:
 
     def end(self, success: bool = True, distance_m: float | None = None, duration_s: float | None = None, *,
             status: str | None = None, error: str | None = None) -> None:  # fmt: skip
-        """The last record: FINISHED or FAILED unless ``status`` (KILLED) says otherwise. What is not stated is measured."""
+        """The last record: FINISHED or FAILED, or ``status`` (KILLED). Values that are not stated are measured."""
         elapsed_s = (self._clock.boot_ns() - self._began_ns) / SECOND
-        stated: dict[str, Any] = {'success': values.truth(success), 'elapsed_s': round(elapsed_s, 6)}
+        stated: dict[str, Any] = {'success': values.boolean(success), 'elapsed_s': round(elapsed_s, 6)}
         for name, value in (('distance_m', distance_m), ('duration_s', duration_s)):
             try:
                 stated[name] = None if value is None else values.number(value, name)
@@ -158,18 +158,18 @@ class Mission:
             self._lose(refused)
 
     def close(self) -> None:
-        """Make durable what was logged and let go of the journal, after ``end``; idempotent."""
+        """Sync and close the journal, after ``end``; idempotent."""
         self.sync()
         self._frames.close()
         self._journal.close()
 
     def forget(self) -> None:
-        """In a forked child: the parent alone logs, and the files that were made ahead are its own."""
+        """In a forked child: only the parent logs, and it owns the files that were made ahead."""
         self._lock, self._ended = threading.Lock(), True
         self._frames.forget()
 
     def sync(self) -> None:
-        """Make durable what was logged before, and note another policy. Called by the logger's thread; never raises OSError."""
+        """Sync what was logged, and record a change of the policy. Called by the logger's thread; never raises OSError."""
         self._note_policy()
         with self._lock:
             files, self._unsynced = self._unsynced, []
@@ -178,7 +178,7 @@ class Mission:
             return
         try:
             for path in (*files, *((self.folder.files,) if files else ())):
-                with suppress(FileNotFoundError):  # the replayer was faster: it is in the spool
+                with suppress(FileNotFoundError):  # the sender was faster: it is in the spool
                     sync(path)
             self._journal.sync()
         except OSError as error:
@@ -188,18 +188,18 @@ class Mission:
     # -- within ----------------------------------------------------------------------------------------------------
 
     def _note_policy(self) -> None:
-        """Record that another one is active than before."""
+        """Record a change of the active policy."""
         now = self._policies.current()
         with self._lock:
             if now != self._policy and not self._ended:
-                with suppress(OSError):  # the next look tries again
+                with suppress(OSError):  # the next sync tries again
                     self._journal.append({'k': 'policy', 't': now_ns(self._clock), 'policy': now})
                     self._policy, self._is_dirty = now, True
 
     def _log(self, metrics: Mapping[str, Any], step: Any) -> None:
         found: dict[str, float] = {}
         try:
-            number = values.whole(step, 'step')
+            number = values.integer(step, 'step')
         except Rejected as error:
             self._refuse(error)
             return
@@ -240,13 +240,13 @@ class Mission:
             self._is_over()
 
     def _is_over(self) -> bool:
-        """Whether it has ended, which is said: no file of what comes now may be left."""
+        """Whether it has ended, with a warning: later calls must leave no file behind."""
         if self._ended:
-            self._warn('ended', 'mission %s has ended: what is logged to it now is left out', self.id)
+            self._warn('ended', 'mission %s has ended: what is logged to it now is ignored', self.id)
         return self._ended
 
     def _is_sampled(self) -> bool:
-        """Whether this frame becomes an artifact of the run as well."""
+        """Whether this frame also becomes an artifact of the run."""
         now_s = time.monotonic()
         with self._lock:
             if now_s < self._next_s or not self._left:
@@ -255,21 +255,21 @@ class Mission:
             return True
 
     def _refuse(self, error: Rejected) -> None:
-        """Count what is nobody's data in the journal."""
-        self._warn(error.reason, 'mission %s leaves out what cannot be logged: %s', self.id, error)
+        """Count in the journal what cannot be logged."""
+        self._warn(error.reason, 'mission %s skips what cannot be logged: %s', self.id, error)
         try:
             self._append('refused', reason=error.reason)
         except OSError as full:
             self._lose(full)
 
     def _lose(self, error: OSError) -> None:
-        """The disk takes nothing: the mission goes on."""
+        """Count what a full disk loses: the mission continues."""
         with self._lock:
             self._lost += 1
-        self._warn('lost', 'mission %s loses what is logged while the disk takes nothing: %s', self.id, error)
+        self._warn('lost', 'mission %s loses what is logged while the disk accepts no writes: %s', self.id, error)
 
     def _warn(self, reason: str, text: str, *values_: object) -> None:
-        """Once a reason."""
+        """Once per reason."""
         with self._lock:
             known = reason in self._warned
             self._warned.add(reason)
@@ -278,32 +278,32 @@ class Mission:
 
 
 @dataclass(frozen=True, slots=True)
-class Beginning:
-    """What all missions of one logger have in common."""
+class MissionStarter:
+    """Starts the missions of one logger: what they have in common."""
 
     home: Path
     robot: str
     frame_artifact_every_s: float
     clock: Clock
     runs: RunRequests | None = None
-    """What creates runs in this process."""
+    """Creates runs in this process."""
 
     def mission(self, mission_type: str, mission_command: str) -> Mission | None:
-        """A new one; None when the disk does not take it, which is said."""
+        """A new mission; None if the disk accepts no writes, which is logged."""
         time_ns, given = now_ns(self.clock), values.text(mission_type, values.MAX_TYPE)
         start = {'k': 'start', 't': time_ns, 'type': given, 'command': values.text(mission_command), 'robot': self.robot,
                  'pid': os.getpid()}  # fmt: skip
         if policy := PolicyFolder(self.home).current():
             start['policy'] = policy
-        if time_ns < EARLIEST_SANE_NS:  # of which boot the clock is that this time is of
+        if time_ns < EARLIEST_SANE_NS:  # the boot to which this time belongs
             start['boot_id'] = self.clock.boot_id
         new_run = None
         try:
             folder = new_folder(self.home, given, time_ns)
             if self.runs is not None and time_ns >= EARLIEST_SANE_NS:
-                with suppress(OSError):  # a file system that locks no folders: the sender creates the run
+                with suppress(OSError):  # a file system that cannot lock folders: the sender creates the run
                     new_run = NewRun(folder)  # before the sender sees the journal
-            journal = _begun(folder, start)
+            journal = _new_journal(folder, start)
         except OSError as error:
             if new_run is not None:
                 new_run.settle()
@@ -314,7 +314,7 @@ class Beginning:
         return Mission(folder, journal, self.frame_artifact_every_s, self.clock, policy, new_run)
 
     def nothing(self, mission_type: str) -> Mission:
-        """A mission that is over: all its calls do nothing. For a disk that takes no journal."""
+        """An ended mission: all its calls do nothing. For a disk that accepts no writes."""
         name = stamped(values.text(mission_type, values.MAX_TYPE), now_ns(self.clock))
         folder = MissionFolder(self.home / MISSIONS / f'{name}_unlogged')
         mission = Mission(folder, Journal(folder.journal), 0.0, self.clock)
@@ -322,8 +322,8 @@ class Beginning:
         return mission
 
 
-def _begun(folder: MissionFolder, start: dict[str, Any]) -> Journal:
-    """A journal with its first record; nothing is left open when the disk does not take it."""
+def _new_journal(folder: MissionFolder, start: dict[str, Any]) -> Journal:
+    """A journal with its first record; closed again if the disk accepts no writes."""
     journal = Journal(folder.journal)
     journal.create()
     try:

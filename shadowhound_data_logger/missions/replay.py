@@ -1,10 +1,11 @@
-"""The process that sends missions: ``python -m shadowhound_data_logger.missions.replay``, started by MissionDataLogger.
+"""The sender of missions, a process: ``python -m shadowhound_data_logger.missions.replay``, started by MissionDataLogger.
 
-One a home works at a time (a lock that dies with it); others wait. It outlives the agent until all is sent, or Tower was
-away for ``LINGER_S``: what is left then waits for the next start. Standard input wakes it; its end is that of the agent.
+One sender per home works at a time (a lock that ends with the process); others wait. It keeps running after the agent until
+everything is sent, or Tower was unreachable for ``LINGER_S``; the next sender sends the rest. Standard input wakes it, and its
+end of file means that the agent has exited.
 
-One whose agent is gone makes way for one whose agent lives, because that one may know a better address or password. Whoever
-waits holds a second lock, shared, which dies with it as well.
+A sender without an agent yields to one that has an agent, because that one may have a better address or password. A waiting
+sender holds a second, shared lock, which also ends with the process.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ from shadowhound_data_logger.core.errors import DataLoggerError, TrackingRefused
 from shadowhound_data_logger.core.retry import backoff
 from shadowhound_data_logger.missions.dating import give_date
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.drawing import Drawing
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, missions, write_json
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.overview import LOCK, STATE
+from shadowhound_data_logger.missions.pictures import Drawing
 from shadowhound_data_logger.missions.tracking import MlflowTracking, Tracking
 from shadowhound_data_logger.spool import clock_record
 
@@ -44,9 +45,9 @@ LONGEST_PAUSE_S: Final = 60.0
 
 
 class Gate:
-    """Decides when a receiver is tried again.
+    """Decides when a receiver is retried.
 
-    Open while it is to be tried; each failure closes it for longer (exponential, full jitter, up to a minute).
+    Open while the receiver may be tried; each failure closes it for longer (exponential, full jitter, up to a minute).
     """
 
     def __init__(self, monotonic: Callable[[], float], rng: random.Random) -> None:
@@ -68,34 +69,34 @@ class Gate:
     def worked(self) -> None:
         self._failures, self.error, self._next_s = 0, None, float('-inf')
 
-    def hurry(self) -> None:
-        """Try at once: somebody waits for it."""
+    def retry_now(self) -> None:
+        """Try immediately: a client waits for it."""
         self._next_s = float('-inf')
 
 
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S: Final = 0.5
-"""How often the journals are looked at when nobody wakes it."""
+"""How often the journals are read without being woken."""
 LINGER_S: Final = 600.0
-"""How long it tries on after the agent ended and nothing gets through."""
+"""How long it keeps trying after the agent has exited, if nothing succeeds."""
 HANG_S: Final = 3.0
-"""How long a request that hangs may keep it from making way."""
+"""How long a hanging request may delay yielding to another sender."""
 WAITING: Final = 'replay.waiting'
-"""Beside the missions: locked, shared, by those that wait for an agent that lives."""
+"""Next to the missions: locked, shared, by waiting senders that have an agent."""
 KEEP_S: Final = 30 * 86_400.0
-"""How long a mission that has arrived stays on the robot; looked at when a sender starts."""
+"""How long a delivered mission stays on the robot; checked when a sender starts."""
 SLICE_S: Final = 0.5
 TRACKING, ARTIFACTS, OBJECTS, STORE = 'tracking', 'artifacts', 'objects', 'store'
 
 
 class Replay:
-    """Sends all missions of one home. Life: New; step any number; close once. Not thread-safe."""
+    """Sends all missions of one home. Lifecycle: New; step any number of times; close once. Not thread-safe."""
 
     def __init__(self, home: Path, tracking: Tracking, spooler: Spooler, drawing: Drawing, *,
                  settle: Callable[[MissionFolder], bool] = lambda _: True, monotonic: Callable[[], float] = time.monotonic,
                  rng: random.Random | None = None) -> None:  # fmt: skip
-        """``settle`` says whether the times of a mission are final."""
+        """``settle`` returns whether the times of a mission are final."""
         self._home = home
         self._tracking = tracking
         self._spooler = spooler
@@ -106,36 +107,36 @@ class Replay:
         self.gates = {name: Gate(monotonic, rng) for name in (TRACKING, ARTIFACTS, OBJECTS, STORE)}
         self._deliveries: dict[str, Delivery] = {}
         self._settle = settle
-        self._stuck: set[tuple[str, str]] = set()  # (gate, mission) that failed when it was tried last
-        self._waiting: set[str] = set()  # without a date yet, or not readable now
-        self._settled: set[str] = set()  # complete, or beyond help until the next start
-        self._told: dict[str, object] = {}
+        self._stuck: set[tuple[str, str]] = set()  # (gate, mission) of which the last try failed
+        self._waiting: set[str] = set()  # without a date yet, or unreadable now
+        self._settled: set[str] = set()  # complete, or impossible to send until the next start
+        self._written_state: dict[str, object] = {}
         self._logged: set[str] = set()
 
     def step(self) -> bool:
-        """Some pieces of work, those of the newest mission first; whether any was done."""
+        """Do some work, for the newest mission first; returns whether any was done."""
         began_s = self._monotonic()
-        self._look()
+        self._find_missions()
         self._progress = False
         tried = [gate for gate in self.gates.values() if gate.is_open]
         for delivery in self._newest_first():
             if self._work(delivery):
-                self._spooler.hasten()
+                self._spooler.expedite()
                 self._settled.add(delivery.folder.mission_id)
                 del self._deliveries[delivery.folder.mission_id]
             if self._progress and self._monotonic() - began_s > SLICE_S:
-                break  # a mission that begins must not wait for old ones
+                break  # a new mission must not wait for old ones
         else:
             if not self._progress:
                 self._try(STORE, self._drain)
             for gate in tried:
                 if gate.is_open:  # nothing failed
                     gate.worked()
-        self._tell()
+        self._write_state()
         return self._progress
 
     def _work(self, delivery: Delivery) -> bool:
-        """One piece for each receiver; whether nothing is left to do for this mission."""
+        """One piece of work for each receiver; returns whether this mission is done."""
         mission_id = delivery.folder.mission_id
         try:
             self._try(TRACKING, delivery.track, mission_id)
@@ -143,43 +144,43 @@ class Replay:
             self._try(OBJECTS, lambda: delivery.spool(hold=self.gates[TRACKING].error is not None), mission_id)
             return delivery.complete()
         except TrackingRefused as error:
-            log.error('mission %s is not sent on: %s', mission_id, error)  # noqa: TRY400 - no defect
-            said = str(error)
-        except Exception as error:  # the supervised catch-all: one rotten journal must not stop the others
+            log.error('mission %s is not sent any further: %s', mission_id, error)  # noqa: TRY400 - no defect
+            reason = str(error)
+        except Exception as error:  # the supervised catch-all: one corrupt journal must not stop the others
             log.error('mission %s cannot be sent', mission_id, exc_info=error)  # noqa: TRY400
-            said = f'{type(error).__name__}: {error}'
-        with suppress(OSError):  # the log has it as well
-            delivery.give_up(said)
+            reason = f'{type(error).__name__}: {error}'
+        with suppress(OSError):  # the log also has it
+            delivery.give_up(reason)
         return True
 
     @property
     def owes(self) -> bool:
-        """Whether something could not be sent yet."""
+        """Whether something is still unsent."""
         waits = bool(self._waiting) or any(delivery.awaits_agent for delivery in self._deliveries.values())
         return waits or any(gate.error for gate in self.gates.values()) or self._spooler.owes or self._drawing.busy
 
-    def hurry(self) -> None:
+    def retry_now(self) -> None:
         for gate in self.gates.values():
-            gate.hurry()
+            gate.retry_now()
 
-    def hasten(self) -> None:
-        """The agent is gone: write the last rows of the catalog soon, because no more will come."""
-        self._spooler.hasten()
+    def expedite(self) -> None:
+        """The agent has exited: write the last rows of the catalog soon."""
+        self._spooler.expedite()
 
     def close(self) -> None:
         self._spooler.close()
         self._drawing.close()
-        self._tell(ended=True)
+        self._write_state(ended=True)
 
-    def _look(self) -> None:
-        """Take up missions that are new here."""
+    def _find_missions(self) -> None:
+        """Start the delivery of new missions."""
         for folder in missions(self._home):
             if folder.mission_id not in self._deliveries and folder.mission_id not in self._settled and folder.journal.exists():
                 try:
                     self._take_up(folder)
                 except OSError as error:
                     self._waiting.add(folder.mission_id)
-                    self._say(folder.mission_id, error)
+                    self._log_once(folder.mission_id, error)
 
     def _take_up(self, folder: MissionFolder) -> None:
         if folder.sent().complete:
@@ -189,12 +190,12 @@ class Replay:
         elif self._settle(folder):
             self._deliveries[folder.mission_id] = Delivery(folder, self._tracking, self._spooler, self._drawing.of)
             self._waiting.discard(folder.mission_id)
-            self.gates[TRACKING].hurry()  # its agent waits for the run's id
+            self.gates[TRACKING].retry_now()  # its agent waits for the run's id
         else:
             self._waiting.add(folder.mission_id)
 
     def _newest_first(self) -> list[Delivery]:
-        """Those that something holds up come last: the others would wait for them whenever it is tried again."""
+        """Delayed missions come last: otherwise every retry of theirs would delay the others."""
         stuck = {mission_id for _, mission_id in self._stuck}
         found = sorted(self._deliveries.items(), key=lambda item: (item[0] not in stuck, _age(item[0])), reverse=True)
         return [delivery for _, delivery in found]
@@ -210,48 +211,48 @@ class Replay:
         except (DataLoggerError, OSError, sqlite3.Error) as error:
             gate.failed(error)
             self._stuck.add((name, mission_id))
-            self._say(name, error)
+            self._log_once(name, error)
         else:
             if worked:
                 gate.worked()
                 self._stuck.discard((name, mission_id))
             self._progress = self._progress or worked
 
-    def _say(self, who: str, error: Exception) -> None:
-        """Once."""
+    def _log_once(self, who: str, error: Exception) -> None:
+        """Log an error once."""
         if str(error) not in self._logged:
             self._logged.add(str(error))
             log.warning('%s: %s', who, error)
 
     def _drain(self) -> bool:
-        """True while there is more to deliver."""
+        """Whether anything was delivered."""
         before = self._spooler.pending()
         self._spooler.drain()
         return self._spooler.pending() < before
 
-    def _tell(self, *, ended: bool = False) -> None:
-        """The state for whoever asks; written when it changes."""
+    def _write_state(self, *, ended: bool = False) -> None:
+        """Write the state for other processes when it changes."""
         errors = {
             name: {'error': str(gate.error), 'remedy': getattr(gate.error, 'remedy', '')}
             for name, gate in self.gates.items() if gate.error is not None
         }  # fmt: skip
         state: dict[str, object] = {'pid': 0 if ended else os.getpid(), 'errors': errors}
-        if state != self._told:
+        if state != self._written_state:
             try:
                 write_json(self._home / MISSIONS / STATE, state)
             except OSError as error:
-                self._say(STATE, error)
+                self._log_once(STATE, error)
             else:
-                self._told = state
+                self._written_state = state
 
 
 def _age(mission_id: str) -> list[str]:
-    """Greater for a mission that began later."""
+    """Greater for a mission that started later."""
     return mission_id.split('_')[-3:-1]
 
 
 class Parent:
-    """The agent: it wakes us by a byte, and its end is the end of our standard input."""
+    """The agent: it wakes the sender with a byte, and its exit is the end of standard input."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -259,27 +260,27 @@ class Parent:
         self.gone = False
 
     def wait(self, seconds: float) -> bool:
-        """Whether it woke us before."""
+        """Whether the agent woke the sender before the time was over."""
         if self.gone:
             time.sleep(seconds)
             return False
         ready = select.select([self._descriptor], [], [], seconds)[0]
-        said = os.read(self._descriptor, 4096) if ready else b''
-        self.gone = bool(ready and not said) or os.getppid() != self._pid
-        return bool(said)
+        read = os.read(self._descriptor, 4096) if ready else b''
+        self.gone = bool(ready and not read) or os.getppid() != self._pid
+        return bool(read)
 
     def has_ended(self) -> bool:
-        """The same as ``gone``, asked of the system, from any thread."""
+        """The same as ``gone``, without reading, from any thread."""
         poll = select.poll()
         poll.register(self._descriptor, 0)
         return bool(poll.poll(0)) or os.getppid() != self._pid
 
 
 class Successor:
-    """Looks whether a sender of an agent that lives waits for this one, whose agent is gone.
+    """Watches for a waiting sender with an agent, to which this one yields once its own agent has exited.
 
-    Life: New; start once; stop once. It owns its thread. A request that hangs does not hold it up: ``HANG_S`` after it saw one,
-    it ends the process, which is as safe as any kill of it.
+    Lifecycle: New; start once; stop once. It owns its thread. A hanging request does not delay it: ``HANG_S`` after it saw one,
+    it ends the process, which is as safe as a kill.
     """
 
     def __init__(self, waiting: Path, parent: Parent, end: Callable[[int], object] = os._exit) -> None:
@@ -301,27 +302,27 @@ class Successor:
         while not self.waits:
             if self._stopped.wait(LOOK_EVERY_S):
                 return
-            self.waits = self._parent.has_ended() and self._somebody_waits()
+            self.waits = self._parent.has_ended() and self._has_successor()
         log.info('a sender of another agent takes over')
         if not self._stopped.wait(HANG_S):
             self._end(0)
 
-    def _somebody_waits(self) -> bool:
+    def _has_successor(self) -> bool:
         try:
             with flock(self._waiting, wait=False) as free:
                 return not free
         except OSError as error:
-            log.warning('%s cannot be looked at: %s', self._waiting, error)
+            log.warning('%s cannot be locked: %s', self._waiting, error)
             return False
 
 
 def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
-    """Until all is sent and the agent is gone; or for ``LINGER_S`` after the last success."""
+    """Run until everything is sent and the agent has exited, or ``LINGER_S`` after the last success."""
     worked_s = time.monotonic()
     woken = False
     while not stopping():
         if woken:
-            replay.hurry()
+            replay.retry_now()
         if replay.step():
             worked_s = time.monotonic()
             woken = parent.wait(0.0)
@@ -329,24 +330,24 @@ def run(replay: Replay, parent: Parent, stopping: Callable[[], bool]) -> None:
         if parent.gone:
             if not replay.owes or time.monotonic() - worked_s > LINGER_S:
                 return
-            replay.hasten()
+            replay.expedite()
         woken = parent.wait(LOOK_EVERY_S)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Until all is sent, the agent is gone, or SIGTERM; SIGINT at the agent's terminal is none of ours."""
+    """Run until everything is sent and the agent has exited, or SIGTERM; SIGINT at the agent's terminal is ignored."""
     parser = argparse.ArgumentParser(prog='python -m shadowhound_data_logger.missions.replay', description='Send missions.')
     parser.add_argument('--home', type=Path, required=True)
     parser.add_argument('--experiment', required=True)
     options = parser.parse_args(arguments)
-    asked: list[int] = []
+    signals: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+    signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
     logging.basicConfig(level=logging.INFO, format='%(asctime)s %(levelname)s %(message)s')
     parent = Parent(sys.stdin.fileno())
     folder: Path = options.home / MISSIONS
     with ExitStack() as opened:
-        if not _locked(folder, opened, parent, lambda: bool(asked)):
+        if not _locked(folder, opened, parent, lambda: bool(signals)):
             return 0
         successor = Successor(folder / WAITING, parent)
         successor.start()
@@ -358,12 +359,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.home, tracking, Spooler(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
         )
         opened.callback(replay.close)
-        run(replay, parent, lambda: bool(asked) or successor.waits)
+        run(replay, parent, lambda: bool(signals) or successor.waits)
     return 0
 
 
 def _locked(folder: Path, opened: ExitStack, parent: Parent, stopping: Callable[[], bool]) -> bool:
-    """Wait until no other process sends; whether that came before the agent's end. Raises OSError."""
+    """Wait until no other process sends; False if the agent exits first. Raises OSError."""
     with flock(folder / WAITING, shared=True):
         while not opened.enter_context(flock(folder / LOCK, wait=False)):
             opened.close()
@@ -381,14 +382,14 @@ def open_tracking(home: Path, experiment: str) -> MlflowTracking:
         root.mkdir(mode=0o700, exist_ok=True)
     tracking = MlflowTracking(uri, experiment, root)
     try:
-        tracking.open()  # now, because it takes seconds that a mission's start should not wait for
+        tracking.open()  # now, because it takes seconds, for which a mission's start should not wait
     except TrackingUnavailable as error:
         log.warning('%s', error)
     return tracking
 
 
 def _private_store(home: Path) -> str:
-    """The home's own SQLite file, for its owner alone: commands and pictures of a home are nobody else's business."""
+    """A SQLite file in the home, readable by its owner only: commands and pictures of a home are private."""
     path = home / 'mlflow.db'
     os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
     return f'sqlite:///{path}'

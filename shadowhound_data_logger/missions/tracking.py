@@ -12,7 +12,7 @@ import os
 import posixpath
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.config import ENDPOINTS
 from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.core.tls import causes, distrust
 from shadowhound_data_logger.missions.folder import Run
-from shadowhound_data_logger.missions.story import Point
+from shadowhound_data_logger.missions.state import Point
 
 MISSION_TAG: Final = 'shadowhound.mission_id'
 DUPLICATE_TAG: Final = 'shadowhound.duplicate_of'
@@ -37,32 +37,36 @@ ENVIRONMENT: Final = {
     'GIT_PYTHON_REFRESH': 'quiet',
     'AWS_MAX_ATTEMPTS': '2',
 }
-"""Set before MLflow is imported, where the user says nothing else: the replayer itself tries again, with a backoff."""
+"""Defaults that are set before MLflow is imported: the sender does the retries, with a backoff."""
 REFUSALS: Final = frozenset({
     'INVALID_PARAMETER_VALUE', 'BAD_REQUEST', 'MALFORMED_REQUEST', 'RESOURCE_DOES_NOT_EXIST', 'INVALID_STATE',
     'RESOURCE_CONFLICT', 'NOT_IMPLEMENTED',
 })  # fmt: skip
-"""MLflow's error codes after which trying the same again is no use."""
+"""MLflow's error codes that a retry does not change."""
 LOGIN_CODES: Final = frozenset({'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOMER_UNAUTHORIZED'})
 STATUS_CODES: Final = {401: 'UNAUTHENTICATED', 403: 'PERMISSION_DENIED'}
-"""Of answers that come without a code, such as those of the proxy for artifacts."""
+"""For answers without a code, such as those of the proxy for artifacts."""
 TOO_LARGE: Final = 413
-"""The HTTP status of a proxy that will never take this file, whatever it takes besides."""
+"""The HTTP status of a proxy that refuses this file permanently."""
 OF_OBJECT: Final = frozenset({400, 404, 406, 409, 410, 412, 414, 422, 431, 451})
-"""HTTP statuses that may be about the object that was sent; whether they are, shows when the server takes others."""
+"""HTTP statuses that may be about the object that was sent: they are if the server accepts others."""
 OF_PATH: Final = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.EEXIST})
-"""The same of a folder."""
+"""The same for a folder."""
 RUN_GONE: Final = 'RUN_GONE'
-"""``data['code']`` of the refusal of everything that belongs to a run that somebody deleted."""
+"""``data['code']`` of a refusal because the run was deleted."""
+MOST_POINTS: Final = 1000
+"""MLflow's limit of a batch."""
+_Batch = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
+"""Points, params and tags."""
 S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
 _USER: Final = re.compile(r'//[^/\s]*@')
 
 
 class Tracking(Protocol):
-    """What the delivery of a mission asks of a tracking server."""
+    """The requests of a mission's delivery to a tracking server."""
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
-        """The mission's run, made where there is none."""
+        """The mission's run, created if missing."""
 
     def log(self, run_id: str, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
         """At most 1,000 points, 100 params and 100 tags."""
@@ -97,7 +101,7 @@ class MlflowTracking:
         return _USER.sub('//', self._uri)
 
     def open(self) -> None:
-        """Load MLflow, which takes seconds, and make the client; idempotent, and done by the first call where it was not."""
+        """Load MLflow, which takes seconds, and make the client; idempotent; otherwise the first request does it."""
         if self._client is not None:
             return
         for name, value in ENVIRONMENT.items():
@@ -105,7 +109,7 @@ class MlflowTracking:
         if endpoint := next(filter(None, map(os.environ.get, ENDPOINTS)), None):
             os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', endpoint)
         try:
-            with _without('pandas'):  # a third of the time and of the memory; mlflow-skinny has none either
+            with _without('pandas'):  # saves a third of time and memory; mlflow-skinny works without it, too
                 from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere
         except ImportError as error:
             remedy = 'install mlflow-skinny for a server, mlflow for sqlite: and file: stores'
@@ -113,8 +117,8 @@ class MlflowTracking:
         try:
             with self._translated('cannot be used'):  # SQLite's tables are made here
                 self._client = MlflowClient(tracking_uri=self._uri)
-        except TrackingRefused as error:  # nothing was sent yet: it is the address that this MLflow cannot do with
-            remedy = 'set MLFLOW_TRACKING_URI to a server, http://TOWER_IP:5001; for sqlite: install mlflow beside mlflow-skinny'
+        except TrackingRefused as error:  # nothing was sent yet: this MLflow does not support the address
+            remedy = 'set MLFLOW_TRACKING_URI to a server, http://TOWER_IP:5001; for sqlite: also install mlflow'
             raise TrackingUnavailable(f'{error}', remedy=remedy) from error
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
@@ -149,7 +153,7 @@ class MlflowTracking:
         self.open()
         if run.artifact_uri.startswith('s3:') and not os.environ.get('MLFLOW_S3_ENDPOINT_URL'):
             text = (
-                f'artifacts of run {run.run_id} lie in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not say where that is'
+                f'artifacts of run {run.run_id} are in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not name that server'
             )
             raise TrackingUnavailable(text, remedy=S3_REMEDY)
         what, remedy = f'did not take the artifact {posixpath.join(folder, path.name)!r} of run {run.run_id}', ''
@@ -162,7 +166,7 @@ class MlflowTracking:
         self.open()
         with self._translated(f'did not end run {run_id}'):
             for run in self._runs(self._experiment_of(), mission_id):
-                if run.info.run_id != run_id:  # made by a request that seemed lost
+                if run.info.run_id != run_id:  # created by a request that seemed lost
                     self._client.set_tag(run.info.run_id, DUPLICATE_TAG, run_id)
                     self._delete(run.info.run_id)
             self._client.set_terminated(run_id, status=status, end_time=end_ms)
@@ -170,7 +174,7 @@ class MlflowTracking:
     def tagged(self, tag: str, value: str) -> list[str]:
         """The ids of the runs of all experiments that have this tag."""
         self.open()
-        with self._translated('does not say which runs there are'):
+        with self._translated('did not list its runs'):
             experiments = [each.experiment_id for each in self._client.search_experiments()]
             found: list[str] = []
             for start in range(0, len(experiments), 100):
@@ -184,7 +188,7 @@ class MlflowTracking:
             return sorted(found)
 
     def _delete(self, run_id: str) -> None:
-        """Where this user may not delete, as on a Tower with passwords, the run stays, ended and with its tag."""
+        """Without the right to delete, as on a Tower with passwords, the run stays, ended and with its tag."""
         from mlflow.exceptions import MlflowException  # noqa: PLC0415 - see open
 
         try:
@@ -196,13 +200,13 @@ class MlflowTracking:
 
     def _is_gone(self, run_id: str) -> bool:
         try:
-            with self._translated(f'does not say what run {run_id} is'):
+            with self._translated(f'did not describe run {run_id}'):
                 return bool(self._client.get_run(run_id).info.lifecycle_stage != 'active')
         except TrackingRefused:
             return True
 
     def _experiment_of(self) -> str:
-        """The id of the experiment, made where there is none; another process may make it at the same time."""
+        """The id of the experiment, created if missing; another process may create it at the same time."""
         if not self._experiment_id:
             found = self._client.get_experiment_by_name(self._experiment)
             if found is None:
@@ -221,7 +225,7 @@ class MlflowTracking:
             return self._client.get_experiment(self._client.create_experiment(self._experiment, artifact_location=location))
         except MlflowException as error:
             if error.error_code == 'PERMISSION_DENIED':
-                text = f'there is no experiment {self._experiment} in {self.where}, and this user may not make it'
+                text = f'there is no experiment {self._experiment} in {self.where}, and this user may not create it'
                 remedy = 'on Tower: make tower-secrets TOWER_ARGS="--robot NAME", and start MLflow again'
                 raise TrackingUnavailable(text, remedy=remedy, code=error.error_code) from error
             if error.error_code != 'RESOURCE_ALREADY_EXISTS':
@@ -229,14 +233,14 @@ class MlflowTracking:
             return self._client.get_experiment_by_name(self._experiment)
 
     def _runs(self, experiment: str, mission_id: str) -> list[Any]:
-        """The runs of a mission that nobody deleted, always in the same order."""
+        """The runs of a mission that were not deleted, always in the same order."""
         found = self._client.search_runs([experiment], f"tags.`{MISSION_TAG}` = '{mission_id}'", max_results=10)
         ours = [run for run in found if DUPLICATE_TAG not in run.data.tags]
         return sorted(ours, key=lambda run: (run.info.start_time, run.info.run_id))
 
     @contextmanager
     def _translated(self, what: str, remedy: str = '') -> Iterator[None]:
-        """``remedy`` is that of a failure without an answer of MLflow's."""
+        """``remedy`` is used for a failure without an answer of MLflow."""
         from mlflow.exceptions import MlflowException, RestException  # noqa: PLC0415 - see open
 
         try:
@@ -251,7 +255,7 @@ class MlflowTracking:
             self._raise_distrust(error)
             of_object = code in REFUSALS or _is_of_object(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code, of_object=of_object) from error
-        except Exception as error:  # what a client, or a store of artifacts, raises besides (a portal's page is not JSON)
+        except Exception as error:  # what else a client or a store of artifacts raises (a portal's page is not JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             status = _status(error)
@@ -262,14 +266,14 @@ class MlflowTracking:
             raise TrackingUnavailable(text, remedy=remedy, code=code, of_object=_is_of_object(error)) from error
 
     def _raise_distrust(self, error: Exception) -> None:
-        """Raises TrackingUnavailable where the certificate of the server is not believed, or of the store of artifacts."""
-        bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE where artifacts go to the S3 server itself)'
+        """Raises TrackingUnavailable if the certificate of the server, or of the store of artifacts, is not trusted."""
+        bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE if artifacts are sent to the S3 server itself)'
         if found := distrust(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
             raise TrackingUnavailable(found[0], remedy=found[1], code='CERTIFICATE') from error
 
 
 def _status(error: BaseException) -> int:
-    """The HTTP status of the answer, of MLflow's server or an S3 server; 0 where there was none."""
+    """The HTTP status of the answer of MLflow or an S3 server; 0 without an answer."""
     for cause in causes(error):
         response: Any = getattr(cause, 'response', None)
         if isinstance(response, dict):  # botocore's
@@ -287,24 +291,51 @@ def _is_of_object(error: BaseException) -> bool:
 
 @contextmanager
 def _without(module: str) -> Iterator[None]:
-    """Have an optional dependency look as if it were not installed, unless it is loaded already."""
+    """Hide an optional dependency, unless it is loaded already."""
     if module in sys.modules:
         yield
         return
-    sys.modules[module] = None  # type: ignore[assignment]  # that is how the import system spells it
+    sys.modules[module] = None  # type: ignore[assignment]  # documented for the import system
     try:
         yield
     finally:
         del sys.modules[module]
 
 
+def send(tracking: Tracking, run_id: str, batch: _Batch, refused: Callable[[Exception], None]) -> None:
+    """Send a batch; what the server refuses is found by halving, reported to ``refused`` and skipped. Raises TrackingError."""
+    points, params, tags = batch
+    if not (points or params or tags):
+        return
+    try:
+        tracking.log(run_id, points, params, tags)
+    except TrackingRefused as error:
+        if error.data.get('code') == RUN_GONE:
+            raise
+        parts = _parts(points, params, tags)
+        for each in parts:
+            send(tracking, run_id, each, refused)
+        if not parts:
+            refused(error)
+
+
+def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[_Batch]:
+    """What a refused batch is split into; empty for a single item."""
+    if len(points) + len(params) + len(tags) <= 1:
+        return []
+    half = len(points) // 2
+    halves: list[_Batch] = [(points[:half], {}, {}), (points[half:], {}, {})]
+    singles: list[_Batch] = [([], {name: value}, {}) for name, value in params.items()]
+    return [*halves, *singles, *(([], {}, {name: value}) for name, value in tags.items())]
+
+
 def remedy_for(code: str) -> str:
     """What an operator can do about an error code of MLflow."""
     if code in LOGIN_CODES:
         return (
-            'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD (or ~/.mlflow/credentials, which is read again by '
-            'itself), or MLFLOW_TRACKING_TOKEN'
+            'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD (or ~/.mlflow/credentials, which is read again '
+            'automatically), or MLFLOW_TRACKING_TOKEN'
         )
     if code == 'ENDPOINT_NOT_FOUND':
         return 'is MLFLOW_TRACKING_URI the address of an MLflow server?'
-    return 'is MLFLOW_TRACKING_URI right, and Tower on? It is tried again by itself'
+    return 'is MLFLOW_TRACKING_URI correct, and Tower on? The request is retried automatically'

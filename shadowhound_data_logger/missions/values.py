@@ -1,7 +1,7 @@
-"""What the tracking server accepts: names, numbers and texts, checked or cut before they are journalled.
+"""What the tracking server accepts: names, numbers and texts, checked or cut before they are journaled.
 
 The limits are MLflow's own (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2, the smaller of both; the colon in names, which
-2.14 refuses, is left out). A request holds at most 1,000 points, params and tags together, and a million characters.
+2.14 refuses, is not allowed). A request holds at most 1,000 points, params and tags together, and a million characters.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ MAX_KEY: Final = 250
 MAX_KEYS: Final = 50
 """Metrics in one record."""
 MAX_TYPE: Final = 128
-"""Letters of a mission's type: a word, which must fit into an object's metadata."""
+"""Characters of a mission's type, which must fit into an object's metadata."""
 MAX_PARAM: Final = 6000
 MAX_TAG: Final = 5000
-"""What 2.14 takes; 3.17 takes 8,000."""
+"""The limit of 2.14; that of 3.17 is 8,000."""
 MAX_TEXT: Final = 1 << 20
-"""Of anything that is journalled: a mission's command is not a film."""
+"""Of any text in the journal."""
 MAX_STEP: Final = (1 << 63) - 1
 MAX_BITS: Final = 1024
-"""Of a number in an event: far larger ones Python does not even write."""
+"""Of an integer in an event: Python refuses to print far larger ones."""
 JPEG: Final = b'\xff\xd8'
 JPEG_QUALITY: Final = 90
 MAX_SIDE: Final = 65_500
@@ -39,8 +39,8 @@ MAX_NAME_BYTES: Final = 240
 """A file has at most 255, of which boto3 needs 9 while it downloads one."""
 MAX_EXTENSION: Final = 16
 _ODD: Final = re.compile(r'[\x00-\x1f\x7f-\x9f#?\\\ud800-\udfff]|%(?=[0-9A-Fa-f]{2})|=(?=[0-9A-F]{2})|^ ')
-"""What does not arrive, tried with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX`` until none
-is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and a
+"""What does not arrive, tested with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX`` until
+none is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and a
 leading blank."""
 _ODD_FOLDER: Final = re.compile(rf"{_ODD.pattern}|'|^\.(?=\.)")
 """MLflow puts a folder into a query between quotes, and takes ``..x`` for a way out."""
@@ -68,8 +68,8 @@ def number(value: Any, what: str) -> float:
     return found
 
 
-def whole(value: Any, what: str) -> int:
-    """A step or id; raises Rejected for what is none or too large for 64 bits."""
+def integer(value: Any, what: str) -> int:
+    """A step or id; raises Rejected for what is not an integer or has more than 64 bits."""
     try:
         found = int(_element(value))
     except (TypeError, ValueError, OverflowError, RuntimeError):
@@ -106,8 +106,8 @@ def jpeg(value: Any, what: str) -> memoryview:
     if not isinstance(value, (bytes, bytearray)) and any(hasattr(value, name) for name in _ARRAYS):
         return memoryview(_encoded(value, what))
     begins = f' that begins with {bytes(data[:4]).hex(" ")}' if data else ''
-    said = f'{what} is {type(value).__name__}{begins}, not a JPEG: encode it, or pass its pixels as an array of uint8'
-    raise Rejected('no_image', said)
+    error = f'{what} is {type(value).__name__}{begins}, not a JPEG: encode it, or pass its pixels as an array of uint8'
+    raise Rejected('no_image', error)
 
 
 def _encoded(value: Any, what: str) -> bytes:
@@ -116,7 +116,7 @@ def _encoded(value: Any, what: str) -> bytes:
 
     try:
         pixels = np.asarray(value)
-    except Exception as error:  # a tensor of another device, for one
+    except Exception as error:  # such as a tensor on another device
         raise Rejected('no_image', f'{what} is {type(value).__name__}, which numpy cannot read: {error}') from error
     if pixels.dtype != np.uint8:
         raise Rejected('no_image', f'{what} is an array of {pixels.dtype}, not of uint8: scale it, (image * 255).astype("uint8") '
@@ -130,10 +130,10 @@ def _encoded(value: Any, what: str) -> bytes:
 
 
 def text(value: object, limit: int = MAX_TEXT) -> str:
-    """Any value as text that every database takes: no NUL (PostgreSQL), no lone surrogates, at most ``limit`` characters."""
+    """Any value as text that every database accepts: no NUL (PostgreSQL), no lone surrogates, at most ``limit`` characters."""
     try:
         found = str(value)
-    except Exception:  # noqa: BLE001 - an agent's own class raises what it likes, and Python for a number of 5,000 digits
+    except Exception:  # noqa: BLE001 - an agent's class may raise anything, and Python does for a number of 5,000 digits
         found = f'<{type(value).__name__}>'
     return found.replace('\0', '\N{REPLACEMENT CHARACTER}').encode('utf-8', 'replace').decode('utf-8')[:limit]
 
@@ -152,7 +152,7 @@ def artifact_folder(path: object) -> str:
 def artifact_name(name: str, odd: re.Pattern[str] = _ODD) -> str:
     """The name under which a run can have a file: unchanged, if MLflow's server and clients list it and download it as that.
 
-    Otherwise ``=XX`` stands for each byte that they do not take (``map#1.png`` is ``map=231.png``), ``=`` before two such digits
+    Otherwise ``=XX`` replaces each byte that they do not accept (``map#1.png`` is ``map=231.png``), ``=`` before two such digits
     among them, so that two names never become one. A name of more than 240 bytes is cut and has a hash.
     """
     found = _SCHEME.sub(r'\1=3A', odd.sub(lambda match: _escaped(match[0]), name))
@@ -170,7 +170,7 @@ def _escaped(letters: str) -> str:
 
 
 def _bytes(name: str) -> bytes:
-    """As the file system has it; lone surrogates that it cannot have become question marks."""
+    """As in the file system; lone surrogates become question marks."""
     try:
         return name.encode('utf-8', 'surrogateescape')
     except UnicodeEncodeError:
@@ -178,13 +178,13 @@ def _bytes(name: str) -> bytes:
 
 
 def plain(value: Any, depth: int = 4) -> Any:
-    """The value as JSON can hold it: what it cannot becomes text."""
+    """The value as JSON; what JSON cannot represent becomes text."""
     if value is None or (isinstance(value, int) and value.bit_length() <= MAX_BITS):
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict) and depth:
-        copy = dict(value)  # in one step: another thread of the agent may change it meanwhile
+        copy = dict(value)  # in one step: another thread of the agent may change it at the same time
         return {text(key, MAX_KEY): plain(inner, depth - 1) for key, inner in copy.items()}
     if isinstance(value, (list, tuple)) and depth:
         return [plain(inner, depth - 1) for inner in value]
@@ -192,15 +192,15 @@ def plain(value: Any, depth: int = 4) -> Any:
 
 
 def bounded(value: Any) -> Any:
-    """The value unchanged; raises Rejected for what is not a record any more but a file."""
+    """The value unchanged; raises Rejected if it is too large for a record."""
     size = len(json.dumps(value))
     if size > MAX_TEXT:
         raise Rejected('too_large', f'an event of {size} characters: log_artifact takes a file')
     return value
 
 
-def truth(value: object) -> bool:
-    """False for what has none, such as an array."""
+def boolean(value: object) -> bool:
+    """The truth value; False for objects without one, such as arrays."""
     try:
         return bool(value)
     except (TypeError, ValueError):
@@ -208,5 +208,5 @@ def truth(value: object) -> bool:
 
 
 def _is_plain(path: str) -> bool:
-    """Whether it stays what it is, and where it is, when it is taken for a file's path."""
+    """Whether it stays unchanged, and below its folder, as a file's path."""
     return posixpath.normpath(path) == path and path != '.' and not path.startswith(('..', '/'))

@@ -53,7 +53,7 @@ from shadowhound_data_logger.node.reporting.front import Front
 from shadowhound_data_logger.node.reporting.interface import Interface
 from shadowhound_data_logger.node.reporting.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.ros.reader import endpoints, node_of
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.shipping.uploader import Uploader
@@ -149,7 +149,7 @@ class Pipeline:
         self.uploader.wait_for(self._rules.closed)
         self._make_request_server(track)
         keeps = self._requests is not None
-        self._catalogue = CatalogueWriter(settings.spool_path, settings.catalogue, settings.robot, self._clock, keeps=keeps)
+        self._catalog = CatalogWriter(settings.spool_path, settings.catalog, settings.robot, self._clock, keeps=keeps)
         self.writer.on_commit(spooled=self.uploader.wake, settled=self._settled if keeps else self.uploader.settled)
         sampler = Sampler(sensors, accounts, types, queue)
         accounts.oldest_open = sampler.oldest_open
@@ -163,7 +163,9 @@ class Pipeline:
         marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
                                preview=keeping.preview, reports=RejectionLog(partial(node_of, node)))  # fmt: skip
-        self._control = ControlSocket(self.spool.root, settings.robot, self._node.create_guard_condition(self._obey).trigger)
+        self._control = ControlSocket(
+            self.spool.root, settings.robot, self._node.create_guard_condition(self._handle_requests).trigger
+        )
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
                                        self._ros.front, self._make_unheard(), self._requests)  # fmt: skip
@@ -236,7 +238,7 @@ class Pipeline:
         end_s = time.monotonic() + self._settings.shutdown.drain_s
         self.uploader.drain(end_s - time.monotonic())
         self.writer.flush(1.0)
-        self._spool_parts(self._catalogue.parts)
+        self._spool_parts(self._catalog.parts)
         self.writer.flush(1.0)
         if self._settings.shutdown.drain_s and not self.uploader.drain(end_s - time.monotonic()):
             log.warning(
@@ -252,7 +254,8 @@ class Pipeline:
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'
             raise SpoolError(text, remedy='start the node again: it is rebuilt then')
-        self._obey()  # whoever woke the executor just as it went to sleep is not heard (rmw_fastrtps clears the condition unseen)
+        # rmw_fastrtps may clear the condition unseen if it is triggered just as the executor goes to sleep.
+        self._handle_requests()
         now_s = time.monotonic()
         if not self._supervise() and now_s < self._due_s:
             return
@@ -260,7 +263,7 @@ class Pipeline:
         self._name_held()
         self.uploader.wait_for(self._rules.look())
         self.recorder.look()
-        self._spool_parts(self._catalogue.due)
+        self._spool_parts(self._catalog.due)
         self._look_at_link()
         self._tell()
         day = self._today()
@@ -268,9 +271,9 @@ class Pipeline:
             self._day = day
             self._ship_ledger()
 
-    def _obey(self) -> None:
+    def _handle_requests(self) -> None:
         """Called by the executor when somebody asks for something at the control socket."""
-        self._control.obey(self._commands.answer)
+        self._control.handle_requests(self._commands.answer)
 
     def _supervise(self) -> bool:
         """Start threads again that died; whether any thread failed since the last time."""
@@ -307,12 +310,12 @@ class Pipeline:
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
                                        cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
-                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._hasten,
+                                       may_send=lambda: KEEP_WHEN not in self._rules.closed, finished=self._expedite,
                                        thin=thinner.step)  # fmt: skip
 
-    def _hasten(self) -> None:
+    def _expedite(self) -> None:
         """Somebody waits for what was asked for."""
-        self._catalogue.hasten()
+        self._catalog.expedite()
 
     def _settled(self, ids: Collection[int]) -> None:
         self.uploader.settled(ids)
@@ -334,7 +337,7 @@ class Pipeline:
         self.recorder.on_mission(mission)
         self.event_buffer.on_mission(mission)
         if not mission:
-            self._catalogue.hasten()
+            self._catalog.expedite()
 
     def _tell(self, *, ended: bool = False) -> None:
         status = self._status.look(ended=ended)
@@ -354,12 +357,12 @@ class Pipeline:
             log.warning('the ledger was not shipped: %s', error)
 
     def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
-        """The catalogue's next parts; what keeps them back now keeps them until the next time."""
+        """The catalog's next parts; what keeps them back now keeps them until the next time."""
         try:
             for part in made():
                 self.writer.put(part, wait=False)
         except (DataLoggerError, sqlite3.Error) as error:
-            log.warning('the catalogue is not written yet: %s', error)
+            log.warning('the catalog is not written yet: %s', error)
 
     def _look_at_link(self, *, is_last: bool = False) -> None:
         """How fast uploads go where the robot is, where somebody may ask for more of them."""

@@ -11,14 +11,14 @@ import os
 import sys
 
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.node.intake.middleware import asked_for, choose
+from shadowhound_data_logger.node.intake.middleware import choose, requested_rmw
 
 
 def main(args: list[str] | None = None) -> int:
     """The console script; ``args`` are ROS arguments without the program's name."""
     arguments = sys.argv[1:] if args is None else args
     try:
-        middleware = choose(asked_for(arguments), os.environ)
+        middleware = choose(requested_rmw(arguments), os.environ)
     except SettingError as error:
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201 - there is no logger yet
         return 2

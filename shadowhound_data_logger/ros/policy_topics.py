@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 NODE: Final = 'shadowhound_policy'
 LOOK_S: Final = 0.1
 """How late a change of the active version is published."""
-MOST_HEALTH_BYTES: Final = 4096
-MOST_VALUE: Final = 1e9
+MAX_HEALTH_BYTES: Final = 4096
+MAX_VALUE: Final = 1e9
 """Failures, and ms."""
 END_S: Final = 5.0
 
@@ -69,16 +69,16 @@ class PolicyTopics:
 
     def _judged(self, text: str) -> str:
         """Why it counts for nothing; empty where it was judged."""
-        if len(text) > MOST_HEALTH_BYTES:
+        if len(text) > MAX_HEALTH_BYTES:
             return 'size'
         try:
-            told = from_json(text.encode(), MOST_HEALTH_BYTES)
+            told = from_json(text.encode(), MAX_HEALTH_BYTES)
             name, failures, p99_ms = told['policy'], told.get('failures', 0), told.get('p99_ms', 0.0)
         except (ValueError, KeyError, TypeError, AttributeError):
             return 'json'
         if type(failures) is not int or type(p99_ms) not in {int, float}:
             return 'values'
-        if not (0 <= failures <= MOST_VALUE and 0 <= p99_ms <= MOST_VALUE):
+        if not (0 <= failures <= MAX_VALUE and 0 <= p99_ms <= MAX_VALUE):
             return 'values'
         if not name or name != self._folder.current():
             return 'other'

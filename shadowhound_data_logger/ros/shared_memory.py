@@ -32,7 +32,7 @@ from shadowhound_data_logger.ros.port_guard import FOLDER, settle
 log = logging.getLogger(__name__)
 STARTING_S: Final = 5.0
 """A process that starts has its file before it has its lock."""
-MOST_DEAD_PORTS: Final = 50
+MAX_DEAD_PORTS: Final = 50
 """Fast DDS tries a hundred."""
 _PORT: Final = re.compile(r'((?:fastdds|fastrtps)_port(\d{4,5}))_el')
 _LOCK: Final = re.compile(r'(?:fastdds|fastrtps)_[0-9a-f]{16}_el')
@@ -81,7 +81,7 @@ def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Pat
                 dead[found[1]] = path.with_name(found[1]).lstat().st_mtime_ns
     written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))  # those that died last first
     with ExitStack() as held:
-        yield [name for name in written[:MOST_DEAD_PORTS] if _has_lock(folder / f'{name}_el', held)]
+        yield [name for name in written[:MAX_DEAD_PORTS] if _has_lock(folder / f'{name}_el', held)]
 
 
 class PortGuard:

@@ -1,4 +1,4 @@
-"""The robot's side of the catalogue and the gap journal: makes parts of what is new, and spools them like any object.
+"""The robot's side of the catalog and the gap journal: makes parts of what is new, and spools them like any object.
 
 Every delivered object is in exactly one part, whoever delivered it and whenever a process died: the list of what is in none
 yet is the spool index's, and a part takes its rows off it in the transaction that makes the part durable.
@@ -16,7 +16,7 @@ from typing import Final
 
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import Clock, utc
-from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import LOST, ON_ROBOT, DataObject
@@ -42,13 +42,13 @@ PRIORITY: Final = 1
 """As a mission's summary: a part has what the store holds already."""
 
 
-class CatalogueWriter:
-    """Makes parts of the catalogue and of the gap journal from what was delivered and lost.
+class CatalogWriter:
+    """Makes parts of the catalog and of the gap journal from what was delivered and lost.
 
     New; ``due`` now and then, on one thread. The thread that commits spools what it returns.
     """
 
-    def __init__(self, spool: Path, settings: CatalogueSettings, robot: str, clock: Clock,
+    def __init__(self, spool: Path, settings: CatalogSettings, robot: str, clock: Clock,
                  monotonic: Callable[[], float] = time.monotonic, *, keeps: bool = False) -> None:  # fmt: skip
         """``keeps``: objects are kept here until somebody asks for them, and who may ask is told of them soon."""
         self._spool = spool
@@ -77,11 +77,11 @@ class CatalogueWriter:
             self._kept_due_s = now_s + KEPT_S
             return self._kept_parts()
         made = self.parts()
-        if sum(len(part.catalogues) for part in made) < MOST_ROWS and not self._gaps.has_more:
+        if sum(len(part.catalogs) for part in made) < MOST_ROWS and not self._gaps.has_more:
             self._due_s = now_s + self._settings.period_s
         return made
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         """Somebody waits for what happened until now: the end of a mission. Any thread."""
         self._due_s = min(self._due_s, self._monotonic() + SOON_S)
 
@@ -98,7 +98,7 @@ class CatalogueWriter:
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            listed = index.catalog.uncatalogued(MOST_ROWS)
+            listed = index.catalog.uncataloged(MOST_ROWS)
         there = {item.id for item in listed}
         # A part takes all its rows at once: where one has gone without the others, another process's part has it, not ours.
         self._handed = [numbers for numbers in self._handed if numbers <= there]
@@ -106,7 +106,7 @@ class CatalogueWriter:
         new = [item for item in listed if item.id not in handed]
         rows = [(item.id, row_of(item.bucket, item.key, item.size, item.content_type, item.metadata)) for item in new]
         made = [self._part(robot, date, found) for robot, date, found in parts.by_folder(rows)]
-        self._handed += [frozenset(part.catalogues) for part in made]
+        self._handed += [frozenset(part.catalogs) for part in made]
         packed = {item.id: item.statistics for item in new if item.statistics}
         statistics = self._statistics_parts([(number, row) for number, row in rows if number in packed], packed)
         # Before the rows: what is told goes with those from the index, and statistics that are told twice do no harm.
@@ -141,7 +141,7 @@ class CatalogueWriter:
         for robot, date, found in parts.by_folder(rows):
             told = tuple((new[place][2].id, new[place][0]) for place, _ in found)
             part = self._part(robot, date, found, KEPT)
-            made.append(replace(part, catalogues=(), tells=told))
+            made.append(replace(part, catalogs=(), tells=told))
             self._told.append(frozenset(told))
         return made
 
@@ -154,7 +154,7 @@ class CatalogueWriter:
             bucket=BUCKET, key=of.part_key(robot, date, name), body=parts.encode(rows, of), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
             protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
-            catalogues=tuple(number for number, _ in found) if of is OBJECTS else (),
+            catalogs=tuple(number for number, _ in found) if of is OBJECTS else (),
         )  # fmt: skip
 
     def _named(self, robot: str | None) -> str:

@@ -62,11 +62,11 @@ WINDOW_S: Final = 5.0
 """The same in seconds of the link, but one object always may go."""
 WINDOW_BYTES: Final = 4 << 20
 """The same where the pace of the link is not known."""
-LEAST_WINDOW, MOST_WINDOW = 1 << 20, 16 << 20
+MIN_WINDOW, MOST_WINDOW = 1 << 20, 16 << 20
 """In bytes."""
 TELL_S: Final = 30.0
 """Between two answers of how far a request is."""
-MOST_REQUESTS: Final = 4096
+MAX_REQUESTS: Final = 4096
 """That are remembered at a time; beyond it those are forgotten that were answered first."""
 AT_A_TIME: Final = 64
 """New requests of one look: each is tried on all that is kept."""
@@ -128,7 +128,7 @@ class RequestServer:
     when it returns, so a death at any moment leaves nothing half done.
     """
 
-    def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbour
+    def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbor
                  put: Callable[[DataObject], None], released: Callable[[Sequence[SpooledObject]], None], cutter: Cutter,
                  mbps: Callable[[], float | None] = lambda: None, may_send: Callable[[], bool] = lambda: True,
                  finished: Callable[[], None] = lambda: None, thin: Callable[[], bool] = lambda: False,
@@ -193,7 +193,7 @@ class RequestServer:
             self._is_clear = True
         with suppress(StoreError):  # which says how many answers there were; it is asked again
             while self._asked_here:
-                self._obey([self._asked_here[0]])
+                self._handle_requests([self._asked_here[0]])
                 self._asked_here.popleft()
         if now_s >= self._poll_at_s:
             self._poll_at_s = now_s + self._settings.poll_s
@@ -273,9 +273,9 @@ class RequestServer:
                 reads.append(read_entry(self._robot, entry))
             except RequestRefused as error:
                 self._refuse(error.reason, f'an entry of the mailbox is refused: {error}')
-        return self._obey(reads)
+        return self._handle_requests(reads)
 
-    def _obey(self, reads: Sequence[PullRequest | PullCancel]) -> bool:
+    def _handle_requests(self, reads: Sequence[PullRequest | PullCancel]) -> bool:
         """Whether all of it is done. Raises StoreError."""
         known = {row.id: row for row in self._spool.requests()}
         new, cancels = dict[str, PullRequest](), []
@@ -285,10 +285,10 @@ class RequestServer:
                 cancels.append(read)
             elif row is None or (not row.is_open and row.told == row.state and read.made_ns != row.made_ns):
                 new.setdefault(read.id, read)
-        if (beyond := len(known) + len(new) - MOST_REQUESTS) > 0:
+        if (beyond := len(known) + len(new) - MAX_REQUESTS) > 0:
             self._spool.forget_requests(self._clock.wall_ns(), beyond)
             known = {row.id: row for row in self._spool.requests()}
-        room = max(0, MOST_REQUESTS - len(known))
+        room = max(0, MAX_REQUESTS - len(known))
         if len(new) > room:
             self._refuse('too_many', 'too many requests are open')
         known |= {row.id: row for row in self._accept(_in_turn(list(new.values()))[: min(AT_A_TIME, room)], known)}
@@ -344,7 +344,7 @@ class RequestServer:
     def _release(self, rows: Sequence[RequestRow]) -> bool:
         """Let the next objects wait for delivery; whether there are any."""
         mbps = self._mbps()
-        window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), LEAST_WINDOW), MOST_WINDOW)
+        window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), MIN_WINDOW), MOST_WINDOW)
         count, size = self._spool.released()
         if not rows or count > WINDOW // 2 or size > window // 2:
             return False
@@ -418,7 +418,7 @@ class RequestServer:
 
     def _send_whole(self, row: RequestRow, cut: SliceCut, error: Exception) -> None:
         log.warning('%d slices are sent whole, since they cannot be cut: %s', len(cut.slices), error)
-        self._spool.set_whole(row.id, [each.id for each in cut.slices])
+        self._spool.set_complete(row.id, [each.id for each in cut.slices])
 
     def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
         """Of the requester who was served least, the most important request, of these the oldest."""

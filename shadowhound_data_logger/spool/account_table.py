@@ -23,7 +23,7 @@ class AccountTable(Table):
     def begin_session(self, robot: str, boot_id: str, pid: int, now_ns: int) -> int:
         query = 'INSERT INTO sessions (robot, boot_id, pid, started_ns) VALUES (?,?,?,?)'
         cursor = self._db.execute(query, (robot, boot_id, pid, now_ns))
-        self._db.execute('INSERT OR IGNORE INTO gaps_told VALUES (?, 0, 0)', (robot,))
+        self._db.execute('INSERT OR IGNORE INTO gaps_reported VALUES (?, 0, 0)', (robot,))
         return int(cursor.lastrowid or 0)
 
     def begin_after(self, session: int, number: int) -> None:

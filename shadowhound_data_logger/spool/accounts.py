@@ -15,7 +15,7 @@ from typing import Final
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.core.stamps import StampReport
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
-from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
 from shadowhound_data_logger.spool.span import NumberRun, Span
 
@@ -171,7 +171,7 @@ class TopicAccount:
         """What is known of the stamps of messages without numbers."""
         self.estimate.expect(expected)
 
-    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: Hearing, newest_ns: int = 0) -> Losses:
+    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: ArrivalContext, newest_ns: int = 0) -> Losses:
         """Estimate what was lost before messages without numbers, just received: publisher ('' where not known) -> stamps.
 
         ``newest_ns`` is when the last of them was sent, whatever the stamps are; 0 where that is not known.
@@ -602,7 +602,7 @@ class Accounts:
     @staticmethod
     def _row(topic: str, account: TopicAccount, count: int, newest_ns: int, latest_ns: int) -> TopicRow:
         heard_ns = min(account.gaps.heard_ns, latest_ns)
-        if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_heard:
+        if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_received:
             account.first_ns = heard_ns
         if account.accounting not in {'', RECEIVED_ONLY} and not account.is_awaiting(heard_ns):
             settled_ns = account.settled_ns

@@ -17,10 +17,10 @@ from shadowhound_data_logger.core.untrusted import from_json
 
 log = logging.getLogger(__name__)
 
-MOST_ACTS: Final = 200
+MAX_ACTS: Final = 200
 MOST_BYTES: Final = 1 << 20
 """Of the file; it has a third of that where each answer is as long as it may be."""
-MOST_SAID: Final = 300
+MAX_SAID: Final = 300
 """Letters of an answer."""
 
 
@@ -38,9 +38,9 @@ def read(spool: Path, robot: str) -> list[dict[str, Any]]:
             {
                 'at_ns': int(each['at_ns']),
                 'ok': bool(each['ok']),
-                **{name: str(each[name])[:MOST_SAID] for name in ('who', 'do', 'said')},
+                **{name: str(each[name])[:MAX_SAID] for name in ('who', 'do', 'said')},
             }
-            for each in given[-MOST_ACTS:]
+            for each in given[-MAX_ACTS:]
         ]
     except (OSError, ValueError, TypeError, KeyError, OverflowError):
         return []
@@ -56,8 +56,8 @@ class ActRecord:
 
     def add(self, who: str, do: str, *, ok: bool, said: str) -> None:
         """``who`` asked for ``do``, and was told ``said``."""
-        self._acts.append({'at_ns': self._now_ns(), 'who': who, 'do': do, 'ok': ok, 'said': said[:MOST_SAID]})
-        del self._acts[:-MOST_ACTS]
+        self._acts.append({'at_ns': self._now_ns(), 'who': who, 'do': do, 'ok': ok, 'said': said[:MAX_SAID]})
+        del self._acts[:-MAX_ACTS]
         try:
             with replacing(self._path, is_synced=True, mode=0o600) as file:
                 file.write(json.dumps(self._acts).encode())

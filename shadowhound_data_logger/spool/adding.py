@@ -144,7 +144,7 @@ class Adding:
             self._sync()
         number = self._index.objects.insert(item, key, sha256, state, reason, metadata, self._now_ns)
         if words.GAP_VERSION in item.metadata:
-            self._index.gaps.set_told(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
+            self._index.gaps.set_reported(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
         path = self._tree.part(number)
         if state in _STAYS and isinstance(item.body, FileBody):
             said = description(item, key, sha256, metadata)

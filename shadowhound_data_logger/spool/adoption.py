@@ -138,7 +138,7 @@ class Adoption:
         self._group.clear()
 
 
-def place_said(tree: Tree, part: Path) -> Path | None:
+def recorded_place(tree: Tree, part: Path) -> Path | None:
     """Where a part belongs by its own description; None when its content is not what that says, or the place is taken."""
     said = description_of(part)
     bucket, key, held = _word(said, 'bucket', ''), _word(said, 'key', ''), _word(said, 'held', '')

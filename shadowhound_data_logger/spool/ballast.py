@@ -62,7 +62,7 @@ class Ballast:
 
     def _gives_up(self, error: Exception) -> bool:
         """Whether the disk is full, and there was a ballast that makes trying again worth while."""
-        if not says_full(error, self._path.parent):
+        if not is_disk_full(error, self._path.parent):
             return False
         self._there = False
         try:
@@ -74,7 +74,7 @@ class Ballast:
         return size > 0
 
 
-def says_full(error: Exception, folder: Path) -> bool:
+def is_disk_full(error: Exception, folder: Path) -> bool:
     """Whether an error means that the disk is full. SQLite calls it an I/O error where its log cannot even be begun."""
     if isinstance(error, OSError):
         return error.errno in _FULL

@@ -14,7 +14,7 @@ from shadowhound_data_logger.spool.table import Table, after
 _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 
 
-class UncataloguedObject(NamedTuple):
+class UncatalogedObject(NamedTuple):
     """An object as the store holds it; of a repeat its own times, and the key that holds its content."""
 
     id: int
@@ -42,7 +42,7 @@ class CatalogTable(Table):
         """These objects are new, or have a new state."""
         rows = [(number,) for number in ids]
         self._db.executemany(
-            "INSERT OR IGNORE INTO uncatalogued SELECT id FROM objects WHERE id = ? AND state IN ('delivered', 'deduplicated')"
+            "INSERT OR IGNORE INTO uncataloged SELECT id FROM objects WHERE id = ? AND state IN ('delivered', 'deduplicated')"
             " AND sensor <> '_catalog'", rows,
         )  # fmt: skip
         self._db.executemany(
@@ -53,24 +53,24 @@ class CatalogTable(Table):
             "DELETE FROM statistics WHERE id = ? AND id IN (SELECT id FROM objects WHERE state = 'evicted')", rows
         )
 
-    def uncatalogued(self, limit: int) -> list[UncataloguedObject]:
+    def uncataloged(self, limit: int) -> list[UncatalogedObject]:
         """Delivered objects without a row in any part of the catalog, the oldest first."""
         rows = self._db.execute(
-            'SELECT id, bucket, key, bytes, content_type, packed, metadata FROM uncatalogued JOIN objects USING (id)'
+            'SELECT id, bucket, key, bytes, content_type, packed, metadata FROM uncataloged JOIN objects USING (id)'
             ' LEFT JOIN statistics USING (id) ORDER BY id LIMIT ?', (limit,),
         )  # fmt: skip
         found = [(*row, json.loads(metadata)) for *row, metadata in rows]
-        return [UncataloguedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, kind, metadata, packed or b'')
+        return [UncatalogedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, kind, metadata, packed or b'')
                 for number, bucket, key, size, kind, packed, metadata in found]  # fmt: skip
 
-    def take_uncatalogued(self, ids: Collection[int]) -> bool:
+    def take_uncataloged(self, ids: Collection[int]) -> bool:
         """Take these off the list. False, and nothing is changed, if one was taken before."""
         if not ids:
             return True
-        listed = {number for (number,) in self._db.execute('SELECT id FROM uncatalogued')}
+        listed = {number for (number,) in self._db.execute('SELECT id FROM uncataloged')}
         if not listed.issuperset(ids):
             return False
-        for table in ('uncatalogued', 'statistics'):
+        for table in ('uncataloged', 'statistics'):
             self._db.executemany(f'DELETE FROM {table} WHERE id = ?', ((number,) for number in ids))  # noqa: S608
         return True
 
@@ -78,17 +78,17 @@ class CatalogTable(Table):
         """The table of kept objects must get this state of an object."""
         self._db.execute('INSERT INTO unreported VALUES (?, ?)', (number, state))
 
-    def unreported(self, limit: int) -> list[tuple[str, str | None, UncataloguedObject]]:
+    def unreported(self, limit: int) -> list[tuple[str, str | None, UncatalogedObject]]:
         """What the table of kept objects lacks: the change (``kept``, ``lost``, a step of thinning), its reason, the object."""
         rows = self._db.execute(
             'SELECT unreported.state, reason, id, bucket, key, bytes, content_type, metadata FROM unreported'
             ' JOIN objects USING (id) ORDER BY id LIMIT ?', (limit,),
         )  # fmt: skip
-        return [(state, reason, UncataloguedObject(number, bucket, key, size, content_type, json.loads(metadata)))
+        return [(state, reason, UncatalogedObject(number, bucket, key, size, content_type, json.loads(metadata)))
                 for state, reason, number, bucket, key, size, content_type, metadata in rows]  # fmt: skip
 
     def take_unreported(self, reported: Collection[tuple[int, str]]) -> bool:
-        """As ``take_uncatalogued``, of rows of the table of kept objects."""
+        """As ``take_uncataloged``, of rows of the table of kept objects."""
         if not reported:
             return True
         query = 'SELECT count(*) FROM unreported WHERE id = ? AND state = ?'
@@ -99,9 +99,9 @@ class CatalogTable(Table):
 
     def clear(self) -> None:
         """No part will describe what is delivered, kept or lost by now."""
-        for table in ('uncatalogued', 'statistics', 'unreported'):
+        for table in ('uncataloged', 'statistics', 'unreported'):
             self._db.execute(f'DELETE FROM {table}')  # noqa: S608 - own constants only
-        self._gaps.set_all_told()
+        self._gaps.set_all_reported()
 
     def has_waiting(self, bucket: str, prefix: str, *, sensor: str, priority: int) -> bool:
         """Whether a part with this prefix is pending with this priority, or quarantined with its file."""

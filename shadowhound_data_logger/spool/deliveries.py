@@ -114,7 +114,7 @@ class Deliveries:
         return self._of_index(self._index.history.delivered_count)
 
     def forgotten(self) -> int:
-        """Delivered objects of longer ago, which the index counts but cannot name any more; parts of the catalogue among them."""
+        """Delivered objects of longer ago, which the index counts but cannot name any more; parts of the catalog among them."""
         return self._of_index(self._index.history.forgotten_count)
 
     def since_ns(self) -> int | None:

@@ -68,7 +68,7 @@ class Expectation(NamedTuple):
 UNDECLARED: Final = Expectation()
 
 
-class Hearing(NamedTuple):
+class ArrivalContext(NamedTuple):
     """The conditions under which some messages arrived."""
 
     now_s: float = 0.0
@@ -135,7 +135,7 @@ class LossEstimator:
     def __post_init__(self) -> None:
         self.period = self.expected.period or self.period
 
-    def observe(self, stamps: Sequence[int], hearing: Hearing) -> Estimate:
+    def observe(self, stamps: Sequence[int], hearing: ArrivalContext) -> Estimate:
         """Count the messages with these stamps."""
         if not self.period and not hearing.alone:  # nobody knows whose rhythm that is
             self._begin()
@@ -163,7 +163,7 @@ class LossEstimator:
 
     # -- one by one ------------------------------------------------------------------------------------------------
 
-    def _is_regular(self, stamps: Sequence[int], hearing: Hearing) -> bool:
+    def _is_regular(self, stamps: Sequence[int], hearing: ArrivalContext) -> bool:
         """Whether all of it is as the rhythm has it, the usual case: then nothing else is to be done."""
         if self.last is None or self.inherited or not self.period or abs(self._phase) > 0.2:
             return False
@@ -174,7 +174,7 @@ class LossEstimator:
         self._intervals += gaps
         return True
 
-    def _place(self, stamp: int, hearing: Hearing, missed: Counter[str]) -> None:
+    def _place(self, stamp: int, hearing: ArrivalContext, missed: Counter[str]) -> None:
         last, inherited, self.inherited = self.last, self.inherited, False
         self.last = stamp
         gap = 0 if last is None else self._gap(stamp, last)
@@ -368,7 +368,7 @@ class TopicEstimate:
             self.estimators.clear()
             self._newest = None
 
-    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: Hearing) -> Estimate:
+    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: ArrivalContext) -> Estimate:
         """Count what publishers sent: the stamps by their names, '' where the middleware does not name them."""
         messages, covered, missed = 0, 0, Counter[str]()
         for publisher, sent in stamps.items():
@@ -378,7 +378,7 @@ class TopicEstimate:
             missed.update(found.missed)
         return Estimate(messages, covered, missed)
 
-    def _observe(self, publisher: str, stamps: Sequence[int], hearing: Hearing) -> Estimate:
+    def _observe(self, publisher: str, stamps: Sequence[int], hearing: ArrivalContext) -> Estimate:
         each = self.estimators.get(publisher)
         if each is None:
             each = self.estimators[publisher] = self._begun(hearing.gid)

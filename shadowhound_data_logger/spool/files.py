@@ -232,7 +232,7 @@ def content_sha256(body: bytes | FileBody) -> str:
 
 
 def facts(item: DataObject) -> dict[str, str]:
-    """What an object says of itself in the store, in its own words first: enough to make its row of the catalogue again."""
+    """What an object says of itself in the store, in its own words first: enough to make its row of the catalog again."""
     said = {words.SENSOR: item.sensor}
     if item.topic is not None:
         said |= {words.TOPIC: item.topic, words.TYPE: item.type, words.COUNT: str(item.samples)}

@@ -28,8 +28,8 @@ MERGE: Final = """
 """What an INSERT does if the row exists; the triggers of schema.sql do the same."""
 MOST_ROWS: Final = 500_000
 """Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
-_TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_told) ELSE ifnull((
-    SELECT told.version FROM gaps_told AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
+_TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_reported) ELSE ifnull((
+    SELECT told.version FROM gaps_reported AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
 """Whether the store is told of a row; those of objects have no session."""
 _WHOLE_ROW: Final = f"""
 SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns, {_TOLD} FROM gaps"""  # noqa: S608
@@ -43,7 +43,7 @@ _SUM_OF_TOLD, _SUM_OF_UNTOLD = 1, 0
 _FORGOTTEN_UNTIL: Final = f"""
 SELECT session, topic, max(ifnull(to_ns, (SELECT max(started_ns) FROM sessions)))
 FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNTOLD}) = {_SUM_OF_UNTOLD}
-  OR EXISTS (SELECT 1 FROM gaps_told WHERE again)) GROUP BY session, topic"""  # noqa: S608
+  OR EXISTS (SELECT 1 FROM gaps_reported WHERE again)) GROUP BY session, topic"""  # noqa: S608
 """When the last forgotten gap ended that may be missing in the store; if that is unknown, when the newest session began."""
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
@@ -129,21 +129,21 @@ class GapTable(Table):
 
     def told(self, robot: str) -> tuple[int, int]:
         """Up to which version the parts of a robot tell all, and how often it was asked to tell all of it again."""
-        found = self._db.execute('SELECT version, again FROM gaps_told WHERE robot = ?', (robot,)).fetchone()
+        found = self._db.execute('SELECT version, again FROM gaps_reported WHERE robot = ?', (robot,)).fetchone()
         return (found[0], found[1]) if found else (0, 0)
 
-    def set_told(self, robot: str, version: int) -> None:
+    def set_reported(self, robot: str, version: int) -> None:
         """In the transaction that spools the last part of those that tell it."""
-        query = 'INSERT INTO gaps_told VALUES (?, ?, 0) ON CONFLICT DO UPDATE SET version = excluded.version'
+        query = 'INSERT INTO gaps_reported VALUES (?, ?, 0) ON CONFLICT DO UPDATE SET version = excluded.version'
         self._db.execute(query, (robot, version))
 
-    def set_all_told(self) -> None:
+    def set_all_reported(self) -> None:
         """Nobody will tell what is there by now."""
-        self._db.execute('UPDATE gaps_told SET version = (SELECT ifnull(max(version), 0) FROM gaps)')
+        self._db.execute('UPDATE gaps_reported SET version = (SELECT ifnull(max(version), 0) FROM gaps)')
 
-    def tell_again(self) -> int:
+    def resend(self) -> int:
         """Have all robots of this spool tell the store all that is remembered; returns how many rows that is."""
-        self._db.execute('UPDATE gaps_told SET version = 0, again = again + 1')
+        self._db.execute('UPDATE gaps_reported SET version = 0, again = again + 1')
         return int(self._db.execute('SELECT count(*) FROM gaps WHERE begin_ns <> ?', (FORGOTTEN,)).fetchone()[0])
 
     def changed(self, after: int, limit: int, offsets: Mapping[str, int]) -> list[Gap]:

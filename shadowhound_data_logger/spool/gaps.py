@@ -28,9 +28,9 @@ UNTIMED: Final = -1
 FORGOTTEN: Final = -2
 """The beginning of a row that holds the sum of those that were forgotten: when they were, the store knows."""
 HOUR_NS: Final = 3600 * SECOND
-MOST_NEW_ROWS: Final = 7200
+MAX_NEW_ROWS: Final = 7200
 """Of a sink and topic in an hour: two a second. Further gaps of a kind and cause are one row, without publisher and mission."""
-MOST_RECENT: Final = 256
+MAX_RECENT: Final = 256
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 """Sinks."""
 _SINKS: Final = {'bag:': BAGS, 'event:': EVENTS}
@@ -160,7 +160,7 @@ class TopicGaps:
         self.before_ns = self.heard_ns
 
     @property
-    def has_heard(self) -> bool:
+    def has_received(self) -> bool:
         """Whether a message came in this session."""
         return self.heard_ns != self.before_ns
 
@@ -226,7 +226,7 @@ class TopicGaps:
         if boot_ns // HOUR_NS != self._hour:
             self._hour, self._new_rows = boot_ns // HOUR_NS, 0
         self._new_rows += 1
-        if self._new_rows > MOST_NEW_ROWS:
+        if self._new_rows > MAX_NEW_ROWS:
             begin_ns = key.begin_ns
             if begin_ns >= EARLIEST_SANE_NS:
                 begin_ns = max(self.clock.wall_ns(), EARLIEST_SANE_NS) // HOUR_NS * HOUR_NS
@@ -234,7 +234,7 @@ class TopicGaps:
                 begin_ns = self._hour * HOUR_NS
             return key._replace(publisher='', mission='', begin_ns=begin_ns)
         self._recent[key] = None
-        if len(self._recent) > MOST_RECENT:
+        if len(self._recent) > MAX_RECENT:
             del self._recent[next(iter(self._recent))]
         return key
 

@@ -66,7 +66,7 @@ class HistoryTable(Table):
         rows = self._db.execute(
             'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns FROM objects INDEXED BY settled'
             " WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns < ?"
-            ' AND NOT EXISTS (SELECT 1 FROM uncatalogued WHERE uncatalogued.id = objects.id)'
+            ' AND NOT EXISTS (SELECT 1 FROM uncataloged WHERE uncataloged.id = objects.id)'
             ' AND NOT EXISTS (SELECT 1 FROM unreported WHERE unreported.id = objects.id) ORDER BY settled_ns LIMIT ?',
             (before_ns, COMPACT_STEP),
         ).fetchall()

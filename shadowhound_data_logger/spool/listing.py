@@ -93,17 +93,17 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
     return Retried(len(moved), sum(row['bytes'] for row in moved), len(wanted) - len(moved))
 
 
-def tell_gaps_again(root: Path) -> int:
+def resend_gaps(root: Path) -> int:
     """Have the next part with gaps start again, with all that the journal remembers: the store lost parts. Returns how many rows.
 
-    A node that runs does so within a period of the catalogue. Raises SpoolError or sqlite3.Error.
+    A node that runs does so within a period of the catalog. Raises SpoolError or sqlite3.Error.
     """
     if not (root / 'index.db').is_file():
         raise SpoolError(f'there is no spool in {root}', remedy='SHADOWHOUND_HOME names its folder')
     with closing(Index(root / 'index.db')) as index:
         index.open()
         with index.transaction():
-            return index.gaps.tell_again()
+            return index.gaps.resend()
 
 
 def _moved(tree: Tree, reason: str, bucket: str, key: str) -> bool:

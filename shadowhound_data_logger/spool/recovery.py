@@ -27,8 +27,8 @@ from shadowhound_data_logger.core.durable_files import fingerprint, lock
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import SINKS
-from shadowhound_data_logger.spool.adoption import Adoption, Recovery, place_said
-from shadowhound_data_logger.spool.ballast import says_full
+from shadowhound_data_logger.spool.adoption import Adoption, Recovery, recorded_place
+from shadowhound_data_logger.spool.ballast import is_disk_full
 from shadowhound_data_logger.spool.binding import renew
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import DROPPED, EXACT, GapRow, TopicGaps
@@ -81,7 +81,7 @@ def _is_damage(path: Path, error: Exception) -> bool:
     """
     if not isinstance(error, sqlite3.OperationalError):
         return True
-    if says_full(error, path.parent):
+    if is_disk_full(error, path.parent):
         return False
     if 'readonly' in str(error):  # a flipped bit of the header says so as well
         return os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
@@ -206,7 +206,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
             if index.objects.state(number) in STATES_IN_SPOOL:
                 _remove_unthinned(tree, index, number, part, report)
                 continue
-            place = place_said(tree, part) if adopt else None
+            place = recorded_place(tree, part) if adopt else None
             if place is None or not tree.place(part, place):
                 tree.remove(part)
                 report.counts['uncommitted parts removed'] += 1

@@ -2,7 +2,7 @@
 
 Equal are the same bytes. A repeat is a row of the index in state
 deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its
-row in the catalogue. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
+row in the catalog. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
 object with another content tells, as metadata, how many repeats there were before it. What has repeats is never evicted.
 """
 

@@ -206,7 +206,7 @@ class RequestTable(Table):
         )  # fmt: skip
         return [(number, bucket, key, sha256, json.loads(metadata)) for number, bucket, key, sha256, metadata in found]
 
-    def set_whole(self, request: str, ids: Iterable[int]) -> None:
+    def set_complete(self, request: str, ids: Iterable[int]) -> None:
         """These are sent whole."""
         size = 'SELECT bytes FROM objects WHERE objects.id = requested.id'
         query = f'UPDATE requested SET bytes = ({size}) WHERE request = ? AND id = ?'  # noqa: S608 - own constants only

@@ -100,7 +100,7 @@ CREATE TABLE compact_objects (
   PRIMARY KEY (folder, name)) WITHOUT ROWID;
 
 -- Delivered objects that no part of the catalog describes yet, and the statistics of their contents for it.
-CREATE TABLE uncatalogued (id INTEGER PRIMARY KEY);
+CREATE TABLE uncataloged (id INTEGER PRIMARY KEY);
 CREATE TABLE statistics (id INTEGER PRIMARY KEY, packed BLOB NOT NULL);
 -- Changes of kept objects that no part of the table of kept objects has yet: 'kept', 'lost', or the step of thinning.
 CREATE TABLE unreported (
@@ -244,7 +244,7 @@ CREATE TABLE gaps (
 CREATE INDEX gaps_changed ON gaps (version);
 CREATE INDEX gaps_begun ON gaps (begin_ns);
 -- Up to which version the parts in the store report the journal of a robot, and how often it was requested in full again.
-CREATE TABLE gaps_told (
+CREATE TABLE gaps_reported (
   robot TEXT NOT NULL PRIMARY KEY,
   version INTEGER NOT NULL,
   again INTEGER NOT NULL) WITHOUT ROWID;

@@ -29,7 +29,7 @@ from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
-from shadowhound_data_logger.spool.ballast import Ballast, says_full
+from shadowhound_data_logger.spool.ballast import Ballast, is_disk_full
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index, lost
@@ -118,7 +118,7 @@ class Spool:
             return
         with suppress(OSError, sqlite3.Error):
             self._keep_index()
-        with self._had_within(CLOSE_S):
+        with self._lock_within(CLOSE_S):
             lost = self.accounts.drop_open('shutdown')
             if lost:
                 log.error('%d messages were still in memory when the spool %s was closed', lost, self.root)
@@ -180,7 +180,7 @@ class Spool:
     def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
         """What a failed commit means to an operator."""
         full = os.strerror(errno.ENOSPC)  # in one word, whoever found it: it is told once
-        reason = full if says_full(error, self.root) else getattr(error, 'strerror', None) or error
+        reason = full if is_disk_full(error, self.root) else getattr(error, 'strerror', None) or error
         return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
@@ -335,10 +335,10 @@ class Spool:
         """Of a request that is over: what it has not released is free to go. Raises as ``commit``."""
         self._in_pieces(lambda table: table.let_go(request))
 
-    def set_whole(self, request: str, ids: Collection[int]) -> None:
+    def set_complete(self, request: str, ids: Collection[int]) -> None:
         """These slices cannot be cut: the request wants all of them. Raises as ``commit``."""
         with self._lock, self._index.transaction():
-            self._index.requests.set_whole(request, ids)
+            self._index.requests.set_complete(request, ids)
 
     def set_cut(self, request: str, ids: Collection[int], places: Iterable[tuple[str, str]]) -> int:
         """A request waits for these (bucket, key) in place of the slices that they were cut out of; returns their bytes.
@@ -403,9 +403,9 @@ class Spool:
         """Waits for no commit."""
         return sum(row[2] for row in self._view.overview.tally() if row[1] == State.PENDING.value)
 
-    def has_uncatalogued(self) -> bool:
+    def has_uncataloged(self) -> bool:
         """Whether a delivered object is in no part of the catalog yet. Waits for no commit."""
-        return bool(self._view.catalog.uncatalogued(1))
+        return bool(self._view.catalog.uncataloged(1))
 
     def usage(self) -> SpoolUsage:
         """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
@@ -466,7 +466,7 @@ class Spool:
         self._session = None
 
     @contextmanager
-    def _had_within(self, seconds: float) -> Iterator[None]:
+    def _lock_within(self, seconds: float) -> Iterator[None]:
         """The lock, unless a commit hangs in the disk: the next start then ends the session."""
         if not self._lock.acquire(timeout=seconds):
             raise SpoolError(f'the spool {self.root} cannot be closed: its disk does not answer', remedy='is it broken?')
@@ -532,7 +532,7 @@ class Spool:
         index = self._index
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
-        return index.catalog.take_uncatalogued(item.catalogues) and index.catalog.take_unreported(item.tells)
+        return index.catalog.take_uncataloged(item.catalogs) and index.catalog.take_unreported(item.tells)
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
         """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it.

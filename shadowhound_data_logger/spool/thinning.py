@@ -1,7 +1,7 @@
 """Gives a kept object a content of fewer messages, and a row of its own to those that are gone.
 
 The object keeps its key and place. What went is told by an object beside it (``<key>.thinned``, ``evicted`` because it was
-``thinned``), so that ledger, gap journal and catalogue know of it as of any other loss.
+``thinned``), so that ledger, gap journal and catalog know of it as of any other loss.
 
 The new content is synced beside the parts, becomes the object's part inside the transaction, and then takes the place of the
 old one: after a death at any moment the row is of the file in its place, or of the part (``recovery.py``).

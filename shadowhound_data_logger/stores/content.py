@@ -27,7 +27,7 @@ CHUNK_BYTES: Final = 1 << 20
 """Most objects are smaller: they are read, hashed and sent as one piece."""
 PART_BYTES: Final = 8 << 20
 """What a broken connection costs at most: eight seconds of a link of 1 MB/s. S3 allows no smaller one than 5 MiB."""
-MOST_PARTS: Final = 10_000
+MAX_PARTS: Final = 10_000
 """S3's own limit."""
 
 log = logging.getLogger(__name__)
@@ -182,7 +182,7 @@ def parts(file: int, size: int, whole: Any) -> Iterator[Part]:
 
 def part_bytes(size: int) -> int:
     """Of each part but the last, for a file of that size."""
-    return max(PART_BYTES, -(-size // MOST_PARTS))
+    return max(PART_BYTES, -(-size // MAX_PARTS))
 
 
 def _known(file: int, start: int, size: int, whole: Any) -> Part:

@@ -47,7 +47,7 @@ _SILENCE: Final = timedelta(seconds=60)
 _WHOLE: Final = timedelta(days=1)
 """For one answer: a large object over WiFi takes its time."""
 _CLIENTS: Final = 16
-"""Buckets whose connections are kept: rows of a catalogue can name any number."""
+"""Buckets whose connections are kept: rows of a catalog can name any number."""
 _CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
 _MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
 _STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')

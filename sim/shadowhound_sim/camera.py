@@ -35,7 +35,7 @@ MOUNT: Final = (0.30, 0.07)
 """How far ahead of and above the middle of the body the camera sits, m."""
 NEAREST: Final = 0.05
 FADE: Final = 1.4
-"""Levels of shade a metre of distance costs."""
+"""Levels of shade a meter of distance costs."""
 _STRIP: Final = 48
 """Rows worked on at a time: few enough that intermediate results stay in the cache."""
 _BAR: Final = 24
@@ -175,7 +175,7 @@ class Camera:
         self._paint(view, index, (columns, near, start), (z0, z1), (scale, stride))
 
     def _cap(self, view: _View, index: NDArray[np.int32], box: int, columns: NDArray[np.intp]) -> None:
-        """The top of a low box, or the underside of a raised one, in one colour."""
+        """The top of a low box, or the underside of a raised one, in one color."""
         z0, z1 = self.world.plan.bounds[4:, box].tolist()
         near = view.hits.near[box, columns]
         far = np.minimum(view.hits.far[box, columns], view.wall[columns])

@@ -33,7 +33,7 @@ from shadowhound_sim.so_arm import NAMESPACE
 
 MARKER: Final = '.shadowhound-demo'
 """In a folder that the demo made and may replace."""
-LEAST_S: Final = 5.0
+MIN_S: Final = 5.0
 AT_THE_DOCK_S: Final = 3.0
 """The robot publishes for so long after its mission: so it is known what is missing up to the end (docs/datasets.md)."""
 NO_PROXY: Final = ('NO_PROXY', 'no_proxy')
@@ -46,8 +46,8 @@ class FolderRefused(DataLoggerError):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     options = _parser().parse_args(arguments)
-    if not (options.duration >= LEAST_S and 0 <= options.outage <= options.duration / 2):
-        print(f'demo: --duration is {LEAST_S:g} s at least, --outage half of it at most', file=sys.stderr)
+    if not (options.duration >= MIN_S and 0 <= options.outage <= options.duration / 2):
+        print(f'demo: --duration is {MIN_S:g} s at least, --outage half of it at most', file=sys.stderr)
         return 2
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # which nohup has asked for

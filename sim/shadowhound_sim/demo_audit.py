@@ -34,7 +34,7 @@ class SensorTotals:
     delivered: int = 0
     bytes: int = 0
     latest: str = ''
-    """Key of the latest; of the catalogue its folder, for its keys are long."""
+    """Key of the latest; of the catalog its folder, for its keys are long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class DemoAudit:
     bodies: Mapping[str, bytes]
     """What was read, by key; no two buckets have the same."""
     rows: int
-    """Of the catalogue, as it lies in the server."""
+    """Of the catalog, as it lies in the server."""
     problems: tuple[str, ...]
     """One sentence for each thing that is not as it should be."""
 
@@ -95,11 +95,9 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     delivered = {row['key']: row['sha256'] for row in rows if row['state'] == State.DELIVERED.value}
     samples = _count(rows, bodies)
     problems = [*ledger.imbalances(found), *_unread(delivered, bodies), *_unaccounted(messages), *_undelivered(found)]
-    catalogue = _catalogued(bodies)
-    problems += [*_uncounted(found, samples), *_uncatalogued(catalogue, bodies)]
-    return DemoAudit(
-        found, messages, _totals(rows), len(bodies), sum(samples.values()), bodies, catalogue.total(), tuple(problems)
-    )
+    catalog = _cataloged(bodies)
+    problems += [*_uncounted(found, samples), *_uncataloged(catalog, bodies)]
+    return DemoAudit(found, messages, _totals(rows), len(bodies), sum(samples.values()), bodies, catalog.total(), tuple(problems))
 
 
 def _messages(published: int, before: int, account: Mapping[str, Any] | None) -> Messages:
@@ -138,8 +136,8 @@ def _unread(delivered: Mapping[str, str], bodies: Mapping[str, bytes]) -> list[s
     return sorted(found)
 
 
-def _catalogued(bodies: Mapping[str, bytes]) -> Counter[str]:
-    """Rows by key, in all parts of the catalogue."""
+def _cataloged(bodies: Mapping[str, bytes]) -> Counter[str]:
+    """Rows by key, in all parts of the catalog."""
     from pyarrow.parquet import read_table  # noqa: PLC0415 - half a second, at the end of the demo only
 
     rows: Counter[str] = Counter()
@@ -149,10 +147,10 @@ def _catalogued(bodies: Mapping[str, bytes]) -> Counter[str]:
     return rows
 
 
-def _uncatalogued(rows: Mapping[str, int], bodies: Mapping[str, bytes]) -> list[str]:
+def _uncataloged(rows: Mapping[str, int], bodies: Mapping[str, bytes]) -> list[str]:
     keys = {key for key in bodies if is_row(BUCKET, key)}
-    found = [f'{key} has {rows.get(key, 0)} rows in the catalogue' for key in keys if rows.get(key, 0) != 1]
-    found += [f'{key} has a row in the catalogue, but is not in the bucket' for key in rows.keys() - keys]
+    found = [f'{key} has {rows.get(key, 0)} rows in the catalog' for key in keys if rows.get(key, 0) != 1]
+    found += [f'{key} has a row in the catalog, but is not in the bucket' for key in rows.keys() - keys]
     return sorted(found)
 
 

@@ -92,7 +92,7 @@ def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
     console.print(verdict(audit.ledger))
     found = '[red]something is wrong' if audit.problems else '[green]all as spooled'
     console.print(f'{audit.read_back:,} objects with {audit.samples:,} messages read back from the S3 server: {found}')
-    console.print(f'The catalogue in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object but its own.')
+    console.print(f'The catalog in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object but its own.')
     for problem in audit.problems:
         console.print(Text(f'  {problem}', style='red'))
     if record.errors:

@@ -1,6 +1,6 @@
 """The building that the simulated Go2 patrols: rooms, and everything solid in them as axis-aligned boxes.
 
-Lengths are metres. The constants stand in the building's own frame (corner of the outer wall at 0, 0; x east, y north);
+Lengths are meters. The constants stand in the building's own frame (corner of the outer wall at 0, 0; x east, y north);
 ``FloorPlan.build()`` gives all of it in the robot's frame ``odom``, whose origin is the charging dock.
 """
 

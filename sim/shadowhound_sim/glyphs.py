@@ -33,10 +33,10 @@ def glyph(character: str) -> NDArray[np.bool_]:
     return np.pad(np.kron(rows, np.ones((SCALE, SCALE))), ((0, 0), (0, SCALE))).astype(bool)
 
 
-def write(image: NDArray[np.uint8], text: str, left: int, top: int, colour: tuple[int, int, int]) -> None:
+def write(image: NDArray[np.uint8], text: str, left: int, top: int, color: tuple[int, int, int]) -> None:
     """Burns one line of text into an (h, w, 3) image; what does not fit at the right is left out."""
     room = (image.shape[1] - left) // ADVANCE
     shown = text[: max(room, 0)]
     if shown:
         mask = np.concatenate([glyph(character) for character in shown], axis=1)
-        image[top : top + HEIGHT, left : left + mask.shape[1]][mask] = colour
+        image[top : top + HEIGHT, left : left + mask.shape[1]][mask] = color

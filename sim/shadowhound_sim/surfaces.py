@@ -1,7 +1,7 @@
 """How the building looks: pictures of floors, ceilings, walls and furniture, and the atlas that the camera looks them up in.
 
 The pictures are drawn with numpy, float RGB from 0 to 255. The atlas is flat and of packed BGR pixels, with a copy of every
-picture for each level of shade: the camera turns every pixel into one index into it, and colours nothing after that.
+picture for each level of shade: the camera turns every pixel into one index into it, and colors nothing after that.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from shadowhound_sim.floor_plan import CEILING, DEPTH, FURNITURE, REFLECTIVITY, ROOMS, WIDTH, FloorPlan
 
 Picture = NDArray[np.float32]
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
-WALLS: Final[dict[str, tuple[Colour, Colour, Colour]]] = {
+WALLS: Final[dict[str, tuple[Color, Color, Color]]] = {
     'dock': ((186, 190, 196), (120, 128, 138), (245, 166, 35)),
     'office': ((196, 214, 228), (110, 142, 168), (58, 84, 110)),
     'lab': ((206, 226, 210), (112, 160, 128), (40, 96, 70)),
@@ -26,7 +26,7 @@ WALLS: Final[dict[str, tuple[Colour, Colour, Colour]]] = {
     'meeting': ((222, 178, 158), (150, 84, 76), (96, 40, 48)),
 }
 """Upper wall, lower wall and accent of each room."""
-FLOORS: Final[dict[str, tuple[Colour, Colour]]] = {
+FLOORS: Final[dict[str, tuple[Color, Color]]] = {
     'dock': ((150, 150, 152), (142, 142, 145)),
     'office': ((96, 112, 132), (88, 103, 122)),
     'lab': ((188, 194, 190), (180, 187, 183)),
@@ -39,12 +39,12 @@ LEVELS: Final = 14
 DIMMING: Final = 0.043
 """How much darker each level of shade is."""
 WALL_SCALE: Final = 80.0
-"""Pixels a metre on walls."""
+"""Pixels a meter on walls."""
 WALL_ROWS: Final = round(CEILING * WALL_SCALE)
 WALL_COLUMNS: Final = 320
 """A wall's picture repeats after this many pixels: 4 m."""
 MAP_SCALE: Final = 62.5
-"""Pixels a metre on floor and ceiling."""
+"""Pixels a meter on floor and ceiling."""
 MAP_ROWS: Final = round(DEPTH * MAP_SCALE)
 MAP_COLUMNS: Final = round(WIDTH * MAP_SCALE)
 FACE: Final = 64
@@ -136,7 +136,7 @@ def ceiling_map(shape: tuple[int, int], scale: float) -> Picture:
 
 
 def wall(name: str, shape: tuple[int, int], scale: float) -> Picture:
-    """Four metres of the walls of a room; row 0 is the ceiling."""
+    """Four meters of the walls of a room; row 0 is the ceiling."""
     upper, lower, accent = WALLS[name]
     image = np.empty((*shape, 3), np.float32)
     rows, columns = shape
@@ -154,7 +154,7 @@ def wall(name: str, shape: tuple[int, int], scale: float) -> Picture:
     return image + _grain(shape, 2.5, len(name))
 
 
-def _ornament(name: str, image: Picture, z: Picture, u: Picture, accent: Colour) -> None:
+def _ornament(name: str, image: Picture, z: Picture, u: Picture, accent: Color) -> None:
     """What hangs on, or is painted on, the walls of each room."""
     if name == 'kitchen':
         image[(z < 0.95) & ((z % 0.15 < 0.012) | (u % 0.15 < 0.012))] = (196, 196, 188)
@@ -189,7 +189,7 @@ def _ornament(name: str, image: Picture, z: Picture, u: Picture, accent: Colour)
 _Rectangle = tuple[float, float, float, float]
 
 
-def _frame(image: Picture, z: Picture, u: Picture, at: _Rectangle, rim: Colour, inner: tuple[Colour, Colour]) -> None:
+def _frame(image: Picture, z: Picture, u: Picture, at: _Rectangle, rim: Color, inner: tuple[Color, Color]) -> None:
     """A framed picture around (u, z) with half its width and height: ``inner`` is the sky above and the hills below."""
     u0, z0, half_width, half_height = at
     image[(np.abs(u - u0) < half_width + 0.05) & (np.abs(z - z0) < half_height + 0.05)] = rim
@@ -199,7 +199,7 @@ def _frame(image: Picture, z: Picture, u: Picture, at: _Rectangle, rim: Colour, 
     image[inside & hills] = inner[1]
 
 
-_BASE: Final[dict[str, Colour]] = {
+_BASE: Final[dict[str, Color]] = {
     'wall': (200, 200, 200), 'frame': (246, 244, 238), 'wood': (186, 134, 82), 'steel': (172, 180, 188),
     'dark': (58, 60, 66), 'screen': (28, 34, 44), 'books': (120, 86, 56), 'plant': (58, 128, 62),
     'board': (246, 248, 250), 'orange': (226, 116, 44), 'crate': (176, 138, 84), 'red': (196, 44, 40),
@@ -219,10 +219,10 @@ def material(name: str, size: int) -> Picture:
         image[(np.abs(u % 0.25 - 0.04) < 0.012) & (v > 0.3) & (v < 0.5)] = (90, 90, 92)
     elif name == 'books':
         image *= 0.55
-        colours = random.integers(60, 230, (4, 16, 3)).astype(np.float32)
+        colors = random.integers(60, 230, (4, 16, 3)).astype(np.float32)
         shelf, book = np.minimum((v * 4).astype(int), 3), np.minimum((u * 16).astype(int), 15)
         tall = (v * 4 % 1) > 0.18 + 0.25 * random.random((4, 16))[shelf, book]
-        image[tall] = colours[shelf, book][tall]
+        image[tall] = colors[shelf, book][tall]
         image[(v * 4 % 1) > 0.93] = (120, 86, 56)
     elif name == 'plant':
         image *= (0.45 + 0.75 * random.random((size // 4, size // 4)).repeat(4, 0).repeat(4, 1))[..., None]

@@ -39,7 +39,7 @@ def test_every_part_of_a_summary_is_optional(tmp_path: Path, options: dict[str, 
     found = info_folder(folder).description
     assert (found.messages, found.t_start_ns, found.t_end_ns) == (10, T0, T0 + 9 * S)
     assert topics(folder) == {('/chat', STRING[0]): 5, ('/talk', STRING[0]): 5}
-    assert verify_folder(folder, deep=True).is_sound
+    assert verify_folder(folder, deep=True).is_intact
     cut = cut_folder(folder, tmp_path / 'piece', Choice('2', '7', topics=('/chat',)))
     assert cut.messages == 3
     assert [one[4] for one in read(tmp_path / 'piece' / 'piece_0.mcap')] == [T0 + n * S for n in (2, 4, 6)]
@@ -157,7 +157,7 @@ def test_names_that_cannot_be_part_of_a_key(tmp_path: Path) -> None:
         assert sent.renamed['my bäg_0.mcap'] == 'my_b_g_0_1.mcap'
         upload_now(store, sent, deadline_s=60)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-    assert verify_remote(store, find_bag(store, 'thor', 'my_b_g'), deep=True).is_sound
+    assert verify_remote(store, find_bag(store, 'thor', 'my_b_g'), deep=True).is_intact
     found = fetch(store, find_bag(store, 'thor', 'my_b_g'), tmp_path / 'fetched')
     assert found.is_complete
     described = info_folder(found.folder).description
@@ -220,7 +220,7 @@ def test_a_message_at_0_that_the_statistics_do_not_have(tmp_path: Path) -> None:
         cut_folder(folder, tmp_path / f'piece{len(options)}', Choice())
         assert [one[4] for one in read(tmp_path / f'piece{len(options)}' / f'piece{len(options)}_0.mcap')] == [0, 1, 2]
     assert info_folder(tmp_path / 'b0').description.t_start_ns == 0
-    assert verify_folder(tmp_path / 'b0', deep=True).is_sound
+    assert verify_folder(tmp_path / 'b0', deep=True).is_intact
 
 
 def test_times_of_64_bits(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_a_list_downloads_no_bag(tmp_path: Path) -> None:
     assert (rows['whole'].messages, rows['whole'].remark.startswith('metadata.yaml claims 7 messages')) == (10, True)
     assert (rows['bare'].messages, rows['bare'].remark) == (7, '')
     assert info_of(store, 'thor', 'bare', tmp_path / 'home').description.messages == 10
-    assert verify_remote(store, find_bag(store, 'thor', 'bare')).is_sound
+    assert verify_remote(store, find_bag(store, 'thor', 'bare')).is_intact
 
 
 def test_a_growing_bag_with_a_torn_file_is_fetched(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def check(folder: Path, out: Path, wanted: list[tuple[str, int]]) -> None:
     found = info_folder(folder).description
     times = [log_ns for _, log_ns in wanted]
     assert (found.messages, found.t_start_ns, found.t_end_ns) == (len(wanted), min(times), max(times))
-    assert verify_folder(folder, deep=True).is_sound
+    assert verify_folder(folder, deep=True).is_intact
     cut_folder(folder, out, Choice())
     assert [(one[0], one[4]) for one in read(out / f'{out.name}_0.mcap')] == wanted
 
@@ -144,7 +144,7 @@ def test_a_summary_that_contradicts_the_data(tmp_path: Path) -> None:
     for place, (channel, count, end) in enumerate(((CHANNEL, 3, 2), (CHANNEL, 2, 9), (Channel(1, '/z', 'cdr', {}, 1), 2, 2))):
         statistics = Statistics(0, 1, {1: count}, 1, count, end, 1, 0, 1)
         folder = assembled(tmp_path / str(place), content, summary=packed(SCHEMA, channel, statistics))
-        assert verify_folder(folder).is_sound
+        assert verify_folder(folder).is_intact
         (finding,) = verify_folder(folder, deep=True).findings
         assert 'messages' in finding.finding
 
@@ -163,7 +163,7 @@ def test_attachments_are_not_read(tmp_path: Path) -> None:
     assert (found.description.messages, found.read_bytes < 20 << 20) == (2, True)
     cut = cut_folder(folder, tmp_path / 'piece', Choice())
     assert (cut.messages, cut.extras) == (2, 2)
-    assert verify_folder(folder).is_sound
+    assert verify_folder(folder).is_intact
 
 
 def test_attachments_alone(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_attachments_alone(tmp_path: Path) -> None:
     alone = write(tmp_path / 'alone' / 'b_0.mcap', lambda writer: writer.add_attachment(1, 1, 'map.png', 'image/png', b'x' * 999))
     found = info_folder(alone).description
     assert (found.messages, found.topics, found.t_start_ns) == (0, (), None)
-    assert verify_folder(alone, deep=True).is_sound
+    assert verify_folder(alone, deep=True).is_intact
     with pytest.raises(BagError, match='no messages'):
         cut_folder(alone, tmp_path / 'piece', Choice())
 
@@ -240,10 +240,10 @@ def test_every_checksum_of_a_file_is_checked(tmp_path: Path, is_chunked: bool) -
 
     folder = write(tmp_path / 'b' / 'b_0.mcap', fill, use_chunking=is_chunked, enable_data_crcs=True)
     content = (folder / 'b_0.mcap').read_bytes()
-    assert verify_folder(folder, deep=True).is_sound
+    assert verify_folder(folder, deep=True).is_intact
     for place in range(8, len(content) - 8, 3):
         (folder / 'b_0.mcap').write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        assert not verify_folder(folder, deep=True).is_sound, place
+        assert not verify_folder(folder, deep=True).is_intact, place
 
 
 def test_schemas_of_one_name(tmp_path: Path) -> None:

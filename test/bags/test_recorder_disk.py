@@ -16,10 +16,10 @@ from pyarrow.parquet import read_table
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import bag_overview
-from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.memory import MemoryStore
 
@@ -61,7 +61,7 @@ def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -
         it.row()
         bag = manifest(it.objects(), name)
         told = Counter[tuple[str, str]]()
-        for part in CatalogueWriter(it.spool.root, CatalogueSettings(), ROBOT, Clocks()).parts():
+        for part in CatalogWriter(it.spool.root, CatalogSettings(), ROBOT, Clocks()).parts():
             assert isinstance(part.body, bytes)
             for row in read_table(BytesIO(part.body)).to_pylist() if '/_gaps/' in part.key else ():
                 if row['what'] == 'gap':

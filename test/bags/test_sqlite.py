@@ -92,7 +92,7 @@ def check(folder: Path, out: Path) -> None:
     assert (found.messages, found.t_start_ns, found.t_end_ns) == (9, T0, T0 + 8 * 10**9)
     assert {topic.name: topic.messages for topic in found.topics} == {'/chat': 3, 'count': 3, '/mine': 3, '/silent': 0}
     assert not found.remarks
-    assert verify_folder(folder, deep=True).is_sound
+    assert verify_folder(folder, deep=True).is_intact
     cut_folder(folder, out, Choice())
     names = {number: (name, kind) for number, name, kind, *_ in TOPICS}
     piece = read(out / f'{out.name}_0.mcap')
@@ -195,7 +195,7 @@ def test_messages_of_no_topic(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[-40_000:-30_000] = bytes(range(250)) * 40
     path.write_bytes(content)
-    assert not verify_folder(path.parent).is_sound
+    assert not verify_folder(path.parent).is_intact
     path = storage(tmp_path / 'd' / 'd_0.db3', HUMBLE, [])
     assert info_folder(path.parent).description.messages == 0
     with pytest.raises(BagError, match='no messages'):
@@ -212,7 +212,7 @@ def test_a_file_that_was_not_closed(tmp_path: Path, suffix: str) -> None:
     for attempt in (lambda: info_folder(path.parent), lambda: cut_folder(path.parent, tmp_path / 'piece', Choice())):
         with pytest.raises(BagDamaged, match='was not closed'):
             attempt()
-    assert not verify_folder(path.parent).is_sound
+    assert not verify_folder(path.parent).is_intact
 
 
 @pytest.mark.parametrize('named', ['b_0.db3', 'b_0.db3.zstd', ''])

@@ -10,7 +10,7 @@ from bags.slices import fill, messages
 
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, Missing, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.naming import slice_file
-from shadowhound_data_logger.bags.state import LEAST_ROWS_BYTES, RECORD, BagState
+from shadowhound_data_logger.bags.state import MIN_ROWS_BYTES, RECORD, BagState
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.formats.mcap.index import read_metadata
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
@@ -67,7 +67,7 @@ def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> Non
         state.add_slice(info(state.folder, number, size, topics))
         state.add_missing(Missing(slice_file(state.folder.name, number), 'dropped: queue_full', 7, '/imu', 'queue_full'))
     said = state.record('thor', 2000)
-    assert sum(map(len, said.values())) < size // 100 + LEAST_ROWS_BYTES
+    assert sum(map(len, said.values())) < size // 100 + MIN_ROWS_BYTES
     found = BagState.of_record(state.folder, 'thor', said)
     assert list(found.slices) == list(state.slices)[-len(found.slices) :]
     assert len(found.slices) >= (1500 if size > 1 << 20 else 10)

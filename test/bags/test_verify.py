@@ -85,10 +85,10 @@ def test_a_bag_without_a_manifest_is_held_against_its_metadata(folder: Path) -> 
     (folder / 'manifest.json').unlink()
     assert verify_folder(folder).state == 'foreign'
     flip(folder)
-    assert verify_folder(folder).is_sound
+    assert verify_folder(folder).is_intact
     assert [check.name for check in verify_folder(folder, deep=True).findings] == [FIRST]
     exchange(folder)
-    assert verify_folder(folder, deep=True).is_sound  # as many messages, all of them whole: nobody says what they were
+    assert verify_folder(folder, deep=True).is_intact  # as many messages, all of them whole: nobody says what they were
     lose(folder)
     assert [check.finding for check in verify_folder(folder).findings] == ['is missing']
 
@@ -99,7 +99,7 @@ def test_a_growing_bag_is_told(folder: Path) -> None:
     for name in (FIRST, f'{NAME}_1.mcap'):
         stored(store, only(folder, name))
     found = verify_remote(store, find_bag(store, 'thor', NAME))
-    assert (found.state, found.is_sound, len(found.checks)) == ('growing', True, 2)
+    assert (found.state, found.is_intact, len(found.checks)) == ('growing', True, 2)
 
 
 def only(folder: Path, name: str) -> Path:
@@ -115,7 +115,7 @@ def test_bags_of_others(tmp_path: Path, plugin: StoragePlugin, name: str) -> Non
     """Messages are counted; a lost one is found."""
     folder = tmp_path / 'theirs'
     write_rosbags(folder, plugin, CompressionMode.NONE)
-    assert verify_folder(folder, deep=True).is_sound
+    assert verify_folder(folder, deep=True).is_intact
     if plugin is StoragePlugin.SQLITE3:
         database = sqlite3.connect(folder / name)
         database.execute('DELETE FROM messages WHERE id = 5')

@@ -152,7 +152,7 @@ def test_an_export_whose_upload_was_cut_off(machines: tuple[Machine, Machine], c
 
 
 def test_the_last_episode_is_taken_out(machines: tuple[Machine, Machine]) -> None:
-    """An empty data set is left, which remembers it; the next mission is its first episode."""
+    """An empty dataset is left, which remembers it; the next mission is its first episode."""
     a, b = machines
     a.add('one')
     assert {*a.ask('drop', 'one')} == {URL}

@@ -23,7 +23,7 @@ TIMES = [NOON_NS + second * SECOND for second in range(5)]
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Ten objects and their part of the catalogue."""
+    """Ten objects and their part of the catalog."""
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         for sensor in SENSORS:
             for stamp_ns in TIMES:

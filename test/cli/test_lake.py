@@ -1,4 +1,4 @@
-"""``shadowhound-data lake``: what it says of the catalogue, and that its verbs do what they say."""
+"""``shadowhound-data lake``: what it says of the catalog, and that its verbs do what they say."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_status_compact_status(home: Path) -> None:
 
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
     """There is nothing to say and nothing to do."""
-    assert 'no catalogue yet in the bucket sensor-data' in run(tmp_path, 'status').output
+    assert 'no catalog yet in the bucket sensor-data' in run(tmp_path, 'status').output
     assert run(tmp_path, 'compact').exit_code == 0
 
 
@@ -56,7 +56,7 @@ def test_reindex_says_what_it_found(home: Path) -> None:
     told = json.loads(run(home, 'reindex', '--robot', 'thor', '--json').output)
     assert told == {'listed': 2, 'added': 2, 'parts': 1, 'gone': 192}
     again = run(home, 'reindex', '--robot', 'thor')
-    assert '0 were not in the catalogue' in again.output
+    assert '0 were not in the catalog' in again.output
     assert '192 rows name objects that are gone' in again.output
 
 
@@ -150,11 +150,11 @@ def test_coverage_for_programs(told: Path) -> None:
 
 
 def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
-    """Blue where it is stored, red where it is lost, grey where nobody knows."""
+    """Blue where it is stored, red where it is lost, gray where nobody knows."""
     assert run(told, *TWO_HOURS, '--map', str(tmp_path / 'coverage.png')).exit_code == 0
     with Image.open(tmp_path / 'coverage.png') as picture:
-        colours = {colour for _, colour in picture.convert('RGB').getcolors(1 << 24) or ()}
-    assert colours >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
+        colors = {color for _, color in picture.convert('RGB').getcolors(1 << 24) or ()}
+    assert colors >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}
 
 
 def test_coverage_of_what_nobody_told(told: Path) -> None:

@@ -32,7 +32,7 @@ PATH = 'thor/patrol_20261028_120000.csv'
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Ten objects, one in another bucket, and two parts of the catalogue."""
+    """Ten objects, one in another bucket, and two parts of the catalog."""
     with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
         for sensor in SENSORS:
             for stamp_ns in TIMES:
@@ -66,10 +66,10 @@ def file(home: Path, key: str) -> Path:
 
 @pytest.mark.parametrize('deep', [[], ['--deep']])
 def test_all_is_there(home: Path, deep: list[str]) -> None:
-    """Exit code 0; every bucket is asked, and of what has no checksum in the catalogue it says so."""
+    """Exit code 0; every bucket is asked, and of what has no checksum in the catalog it says so."""
     answer = run(home, *deep)
     assert answer.return_value == 0
-    assert 'asked for 11 of the 11 objects of its own catalogue' in answer.stdout
+    assert 'asked for 11 of the 11 objects of its own catalog' in answer.stdout
     assert 'Of 1 no checksum is known' in answer.stdout
     assert 'All of them are there' in answer.stdout
     assert as_json(home, *deep, '--sensor', 'camera', '--since', '2026-10-28T12:00:02')['asked'] == 3
@@ -86,7 +86,7 @@ def test_each_loss_is_named(home: Path) -> None:
     assert found(as_json(home, '--deep')) == {'missing': [gone], 'size': [cut], 'checksum': [changed]}
     text = run(home)
     assert f'sensor-data/{gone}: ' in text.stdout
-    assert '3 are not as the catalogue says' in text.stdout
+    assert '3 are not as the catalog says' in text.stdout
 
 
 def test_all_keys_are_in_the_json(home: Path) -> None:
@@ -98,22 +98,22 @@ def test_all_keys_are_in_the_json(home: Path) -> None:
     assert '... and 30 more' in run(home).stdout
 
 
-def test_the_catalogue_of_another_store_counts_as_well(home: Path, tmp_path: Path) -> None:
-    """What the store lost of its own catalogue, and the objects that were in it, are found by that alone."""
+def test_the_catalog_of_another_store_counts_as_well(home: Path, tmp_path: Path) -> None:
+    """What the store lost of its own catalog, and the objects that were in it, are found by that alone."""
     old = tmp_path / 'old'
     shutil.copytree(file(home, 'thor/_catalog'), old / 'thor' / '_catalog')
-    assert as_json(home, '--catalogue', str(old))['ok']
+    assert as_json(home, '--catalog', str(old))['ok']
     for part in file(home, 'thor/_catalog').rglob('*_camera.parquet'):
         part.unlink()
     cameras = [key for key in KEYS if '/camera/' in key]
     file(home, cameras[0]).unlink()
     own = as_json(home)
     assert (own['ok'], own['asked']) == (True, 6)
-    said = as_json(home, '--catalogue', str(old))
+    said = as_json(home, '--catalog', str(old))
     assert said['asked'] == 11
     assert found(said) == {'missing': [cameras[0]], 'unlisted': cameras}
-    text = run(home, '--catalogue', str(old)).stdout
-    assert '5 are not as the catalogue says' in text
+    text = run(home, '--catalog', str(old)).stdout
+    assert '5 are not as the catalog says' in text
     assert 'lake reindex' in text
 
 
@@ -128,7 +128,7 @@ def test_a_name_that_nothing_has_is_wrong_usage(home: Path, arguments: list[str]
 
 
 def test_nothing_to_verify_is_no_success(home: Path) -> None:
-    """A catalogue that is lost says nothing."""
+    """A catalog that is lost says nothing."""
     answer = run(home, '--sensor', 'lidar')
     assert answer.return_value == 1
     assert 'Nothing is verified' in answer.stdout
@@ -178,6 +178,6 @@ def test_one_question_is_asked_by_one_process(home: Path, tmp_path: Path) -> Non
 
 
 def test_bad_usage(home: Path) -> None:
-    """A folder without a catalogue, a question that a catalogue alone cannot answer, a time that is none."""
-    for wrong in (['--catalogue', str(home / 'tmp')], ['--catalogue', str(home), '--failed'], ['--since', 'soon']):
+    """A folder without a catalog, a question that a catalog alone cannot answer, a time that is none."""
+    for wrong in (['--catalog', str(home / 'tmp')], ['--catalog', str(home), '--failed'], ['--since', 'soon']):
         assert isinstance(run(home, *wrong).exception, click.UsageError)

@@ -26,13 +26,13 @@ from shadowhound_data_logger.stores import open_store
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A red and a blue picture, and one that is none."""
     home = tmp_path_factory.mktemp('home')
-    make_pair(home / 'colours')
+    make_pair(home / 'colors')
     with closing(open_store(folder_store(home), UploadSettings())) as store:
-        for place, colour in enumerate(['red', 'blue', None]):
+        for place, color in enumerate(['red', 'blue', None]):
             out = io.BytesIO(b'no picture')
-            if colour:
-                Image.new('RGB', (64, 48), colour).save(out, 'PNG')
-            if colour == 'red':
+            if color:
+                Image.new('RGB', (64, 48), color).save(out, 'PNG')
+            if color == 'red':
                 (home / 'red.png').write_bytes(out.getvalue())
             body = out.getvalue()
             told = {**row('camera', NOON_NS + place * SECOND), 'bytes': len(body), 'sha256': hashlib.sha256(body).hexdigest()}
@@ -48,19 +48,19 @@ def run(home: Path, *arguments: str) -> Result:
 
 
 def test_embed_then_ask(home: Path) -> None:
-    asked = run(home, 'query', '--like', str(home / 'red.png'), '--model', str(home / 'colours'))
-    assert '3 of 3 pictures have no vector by the model colours' in asked.output
-    assert f'shadowhound-data lake embed --model {home / "colours"} makes them' in asked.output
-    made = run(home, 'embed', '--model', str(home / 'colours'))
+    asked = run(home, 'query', '--like', str(home / 'red.png'), '--model', str(home / 'colors'))
+    assert '3 of 3 pictures have no vector by the model colors' in asked.output
+    assert f'shadowhound-data lake embed --model {home / "colors"} makes them' in asked.output
+    made = run(home, 'embed', '--model', str(home / 'colors'))
     assert made.return_value == ExitCode.FINDING
-    assert '2 vectors made by the model colours' in made.output
+    assert '2 vectors made by the model colors' in made.output
     assert '1 picture without one: no JPEG, PNG or TIFF' in made.output
-    told = json.loads(run(home, 'embed', '--model', str(home / 'colours'), '--json').stdout)
+    told = json.loads(run(home, 'embed', '--model', str(home / 'colors'), '--json').stdout)
     assert (told['pictures'], told['known'], told['made'], told['refused']) == (3, 2, 0, {'unreadable': 1})
     for question in (['--like', str(home / 'red.png')], ['--like-text', 'red']):
-        found = run(home, 'query', *question, '--model', str(home / 'colours'), '--limit', '1', '--format', 'keys')
+        found = run(home, 'query', *question, '--model', str(home / 'colors'), '--limit', '1', '--format', 'keys')
         assert 'sensor-data/thor/camera/20261028/120000_x.jpg' in found.output
-    asked_with = ['--like-text', 'blue', '--model', str(home / 'colours'), '--sheet', str(home / 'sheet.jpg')]
+    asked_with = ['--like-text', 'blue', '--model', str(home / 'colors'), '--sheet', str(home / 'sheet.jpg')]
     table = run(home, 'query', *asked_with)
     assert '1.000  2026-10-28 12:00:01  camera' in table.output
     assert (home / 'sheet.jpg').stat().st_size > 1000

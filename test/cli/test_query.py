@@ -87,8 +87,8 @@ def test_pictures_of_the_answer(home: Path, tmp_path: Path) -> None:
     assert found.exit_code == 0, found.output
     with Image.open(sheet) as image:
         assert image.width == 800
-        colours = [image.convert('RGB').getpixel((x, 100)) for x in range(image.width)]
-        assert sum(colour[0] < 20 and 110 < colour[1] < 140 for colour in colours) > 400  # type: ignore[index, operator]
+        colors = [image.convert('RGB').getpixel((x, 100)) for x in range(image.width)]
+        assert sum(color[0] < 20 and 110 < color[1] < 140 for color in colors) > 400  # type: ignore[index, operator]
     with Image.open(ground) as image:
         assert image.width == 800
     assert 'no image' in run(home, '--sensor', 'odom', '--sheet', str(sheet)).output

@@ -98,7 +98,7 @@ def test_an_empty_spool_is_fine(tmp_path: Path) -> None:
     assert 'Nothing waits' in answer.stdout
 
 
-@pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',), ('tell-gaps',)])
+@pytest.mark.parametrize('verb', [(), ('list',), ('drain',), ('retry',), ('resend-gaps',)])
 def test_no_spool(tmp_path: Path, verb: tuple[str, ...]) -> None:
     """Every verb says which folder, and what names it; none makes one."""
     answer = run('--spool', str(tmp_path / 'none'), *verb)
@@ -143,8 +143,8 @@ def test_one_object_waits_again(home: Path) -> None:
 
 def test_gaps_are_told_again(home: Path) -> None:
     """The next part begins anew."""
-    assert said('tell-gaps') == {'rows': 1}
-    answer = run('tell-gaps')
+    assert said('resend-gaps') == {'rows': 1}
+    answer = run('resend-gaps')
     assert (answer.return_value, answer.stdout) == (0, '1 row of the gap journal will be sent again with the next part\n')
 
 
@@ -215,7 +215,7 @@ def test_a_shell_without_the_nodes_server_delivers_nothing(home: Path) -> None:
 
 
 def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To a real server, each object with a row in the catalogue; what is held or refused stays, and is told."""
+    """To a real server, each object with a row in the catalog; what is held or refused stays, and is told."""
     for name, value in seaweed.environment().items():
         monkeypatch.setenv(name, value)
     answer = run('drain', '--json')
@@ -226,10 +226,10 @@ def test_all_is_delivered_without_a_node(home: Path, seaweed: Tower, monkeypatch
     books = [row['key'] for row in rows(home / 'spool') if row['sensor'] == '_catalog' and row['state'] == 'delivered']
     assert sorted(key.split('/')[1] for key in books) == ['_catalog', '_gaps'], 'what is quarantined is in the gap journal'
     with closing(sqlite3.connect(home / 'spool/index.db')) as db:
-        assert db.execute('SELECT count(*) FROM uncatalogued').fetchone() == (0,)
+        assert db.execute('SELECT count(*) FROM uncataloged').fetchone() == (0,)
         assert db.execute("SELECT count(*) FROM sessions WHERE robot = 'thor'").fetchone() == (1,)
     assert run('retry').return_value == 0
-    assert said('drain')['delivered'] == 3  # the object, its part of the catalogue, and that it is not a gap any more
+    assert said('drain')['delivered'] == 3  # the object, its part of the catalog, and that it is not a gap any more
 
 
 def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,7 +98,7 @@ def test_what_the_index_forgot_is_said(home: Path) -> None:
     assert '1 older ones are not remembered' in ' '.join(run('--verify').stdout.split())
 
 
-def test_the_catalogue_is_not_called_forgotten(home: Path) -> None:
+def test_the_catalog_is_not_called_forgotten(home: Path) -> None:
     """Its parts are not asked for, others stand for them in time; but they are not objects that the index forgot."""
     with closing(sqlite3.connect(home / 'spool/index.db')) as index:
         index.execute("UPDATE objects SET sensor = '_catalog' WHERE key = 'thor/a'")

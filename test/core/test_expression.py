@@ -19,8 +19,8 @@ from shadowhound_data_logger.core.expression import (
     Comparison,
     Condition,
     conditions,
+    leaves,
     parse,
-    tests,
     text_of,
 )
 from shadowhound_data_logger.formats.statistics import NUMBERS
@@ -105,7 +105,7 @@ def test_an_expression_that_is_spelled_out_is_the_same(data: st.DataObject) -> N
     """``text_of`` writes what ``parse`` reads, with the same tests in the same order."""
     found = parse(spelled(data.draw, 3), 'x', PARTS)
     again = parse(text_of(found), 'x', PARTS)
-    assert list(tests(again)) == list(tests(found))
+    assert list(leaves(again)) == list(leaves(found))
     assert text_of(again) == text_of(parse(text_of(again), 'x', PARTS))
 
 
@@ -113,7 +113,7 @@ def test_an_expression_that_is_spelled_out_is_the_same(data: st.DataObject) -> N
 def test_any_text_is_an_expression_or_a_clear_error(text: str) -> None:
     """Never another error."""
     with suppress(SettingError):
-        assert list(tests(parse(text, 'x', PARTS)))
+        assert list(leaves(parse(text, 'x', PARTS)))
 
 
 @pytest.mark.parametrize(('text', 'allowed', 'position'), [

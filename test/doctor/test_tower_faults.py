@@ -258,7 +258,7 @@ def test_a_server_that_verifies_nothing(robot: Scene) -> None:
 
 def test_minio_is_told_and_no_finding(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such Towers go on working; what it means that nobody maintains it is said."""
-    monkeypatch.setattr('stores.fake_s3._Handler.version_string', lambda _: 'MinIO')
+    monkeypatch.setattr('stores.fake_s3.Handler.version_string', lambda _: 'MinIO')
     imitated()(robot)
     told = {result.check: result for result in robot.ask('s3')}
     assert told['s3.server'].severity is Severity.INFO

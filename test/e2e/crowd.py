@@ -1,4 +1,4 @@
-"""Program of tests: a neighbour in the robot's ROS domain, with many topics, and publishers that come and go.
+"""Program of tests: a neighbor in the robot's ROS domain, with many topics, and publishers that come and go.
 
 Standard input: ``topics N BYTES`` makes N publishers of Strings that publish once a second from then on, ``churn N`` makes N
 more that publish a few messages each and go, ``leave`` ends all of them. Each is answered with ``done``.

@@ -32,7 +32,7 @@ STRING = 'std_msgs/msg/String'
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """What the store holds of one robot (or below ``robot/sensor``), but for bookkeeping, as ledger and catalogue."""
+    """What the store holds of one robot (or below ``robot/sensor``), but for bookkeeping, as ledger and catalog."""
 
     contents: Mapping[str, bytes]
     """Key -> content."""

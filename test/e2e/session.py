@@ -1,4 +1,4 @@
-"""One run of the simulated Go2 whose sensors, bags and catalogue several files of tests look at."""
+"""One run of the simulated Go2 whose sensors, bags and catalog several files of tests look at."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Session:
 
     @classmethod
     def of(cls, processes: Processes, seaweed: Tower, store: ObjectStore) -> Session:
-        parameters = {'bag.record': 'always', 'bag.slice_s': SLICE_S, 'catalogue.period_s': CATALOGUE_S}
+        parameters = {'bag.record': 'always', 'bag.slice_s': SLICE_S, 'catalog.period_s': CATALOGUE_S}
         node = processes.node(seaweed.environment(), parameters)
         recording = processes.folder / 'witness'
         witness = processes.witness(TYPES, recording, best_effort=BEST_EFFORT)

@@ -39,7 +39,7 @@ PARAMETERS: Final = {
 
 
 def fitted(exported: Path, folder: Path) -> str:
-    """A line through the data set, as ONNX: from the state to the action; the digest of what it was fitted to."""
+    """A line through the dataset, as ONNX: from the state to the action; the digest of what it was fitted to."""
     from onnx import TensorProto, helper, numpy_helper
 
     info = json.loads((exported / 'meta/info.json').read_bytes())
@@ -140,9 +140,9 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
         return time.monotonic() - begun > 8.0 and any(one.pose.pose.position.x > 0.5 for one in heard)
 
     taught = mission(f'taught {robot}', went, lambda: told.publish(command))
-    # The mission becomes a data set, and that a policy.
+    # The mission becomes a dataset, and that a policy.
     asked = ('query', "SELECT count(*) AS rows FROM objects WHERE sensor = 'cmd_vel'", '--mission', taught, '--json')
-    until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalogue has arrived')
+    until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalog has arrived')
     exported = tmp_path / policy
     said = run('export', 'lerobot', policy, '--robot', robot, '--mission', taught, '--wait', '--max-stale', '1', '--allow-gaps',
         '--codec', 'h264')  # fmt: skip

@@ -1,4 +1,4 @@
-"""A neighbour with more topics than any robot has: the node's memory stays within bounds, and its accounts hold."""
+"""A neighbor with more topics than any robot has: the node's memory stays within bounds, and its accounts hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The story of docs/keep.md: a robot keeps everything, and the commands of the page bring what is wanted, to a data set."""
+"""The story of docs/keep.md: a robot keeps everything, and the commands of the page bring what is wanted, to a dataset."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_without_a_server_the_store_is_a_folder(processes: Processes) -> None:
         ({'camera.rate_hertz': 2.0}, ('camera.rate_hertz = 2.0', 'camera.enabled', 'camera.rate_hz')),
         ({'queue.max_bytes': 17}, ('queue.max_bytes = 17', 'at least')),
         ({'imu.topics': ['no topic!']}, ("imu.topics = ['no topic!']", 'valid topic names')),
-        ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'valid topic')),
+        ({'events.regex': '.*', 'events.conditions': ['x: t!:f < 1']}, ("events.conditions = 'x: t!:f < 1'", 'character 2')),
         ({'imu.topics': ['/odom']}, ("odom.topics = ['odom']", '/odom is in imu.topics already')),
         ({'robot': '../x'}, ("robot = '../x'", 'letters, digits')),
     ],

@@ -23,7 +23,7 @@ class Report:
     """Ends of the process in the middle of it."""
     requests: int = 0
     repeated: int = 0
-    """Puts that wrote the same content once more, on a server that does not know or honour If-None-Match."""
+    """Puts that wrote the same content once more, on a server that does not know or honor If-None-Match."""
     put_back: int = 0
     """Objects that were denied twice while others were taken, and that somebody moved back from quarantine."""
     lasted_s: float = 0.0

@@ -36,7 +36,7 @@ DAY_S: Final = 86_400.0
 PRODUCING_S: Final = 120.0
 CALM_S: Final = 900.0
 """Within so long after the last fault everything is delivered: a backoff of a minute, and a second one."""
-MOST_THREADS: Final = 4
+MAX_THREADS: Final = 4
 FOREIGN: Final = b'of another writer'
 
 
@@ -62,7 +62,7 @@ class Process:
         self._committing = False
         self._settled: set[int] = set()
         self._alive = True
-        upload = UploadSettings(threads=rng.randint(1, MOST_THREADS))
+        upload = UploadSettings(threads=rng.randint(1, MAX_THREADS))
         store = S3Store(StoreSettings(endpoint_url='http://simulated'), upload)
         parts: Any = store
         parts._s3, parts._creating = line, VirtualLock(time)

@@ -13,7 +13,7 @@ from faults.signing import signed_again
 TIMEOUT_S: Final = 30.0
 OFF: Final = timedelta(minutes=20)
 HOP: Final = frozenset({'connection', 'expect', 'keep-alive', 'transfer-encoding'})
-"""Headers that concern two neighbours only; none of them is signed."""
+"""Headers that concern two neighbors only; none of them is signed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ def members(made: Any) -> dict[str, bytes]:
 
 
 def samples(made: Any) -> dict[str, dict[str, bytes]]:
-    """Key -> kind -> content, put together as WebDataset does: neighbours whose names are the same up to the first dot."""
+    """Key -> kind -> content, put together as WebDataset does: neighbors whose names are the same up to the first dot."""
     found: dict[str, dict[str, bytes]] = {}
     last = None
     for name, content in members(made).items():

@@ -19,7 +19,7 @@ IMU = 'go2_interfaces/msg/IMU'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 STAMP_NS = 1_760_788_800_250_000_000
 JPEG = bytes.fromhex('ffd8ffc0000b080001000101011100ffda0008010100003f0000ffd9')
-"""The least that has a frame header, a scan header and a byte of scan: one grey pixel."""
+"""The least that has a frame header, a scan header and a byte of scan: one gray pixel."""
 SENSOR_OF = {
     COMPRESSED: 'camera',
     'sensor_msgs/msg/Image': 'camera',

@@ -16,7 +16,7 @@ IMAGE = 'sensor_msgs/msg/Image'
 
 
 def gradient(height: int = 48, width: int = 64) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A picture in RGB whose channels differ everywhere: swapped colours cannot go unnoticed."""
+    """A picture in RGB whose channels differ everywhere: swapped colors cannot go unnoticed."""
     rows, columns = np.mgrid[0:height, 0:width]
     return np.stack((rows * 255 // height, columns * 255 // width, np.full_like(rows, 40)), axis=-1).astype(np.uint8)
 
@@ -88,8 +88,8 @@ def test_a_jpeg_cut_in_its_headers(ros: Any) -> None:
 
 @pytest.mark.parametrize('padding', [0, 16])
 @pytest.mark.parametrize('encoding', ['rgb8', 'bgr8', 'rgba8', 'bgra8'])
-def test_colours_and_padding(ros: Any, encoding: str, padding: int) -> None:
-    """A raw colour image, with or without padding at the end of its rows, decodes to the same picture."""
+def test_colors_and_padding(ros: Any, encoding: str, padding: int) -> None:
+    """A raw color image, with or without padding at the end of its rows, decodes to the same picture."""
     picture = gradient()
     order = ['rgba'.index(channel) % 3 for channel in encoding.removesuffix('8')]
     rows = np.hstack((picture[:, :, order].reshape(48, -1), np.full((48, padding), 99, np.uint8)))
@@ -100,12 +100,12 @@ def test_colours_and_padding(ros: Any, encoding: str, padding: int) -> None:
     assert np.abs(decoded - picture).mean() < 2
 
 
-def test_grey(ros: Any) -> None:
-    """A mono8 image becomes a grey JPEG."""
-    grey = gradient()[:, :, 1]
-    body = raw(ros, grey, encoding='mono8').object.body
+def test_gray(ros: Any) -> None:
+    """A mono8 image becomes a gray JPEG."""
+    gray = gradient()[:, :, 1]
+    body = raw(ros, gray, encoding='mono8').object.body
     assert simplejpeg.decode_jpeg_header(body)[2:] == ('Gray', 'Gray')
-    assert np.abs(simplejpeg.decode_jpeg(body, 'GRAY')[:, :, 0].astype(int) - grey).max() <= 6
+    assert np.abs(simplejpeg.decode_jpeg(body, 'GRAY')[:, :, 0].astype(int) - gray).max() <= 6
 
 
 def test_quality(ros: Any) -> None:
@@ -146,11 +146,11 @@ def test_too_large_for_a_jpeg(ros: Any) -> None:
 
 
 def test_a_jpeg_has_brightness_and_sharpness(ros: Any) -> None:
-    """Of its grey: an even picture is as bright as it is and has no edges; whoever opens the object finds the same."""
+    """Of its gray: an even picture is as bright as it is and has no edges; whoever opens the object finds the same."""
     board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((16, 16))) * 255
     told = {}
-    for name, grey in (('dark', np.full((96, 128), 20)), ('board', board)):
-        picture = np.repeat(grey[:, :, None].astype(np.uint8), 3, axis=2)
+    for name, gray in (('dark', np.full((96, 128), 20)), ('board', board)):
+        picture = np.repeat(gray[:, :, None].astype(np.uint8), 3, axis=2)
         made = compressed(ros, bytes(simplejpeg.encode_jpeg(picture, quality=95))).object
         told[name] = unpacked_statistics(made.statistics)
         assert told[name] == statistics_of(made.key, made.body)

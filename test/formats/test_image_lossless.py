@@ -43,7 +43,7 @@ def pixels_of(made: Any) -> Any:
 
 
 @pytest.mark.parametrize('format_name', ['jpeg', 'png'])
-@pytest.mark.parametrize('pixels', [PIXELS, PIXELS[:, :, :3], PIXELS[:, :, 0], DEPTH], ids=['rgba', 'rgb', 'grey', '16 bit'])
+@pytest.mark.parametrize('pixels', [PIXELS, PIXELS[:, :, :3], PIXELS[:, :, 0], DEPTH], ids=['rgba', 'rgb', 'gray', '16 bit'])
 def test_a_png_passes_through(ros: Any, format_name: str, pixels: Any) -> None:
     """The object is the published PNG byte for byte, under its own extension and content type, and knows its size."""
     data = png(np.ascontiguousarray(pixels))
@@ -83,7 +83,7 @@ def test_a_png_whose_header_lies(ros: Any, changes: dict[int, int]) -> None:
 @pytest.mark.parametrize('padding', [0, 3])
 @pytest.mark.parametrize(('encoding', 'order'), [('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 3]),
                                                  ('bgra8', [2, 1, 0, 3]), ('mono8', [0])])  # fmt: skip
-def test_colours_without_loss(ros: Any, encoding: str, order: list[int], padding: int) -> None:
+def test_colors_without_loss(ros: Any, encoding: str, order: list[int], padding: int) -> None:
     """With format png every 8-bit image reads back as it was, alpha included, whatever its order and its padding."""
     made = raw(ros, PIXELS[:, :, order], encoding, padding=padding, format='png')
     wanted = PIXELS[:, :, sorted(order)]
@@ -109,12 +109,12 @@ def test_sixteen_bits(ros: Any, format_name: str, encoding: str, bigendian: bool
 @pytest.mark.parametrize('format_name', ['jpeg', 'png'])
 def test_floats(ros: Any, format_name: str, bigendian: bool, padding: int) -> None:
     """float32 images are TIFFs, with both formats, and every bit is as it was, in NaN and infinities too."""
-    metres = np.random.default_rng(13).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
-    metres[0, :4] = np.nan, np.inf, -np.inf, -0.0
-    metres[1, 0] = np.frombuffer(b'\1\2\xc0\x7f', np.float32)[0]  # a NaN with something in it
-    data = metres.astype('>f4' if bigendian else '<f4')
+    meters = np.random.default_rng(13).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    meters[0, :4] = np.nan, np.inf, -np.inf, -0.0
+    meters[1, 0] = np.frombuffer(b'\1\2\xc0\x7f', np.float32)[0]  # a NaN with something in it
+    data = meters.astype('>f4' if bigendian else '<f4')
     made = raw(ros, data, '32FC1', padding=padding, bigendian=bigendian, format=format_name)
-    assert pixels_of(made).tobytes() == metres.tobytes()
+    assert pixels_of(made).tobytes() == meters.tobytes()
     assert (made.key, made.content_type) == ('thor/camera/20251018/120000_front.tiff', 'image/tiff')
 
 

@@ -100,7 +100,7 @@ def test_fields_out_of_order(ros: Any) -> None:
     assert points.pc_data['a'].tolist() == [1, 3]
 
 
-def test_packed_colour_keeps_its_bits(ros: Any) -> None:
+def test_packed_color_keeps_its_bits(ros: Any) -> None:
     """``rgb`` packed into a float is copied as bits: a signalling NaN in it stays what it is, padding or not."""
     data = np.array([(1, 0x7F812345), (2, 0xFFA00001)], '<u4')
     for point_step, extra in ((8, 0), (12, 4)):
@@ -208,7 +208,7 @@ def test_no_points_are_a_measurement(ros: Any, shape: dict[str, int]) -> None:
 
 
 def test_fields_that_overlap(ros: Any) -> None:
-    """Each of them is stored, as for a colour that is named as a whole and by its bytes."""
+    """Each of them is stored, as for a color that is named as a whole and by its bytes."""
     fields = [('x', 0, 7, 1), ('rgb', 4, 7, 1), ('b', 4, 2, 1), ('g', 5, 2, 1), ('r', 6, 2, 1)]
     data = np.float32(1.5).tobytes() + bytes([1, 2, 3, 0])
     found = read(ros.encode(CLOUD, cloud(ros, fields, data, width=1, point_step=8)).object.body).pc_data

@@ -50,7 +50,7 @@ from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import decode, query, reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
-from shadowhound_data_logger.lake.fetch import Wish
+from shadowhound_data_logger.lake.fetch import FetchRequest
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import sources_of
@@ -371,11 +371,11 @@ def fetched_objects(shop: Shop) -> Round:
             path.write_bytes(body)
         settings = StoreSettings(directory=shop.input)
         wishes = [
-            Wish(rng.choice((schema.BUCKET, schema.BUCKET, schema.BUCKET, '..', '.')),
+            FetchRequest(rng.choice((schema.BUCKET, schema.BUCKET, schema.BUCKET, '..', '.')),
                  rng.choice((*bodies, *TEXTS, '../' * 5 + 'x')),
                  rng.choice((7, 3000, *NUMBERS)), rng.choice((None, 'ab', 64 * '0')))
             for _ in range(4)
-        ] + [Wish(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
+        ] + [FetchRequest(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
         with shop.reading():
             found = fetch_objects(wishes, shop.target, DirectoryStore(settings.directory), threads=2)
         return f'{found.moved} moved'

@@ -21,7 +21,7 @@ from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.compact import compact
-from shadowhound_data_logger.lake.fetch import Wish, fetch
+from shadowhound_data_logger.lake.fetch import FetchRequest, fetch
 from shadowhound_data_logger.lake.fetched import keep_rows
 from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
@@ -216,7 +216,7 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
     source, to = drive(tmp_path, frames=frames), tmp_path / 'data'
     for flags in ({'sensor': 'camera'}, {'robot': 'thor'}):
         rows = query.objects(source, **flags).to_pylist()
-        wishes = [Wish(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
+        wishes = [FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
         fetch(wishes, to, DirectoryStore(source.settings.directory))
         keep_rows(to, rows)
     store, folder = MissionDataset(source, align=ALIGN), MissionDataset(to, align=ALIGN)

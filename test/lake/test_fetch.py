@@ -18,7 +18,7 @@ from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, 
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.fetch import FetchResult, Wish, fetch, under
+from shadowhound_data_logger.lake.fetch import FetchRequest, FetchResult, fetch, under
 from shadowhound_data_logger.lake.fetched import Fetched, keep_rows
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import Content
@@ -165,7 +165,7 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
 def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Path) -> None:
     """An object that is not what its row says is a failure, whatever it says of itself."""
     key = next(iter(OBJECTS))
-    found = run(Asked(settings), tmp_path / 'data', wishes=[Wish(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
+    found = run(Asked(settings), tmp_path / 'data', wishes=[FetchRequest(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
 
 
@@ -184,7 +184,7 @@ def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings
 def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path, key: str) -> None:
     """Anybody may have written to a bucket."""
     source = Asked(settings)
-    found = run(source, tmp_path / 'data', wishes=[Wish(BUCKET, key, 3)])
+    found = run(source, tmp_path / 'data', wishes=[FetchRequest(BUCKET, key, 3)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
     assert source.asked == []
 
@@ -203,7 +203,7 @@ def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_
     keys = list(OBJECTS)
     to = tmp_path / 'data'
     (to / keys[0]).mkdir(parents=True)
-    wishes = [*under(Bucket(settings, BUCKET), PREFIX), Wish(BUCKET, 'thor/gone', 3), Wish('other', keys[1], 3)]
+    wishes = [*under(Bucket(settings, BUCKET), PREFIX), FetchRequest(BUCKET, 'thor/gone', 3), FetchRequest('other', keys[1], 3)]
     found = run(Asked(settings), to, wishes=wishes)
     assert found.moved == COUNT - 1
     assert set(found.failed) == {f'{BUCKET}/{keys[0]}', f'{BUCKET}/thor/gone', f'other/{keys[1]}'}
@@ -222,7 +222,7 @@ def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path, m
             raise error
 
     source = Away(settings)
-    wishes = [Wish(BUCKET, f'thor/{number}', 3) for number in range(2000)]
+    wishes = [FetchRequest(BUCKET, f'thor/{number}', 3) for number in range(2000)]
     error: Exception = StoreUnavailable('away')
     with pytest.raises(StoreUnavailable):
         run(source, tmp_path / 'data', wishes=wishes, threads=2)

@@ -57,7 +57,7 @@ class Lake:
     def parts(self) -> list[str]:
         return [info.key for info in self.store.list('sensor-data', '_vectors/')]
 
-    def likest(self, model: Any, wanted: Any, **flags: Any) -> list[str]:
+    def most_similar(self, model: Any, wanted: Any, **flags: Any) -> list[str]:
         rows = like(self.source, model, wanted, limit=10, **flags).rows.to_pylist()
         names = {key: name for name, key in self.keys.items()}
         return [names[each['key']] for each in rows]
@@ -87,9 +87,9 @@ def test_the_likest_come_first(lake: Lake, pair: Path) -> None:
     assert (found.pictures, found.known, found.made, dict(found.refused)) == (4, 0, 4, {})
     assert len(lake.parts()) == 2, 'one a day'
     reddish = model.of_pictures([Image.new('RGB', (100, 40), (200, 30, 30))])[0]
-    assert set(lake.likest(model, reddish)[:2]) == {'red', 'dark red'}
-    assert lake.likest(model, model.of_text('blue'))[0] == 'blue'
-    assert lake.likest(model, reddish, until='2026-10-29') == ['red', 'blue']
+    assert set(lake.most_similar(model, reddish)[:2]) == {'red', 'dark red'}
+    assert lake.most_similar(model, model.of_text('blue'))[0] == 'blue'
+    assert lake.most_similar(model, reddish, until='2026-10-29') == ['red', 'blue']
     answer = like(lake.source, model, model.of_text('green'), limit=1)
     assert answer.rows['likeness'].to_pylist() == pytest.approx([0.99], abs=0.02)
     assert (answer.pictures, answer.without, len(answer.rows)) == (4, 0, 1)
@@ -269,7 +269,7 @@ def test_pictures_of_one_content_are_all_answers(lake: Lake, pair: Path) -> None
     model = OnnxPair.open(pair)
     found = embed(lake.store, lake.source, model)
     assert (found.pictures, found.made, found.known) == (5, 4, 1)
-    assert set(lake.likest(model, model.of_text('red'))[:2]) == {'red', 'red again'}
+    assert set(lake.most_similar(model, model.of_text('red'))[:2]) == {'red', 'red again'}
 
 
 def test_a_death_in_the_middle_costs_no_vector(lake: Lake, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pull import _sentence
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter, PullRequest
 from shadowhound_data_logger.core.model import Outcome, State
@@ -34,7 +34,7 @@ from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.scan import superseding
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -54,7 +54,7 @@ class Field:
         self.source = Bucket(self.settings, 'sensor-data')
         self.spool = Spool(home / 'spool', SpoolSettings(min_free_bytes=0), self.clock, 'thor', KeepSettings(max_bytes=1 << 20))
         self.spool.open()
-        self.catalogue = CatalogueWriter(home / 'spool', CatalogueSettings(), 'thor', self.clock, lambda: self.now_s, keeps=True)
+        self.catalogue = CatalogWriter(home / 'spool', CatalogSettings(), 'thor', self.clock, lambda: self.now_s, keeps=True)
         self.server = RequestServer(self.spool, self.store, KeepSettings(), 'thor', self.clock, put=self.commit,
                                     released=lambda _: None, cutter=partial(KeptCut, home),
                                     monotonic=lambda: self.now_s)  # fmt: skip

@@ -23,7 +23,7 @@ from shadowhound_data_logger.live import acts as acts_module
 from shadowhound_data_logger.live import answers as answers_module
 from shadowhound_data_logger.live import server as module
 from shadowhound_data_logger.live import viewers as viewers_module
-from shadowhound_data_logger.live.access import ENDED_FILE, LASTS_S, MOST_FAILURES, Access, OwnNames, TokenRefused, make_tokens
+from shadowhound_data_logger.live.access import ENDED_FILE, LASTS_S, MAX_FAILURES, Access, OwnNames, TokenRefused, make_tokens
 from shadowhound_data_logger.live.auth import MAX_BODY
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 from shadowhound_data_logger.live.viewers import MAX_MESSAGE, MAX_VIEWERS
@@ -251,9 +251,9 @@ def test_wrong_tokens_have_to_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         async with serving(tmp_path, monkeypatch) as page:
             statuses = [
                 (await page.ask('stranger', 'POST', '/api/session', body=b'{"token": "guess"}'))[0]
-                for _ in range(MOST_FAILURES + 2)
+                for _ in range(MAX_FAILURES + 2)
             ]
-            assert statuses == [401] * MOST_FAILURES + [429] * 2
+            assert statuses == [401] * MAX_FAILURES + [429] * 2
             right = json.dumps({'token': page.token('operator')}).encode()
             status, headers, _ = await page.ask('stranger', 'POST', '/api/session', body=right)
             assert (status, 0 < int(headers['Retry-After']) <= 60) == (429, True)
@@ -294,30 +294,30 @@ def test_strangers_lock_out_nobody_but_themselves(tmp_path: Path) -> None:
 def test_an_address_that_guesses_waits_a_minute_from_its_first_guess(tmp_path: Path) -> None:
     """It may try as often as is allowed in any minute; the wait is said, and a right token after it clears the record."""
     door = Door(tmp_path)
-    assert [door.guess('10.0.0.1') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert [door.guess('10.0.0.1') for _ in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
     assert door.access.wait_s('10.0.0.1') == access_module.FAILURES_S
     door.now_s += access_module.FAILURES_S
     assert door.lets_in('10.0.0.1')
-    assert [door.guess('10.0.0.1') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert [door.guess('10.0.0.1') for _ in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
 
 
 def test_a_host_with_many_addresses_of_ipv6_is_one(tmp_path: Path) -> None:
     """All addresses of a /64 wait together, an IPv4 address is the same within IPv6, and other networks do not wait."""
     door = Door(tmp_path)
-    assert [door.guess(f'fd00::{n:x}') for n in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert [door.guess(f'fd00::{n:x}') for n in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
     assert door.lets_in('fd00:0:0:1::1')
-    assert [door.guess('::ffff:10.0.0.1') for _ in range(MOST_FAILURES)] == [True] * MOST_FAILURES
+    assert [door.guess('::ffff:10.0.0.1') for _ in range(MAX_FAILURES)] == [True] * MAX_FAILURES
     assert not door.guess('10.0.0.1')
 
 
 def test_what_is_remembered_of_wrong_tokens_is_bounded(tmp_path: Path) -> None:
     """However many addresses guess, a bounded number of them is remembered, and those that guess now are among them."""
     door = Door(tmp_path)
-    for number in range(3 * access_module.MOST_ADDRESSES):
+    for number in range(3 * access_module.MAX_ADDRESSES):
         door.guess(f'10.{number >> 16 & 255}.{number >> 8 & 255}.{number & 255}')
     failures = door.access._failures
-    assert (len(failures), max(map(len, failures.values()))) == (access_module.MOST_ADDRESSES, 1)
-    assert [door.guess('10.9.9.9') for _ in range(MOST_FAILURES + 1)] == [True] * MOST_FAILURES + [False]
+    assert (len(failures), max(map(len, failures.values()))) == (access_module.MAX_ADDRESSES, 1)
+    assert [door.guess('10.9.9.9') for _ in range(MAX_FAILURES + 1)] == [True] * MAX_FAILURES + [False]
 
 
 def test_a_sign_in_ends_with_a_sign_out_and_with_a_new_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -724,7 +724,7 @@ def test_a_sign_out_holds_at_every_page_that_has_the_tokens(tmp_path: Path) -> N
 
 def test_what_is_remembered_of_sign_outs_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the most there may be the oldest leave, and nobody of theirs comes back; what has expired leaves by itself."""
-    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
     it = Signing(tmp_path)
     access = it.access()
     ended = []
@@ -749,7 +749,7 @@ def test_a_viewer_who_signs_out_again_and_again_ends_no_operator_s_sign_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is remembered beyond the most there may be counts for the role alone."""
-    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
     it = Signing(tmp_path)
     access = it.access()
     operator = access.sign_in(it.tokens['operator'].read_text().strip(), '10.0.0.1')
@@ -765,7 +765,7 @@ def test_a_viewer_who_signs_in_again_and_again_over_himself_ends_no_operators_si
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of his own sign-ins the last one is left, also when all came within a second."""
-    monkeypatch.setattr(access_module, 'MOST_ENDED', 3)
+    monkeypatch.setattr(access_module, 'MAX_ENDED', 3)
     it = Signing(tmp_path)
     access = it.access()
     tokens = {role: path.read_text().strip() for role, path in it.tokens.items()}

@@ -19,7 +19,7 @@ from shadowhound_data_logger.live.kinds import (
     FULL,
     HALF,
     KINDS,
-    MOST_NAME,
+    MAX_NAME,
     MOST_NAMES,
     SIZES,
     SMALLEST,
@@ -183,7 +183,7 @@ def test_joints_without_end_are_cut() -> None:
     joints = cdr(new(name, header=header(), name=names, position=np.zeros(2000), velocity=empty, effort=empty), name)
     item = series('/joints', KINDS[name], name, TYPES, [(10.0, joints)])
     assert item.head is not None
-    assert (len(item.head['names']), max(map(len, item.head['names']))) == (MOST_NAMES, MOST_NAME)
+    assert (len(item.head['names']), max(map(len, item.head['names']))) == (MOST_NAMES, MAX_NAME)
 
 
 @pytest.mark.parametrize(('unknown', 'names'), [

@@ -258,7 +258,7 @@ def test_the_keyboard_presses_and_scrubs(page: Page) -> None:
     page.locator('#data').wait_for()
 
 
-def test_motion_and_colours_are_as_the_user_wants_them(page: Page) -> None:
+def test_motion_and_colors_are_as_the_user_wants_them(page: Page) -> None:
     """Nothing moves by itself for who asked for that; and the page is dark in a dark system."""
     moving = """() => [...document.querySelectorAll('*')].filter((each) => {
         const style = getComputedStyle(each);
@@ -275,17 +275,17 @@ def test_motion_and_colours_are_as_the_user_wants_them(page: Page) -> None:
             page.emulate_media(color_scheme=scheme)
             for part in ('body', '.panel'):
                 style = f'getComputedStyle(document.querySelector("{part}"))'
-                colours = page.evaluate(f'[{style}.backgroundColor, {style}.color]')
-                shades[scheme, part] = [sum(rgb(colour)) for colour in colours]
+                colors = page.evaluate(f'[{style}.backgroundColor, {style}.color]')
+                shades[scheme, part] = [sum(rgb(color)) for color in colors]
         assert all(back > text + 300 for (scheme, _), (back, text) in shades.items() if scheme == 'light')
         assert all(back < text - 300 for (scheme, _), (back, text) in shades.items() if scheme == 'dark')
     finally:
         page.emulate_media(reduced_motion='no-preference', color_scheme='light')
 
 
-def rgb(colour: str) -> list[int]:
-    """Of a computed colour."""
-    return [int(part) for part in re.findall(r'\d+', colour)[:3]]
+def rgb(color: str) -> list[int]:
+    """Of a computed color."""
+    return [int(part) for part in re.findall(r'\d+', color)[:3]]
 
 
 @pytest.fixture
@@ -444,7 +444,7 @@ def test_a_gap_stands_on_the_timeline_at_its_time(page: Page, watching: Watching
 def test_back_in_time(page: Page, watching: Watching, tmp_path: Path) -> None:
     """A click on the timeline shows that moment: frame, cloud, path and plots of then; it plays on from there.
 
-    The commands that the page tells run as they stand there, once the catalogue of that minute has arrived: query finds it, fetch
+    The commands that the page tells run as they stand there, once the catalog of that minute has arrived: query finds it, fetch
     and bag cut give files.
     """
     press(page.get_by_role('button', name='Back in time'))
@@ -826,17 +826,17 @@ BLINDNESS = {
 """What such an eye sees of linear RGB: Machado, Oliveira and Fernandes (2009), severity 1."""
 
 
-def seen(colour: str, kind: str) -> Any:
-    """A computed colour in CIE Lab."""
-    linear = np.array([(part / 255 + 0.055) ** 2.4 / 1.055**2.4 if part > 10 else part / 255 / 12.92 for part in rgb(colour)])
+def seen(color: str, kind: str) -> Any:
+    """A computed color in CIE Lab."""
+    linear = np.array([(part / 255 + 0.055) ** 2.4 / 1.055**2.4 if part > 10 else part / 255 / 12.92 for part in rgb(color)])
     linear = np.clip(np.array(BLINDNESS[kind]) @ linear if kind else linear, 0, 1)
     xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear / (0.9505, 1, 1.089)
     x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
     return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
-def test_each_cause_of_a_gap_has_its_own_colour(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hue and pattern: on the timeline as in the legend, for words of a server too; most hues differ for the colour-blind too."""
+def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hue and pattern: on the timeline as in the legend, for words of a server too; most hues differ for the color-blind too."""
     causes = sorted({*CAUSES, 'unknown', 'EntityTooLarge', 'InvalidObjectState'})
     now_ms = time.time() * 1e3
     columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
@@ -878,7 +878,7 @@ APART = 20.0
 
 
 def page_rgb(page: Page, name: str) -> str:
-    """A colour of the style sheet as it is computed."""
+    """A color of the style sheet as it is computed."""
     script = """name => {
         const probe = document.body.appendChild(document.createElement('i'));
         probe.style.color = `var(${name})`;

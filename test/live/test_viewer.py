@@ -12,13 +12,13 @@ from shadowhound_data_logger.live.viewer import (
     BESIDE_VIDEO,
     CHUNK_S,
     FIRST_RATE,
-    LEAST_CHUNK,
-    LEAST_QUEUE,
-    MOST_CHUNK,
-    MOST_QUEUE,
-    MOST_RATE,
-    MOST_ROUND_S,
-    MOST_ROWS_WAITING,
+    MAX_CHUNK,
+    MAX_QUEUE,
+    MAX_RATE,
+    MAX_ROUND_S,
+    MAX_ROWS_WAITING,
+    MIN_CHUNK,
+    MIN_QUEUE,
     SMALL_FRAME,
     SMALL_ROOM,
     SMALLER,
@@ -43,7 +43,7 @@ class Browser:
         before = len(self.items)
         while most and (frame := self.viewer.next_frame()) is not None:
             most -= 1
-            assert len(frame) <= MOST_CHUNK + 4
+            assert len(frame) <= MAX_CHUNK + 4
             self.items += [{**head, 'body': body} for head, body in self._frames.take(frame)]
         return self.items[before:]
 
@@ -94,14 +94,14 @@ def test_a_browser_that_reads_nothing_is_sent_a_window_and_holds_one_item_a_topi
         browser.viewer.offer(frame(number))
         browser.viewer.offer(row(number))
         browser.read()
-    assert LEAST_QUEUE <= browser.received <= MOST_QUEUE + MOST_CHUNK
+    assert MIN_QUEUE <= browser.received <= MAX_QUEUE + MAX_CHUNK
     browser.acknowledge()
     items = all_of(browser)
     frames = [item['number'] for item in items if item['topic'] == '/camera']
     assert len(frames) <= 2
     assert frames[-1] == 499
     rows = [item['number'] for item in items if item['topic'] == '/imu']
-    assert rows == list(range(500 - MOST_ROWS_WAITING, 500))
+    assert rows == list(range(500 - MAX_ROWS_WAITING, 500))
     assert browser.viewer.replaced > 400
 
 
@@ -176,7 +176,7 @@ def test_an_acknowledgement_of_what_was_not_sent_opens_no_window(browser: Browse
     before = browser.received
     browser.viewer.acknowledge(said)
     browser.read()
-    assert browser.received - before <= MOST_CHUNK + 4
+    assert browser.received - before <= MAX_CHUNK + 4
 
 
 def test_what_is_not_watched_any_more_is_not_sent(browser: Browser) -> None:
@@ -254,7 +254,7 @@ def test_a_narrow_link_is_not_filled_beyond_what_it_holds(now: list[float], rate
     link.run(20.0)
     late = sorted(link.late_s)
     assert 0.5 * rate < viewer.rate < 1.5 * rate
-    assert late[int(len(late) * 0.95)] < round_s / 2 + (LEAST_QUEUE + 2 * 4_096) / rate + 0.08
+    assert late[int(len(late) * 0.95)] < round_s / 2 + (MIN_QUEUE + 2 * 4_096) / rate + 0.08
 
 
 def test_beside_video_large_items_get_a_part_of_the_link(now: list[float]) -> None:
@@ -280,7 +280,7 @@ def test_beside_video_large_items_get_a_part_of_the_link(now: list[float]) -> No
     assert link.carried > 10 * rate * BESIDE_VIDEO * 2
 
 
-@pytest.mark.parametrize(('rate', 'chunk'), [(5e6, MOST_CHUNK), (60_000.0, LEAST_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
+@pytest.mark.parametrize(('rate', 'chunk'), [(5e6, MAX_CHUNK), (60_000.0, MIN_CHUNK), (FIRST_RATE, int(FIRST_RATE * CHUNK_S))])
 def test_a_piece_of_a_large_item_does_not_keep_a_link_for_long(browser: Browser, rate: float, chunk: int) -> None:
     """What comes after it waits 13 ms, where the link is not slower than is worth while."""
     browser.viewer.rate = rate
@@ -316,4 +316,4 @@ def test_a_way_is_not_believed_to_hold_what_none_holds(now: list[float]) -> None
     """A kernel, or who stands in between, may say anything."""
     viewer = Viewer(lambda: now[0])
     viewer.rate, viewer.round_s = 1e12, 1e6
-    assert viewer.window <= MOST_QUEUE + MOST_RATE * MOST_ROUND_S
+    assert viewer.window <= MAX_QUEUE + MAX_RATE * MAX_ROUND_S

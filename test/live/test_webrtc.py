@@ -308,7 +308,7 @@ def test_an_offer_that_is_none_is_answered_with_the_problem(offer: Any) -> None:
 def test_no_more_peers_and_cameras_than_there_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes later is told so; whoever goes makes room."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
-    monkeypatch.setattr(webrtc, 'MOST_PEERS', 3)
+    monkeypatch.setattr(webrtc, 'MAX_PEERS', 3)
     addresses = '127.0.0.1', '::ffff:127.0.0.1'
 
     async def run() -> None:
@@ -333,13 +333,13 @@ def test_no_more_peers_and_cameras_than_there_may_be(monkeypatch: pytest.MonkeyP
 
 
 def test_frames_of_any_size_become_video() -> None:
-    """Odd sides, large ones, grey ones; what is no picture is left out."""
+    """Odd sides, large ones, gray ones; what is no picture is left out."""
     webrtc = pytest.importorskip('shadowhound_data_logger.live.webrtc')
     for height, width, shown in ((3, 5, (2, 4)), (240, 321, (240, 320)), (500, 4001, (188, 1500))):
         frame = webrtc._frame(simplejpeg.encode_jpeg(np.zeros((height, width, 3), np.uint8)))
         assert (frame.height, frame.width) == shown
-    grey = simplejpeg.encode_jpeg(np.zeros((8, 8, 1), np.uint8), colorspace='GRAY', colorsubsampling='Gray')
-    assert webrtc._frame(grey).width == 8
+    gray = simplejpeg.encode_jpeg(np.zeros((8, 8, 1), np.uint8), colorspace='GRAY', colorsubsampling='Gray')
+    assert webrtc._frame(gray).width == 8
     for broken in (b'', b'\xff\xd8\xff', simplejpeg.encode_jpeg(np.zeros((1, 1, 3), np.uint8))):
         with pytest.raises(ValueError):
             webrtc._frame(broken)

@@ -13,7 +13,7 @@ from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.missions.folder import MissionFolder, Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.mission_data_logger import MissionDataLogger
-from shadowhound_data_logger.missions.story import Point
+from shadowhound_data_logger.missions.state import Point
 
 
 @dataclass
@@ -89,7 +89,7 @@ class FakeSpooler:
     def drain(self) -> None:
         pass
 
-    def hasten(self) -> None:
+    def expedite(self) -> None:
         pass
 
     def close(self) -> None:

@@ -129,7 +129,7 @@ def is_holding(pid: int) -> bool:
     return state == 'S' and int(fields[15]) == child.NICE
 
 
-@pytest.mark.parametrize('by', ['wake', 'let_go', 'HOLD_S'])
+@pytest.mark.parametrize('by', ['wake', 'release', 'HOLD_S'])
 def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str) -> None:
     """Or its agent is gone, or a second has passed: the CPU is left to the first mission's request for a run."""
     fake, loaded = tmp_path / 'package/shadowhound_data_logger/missions', tmp_path / 'loaded'
@@ -148,7 +148,7 @@ def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, 
         assert not loaded.exists()
         getattr(replayer, by)()
     until(loaded.exists, 'it loads the package')
-    replayer.let_go()
+    replayer.release()
 
 
 @pytest.mark.parametrize('arguments', [

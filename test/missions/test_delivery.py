@@ -11,11 +11,11 @@ from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.core.errors import TrackingError, TrackingRefused, TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
-from shadowhound_data_logger.missions.drawing import Pictures, nothing
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.journal import Journal, read
 from shadowhound_data_logger.missions.overview import report
-from shadowhound_data_logger.missions.story import Point
+from shadowhound_data_logger.missions.pictures import Pictures, nothing
+from shadowhound_data_logger.missions.state import Point
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 

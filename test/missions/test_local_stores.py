@@ -8,7 +8,7 @@ import pytest
 
 from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.folder import Run
-from shadowhound_data_logger.missions.story import Point
+from shadowhound_data_logger.missions.state import Point
 from shadowhound_data_logger.missions.tracking import MISSION_TAG, MlflowTracking
 
 POINTS = [Point('battery_pct', 90.0 - number, 1_760_788_800_000 + number, number) for number in range(5)]

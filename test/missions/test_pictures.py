@@ -13,11 +13,10 @@ from missions.server import until
 from missions.test_delivery import deliver
 from PIL import Image
 
-from shadowhound_data_logger.missions import drawing
-from shadowhound_data_logger.missions.drawing import NAMES, Drawing
+from shadowhound_data_logger.missions import pictures
 from shadowhound_data_logger.missions.folder import MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import Journal
-from shadowhound_data_logger.missions.pictures import make, material_of, read_path
+from shadowhound_data_logger.missions.pictures import NAMES, Drawing, make, material_of, read_path
 
 WIDTH = 800
 
@@ -67,7 +66,7 @@ def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None
     folder.floor.write_bytes(b'no array')
     notes = make(folder, 'patrol_1')
     assert notes == {
-        'camera_summary.jpg': '1 of 3 frames are not pictures', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
+        'camera_summary.jpg': '1 of 3 frames are not images', 'trajectory.png': notes['trajectory.png'], 'battery.png': '',
     }  # fmt: skip
     assert notes['trajectory.png'].startswith('not made: ')
     assert sorted(path.name for path in folder.files.iterdir() if path.name in NAMES) == ['battery.png', 'camera_summary.jpg']
@@ -94,7 +93,7 @@ def test_the_node_s_data_stand_in(tmp_path: Path) -> None:
     node.append({'k': 'metrics', 't': start_ns + 10**9, 's': 0, 'm': {'battery_pct': 1.0, 'temperature_c': 2.0}})
     node.close()
     found = material_of(folder)
-    assert [(frame.number, frame.path) for frame in found.frames] == [(4, folder.node.files / 'a.jpg')]
+    assert [frame[1:] for frame in found.frames] == [(4, folder.node.files / 'a.jpg')]
     assert [value for _, value in found.states['battery_pct']] == [90.0, 89.0, 88.0]
 
 
@@ -144,15 +143,15 @@ def test_a_process_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
     hanging = tmp_path / 'hang.py'
     hanging.write_text('import time\ntime.sleep(600)\n')
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
-    monkeypatch.setattr(drawing, 'PROGRAM', program)
+    monkeypatch.setattr(pictures, 'PROGRAM', program)
     now = [0.0]
     here = Drawing(monotonic=lambda: now[0])
     folder = fly(tmp_path / 'a', frames=0, states=0)
     assert here.of(folder, 'patrol_1') is None
-    now[0] = drawing.DEADLINE_S + 1
+    now[0] = pictures.DEADLINE_S + 1
     notes = until(lambda: here.of(folder, 'patrol_1'), 'it is given up')
     assert set(notes) == set(NAMES)
-    assert 'the process that makes them ended with' in notes['battery.png']
+    assert 'the process that makes them exited with' in notes['battery.png']
     assert not here.busy
 
 

@@ -79,7 +79,7 @@ def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
     newest = max(missions(tmp_path), key=lambda folder: folder.mission_id)
     assert (report(newest).last_error, report(newest).remedy) == ('away (wait)', 'wait')
     away = False
-    replay.hurry()
+    replay.retry_now()
     while replay.step():
         pass
     assert not replay.owes
@@ -94,7 +94,7 @@ def test_a_mission_that_begins_ends_a_pause(tmp_path: Path) -> None:
     tracking = FakeTracking(fail=lambda _: away)
     replay = new_replay(tmp_path, tracking, now)
     for _ in range(20):
-        replay.hurry()
+        replay.retry_now()
         replay.step()
     away = False
     assert not replay.step()

@@ -48,7 +48,7 @@ def said(folder: MissionFolder) -> Report:
 def test_no_process_sends_it(folder: MissionFolder) -> None:
     """The command that does is named."""
     found = said(folder)
-    assert found.waiting_for == 'a process that sends it'
+    assert found.waiting_for == 'a sender'
     assert 'missions resume' in found.remedy
 
 
@@ -121,4 +121,4 @@ def test_a_complete_mission_waits_for_nothing(folder: MissionFolder) -> None:
 def test_a_journal_that_is_gone(folder: MissionFolder) -> None:
     """The report says so, and does not raise."""
     folder.journal.unlink()
-    assert 'gone' in said(folder).waiting_for
+    assert 'missing' in said(folder).waiting_for

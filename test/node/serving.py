@@ -39,7 +39,7 @@ class Serving:
             self._wake.wait()
             self._wake.clear()
             with self.hold:
-                self.control.obey(self._done)
+                self.control.handle_requests(self._done)
 
     def _done(self, request: Mapping[str, Any]) -> dict[str, Any]:
         self.asked.append(request)

@@ -17,7 +17,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.missions.folder import MissionSent, Run, missions
 from shadowhound_data_logger.missions.pictures import make
-from shadowhound_data_logger.missions.story import MOST_POLICIES, Story, summary_of
+from shadowhound_data_logger.missions.state import MOST_POLICIES, MissionState, summary_of
 from shadowhound_data_logger.policies.folder import PolicyFolder
 
 OLD, NEW = 'go2_patrol@6#fedcba9876543210', 'go2_patrol@7#0123456789abcdef'
@@ -36,11 +36,11 @@ def activate(home: Path, name: str | None) -> None:
     PolicyFolder(home)._link(name)
 
 
-def told_of(home: Path) -> list[tuple[Story, dict[str, Any]]]:
+def told_of(home: Path) -> list[tuple[MissionState, dict[str, Any]]]:
     """The story and the summary of each mission, the first one first."""
     stories = []
     for records in journals(home):
-        story = Story()
+        story = MissionState()
         for record in records:
             story.add(record)
         stories.append((story, summary_of(story, 'mission', Run('run', '1', ''), MissionSent(), {})))
@@ -96,7 +96,7 @@ def test_a_rollback_within_a_mission_is_in_all_that_is_said_of_it(tmp_path: Path
 
 
 def test_one_that_changes_without_end_is_bounded(tmp_path: Path) -> None:
-    story = Story()
+    story = MissionState()
     story.add({'k': 'start', 't': 0, 'type': 'patrol', 'command': '', 'robot': 'thor', 'policy': NEW})
     for number in range(10 * MOST_POLICIES):
         story.add({'k': 'policy', 't': number, 'policy': (OLD, NEW)[number % 2]})

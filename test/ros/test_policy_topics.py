@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from shadowhound_data_logger.ros.policy_topics import MOST_HEALTH_BYTES, NODE, PolicyTopics, telling
+from shadowhound_data_logger.ros.policy_topics import MAX_HEALTH_BYTES, NODE, PolicyTopics, telling
 
 
 class Listener:
@@ -74,7 +74,7 @@ def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) 
         assert listener.heard[-1] == second
         listener.until(listener.health.get_subscription_count, 'somebody listens to its health')
         bad: list[tuple[str, Any]] = [
-            ('size', 'x' * (MOST_HEALTH_BYTES + 1)), ('json', '{'), ('json', []), ('json', {'failures': 9}),
+            ('size', 'x' * (MAX_HEALTH_BYTES + 1)), ('json', '{'), ('json', []), ('json', {'failures': 9}),
             ('values', {'policy': second, 'failures': -1}), ('values', {'policy': second, 'failures': True}),
             ('values', f'{{"policy": "{second}", "p99_ms": 1e999}}'), ('values', f'{{"policy": "{second}", "p99_ms": NaN}}'),
             ('values', {'policy': second, 'p99_ms': 10**400}), ('values', {'policy': second, 'failures': 10**400}),

@@ -37,7 +37,7 @@ def test_a_package_without_its_library(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize('layout', ['careless.py', 'careless/__init__.py'])
 def test_a_package_without_messages_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layout: str) -> None:
-    """A neighbour that publishes a type of that name would have whatever is installed here run."""
+    """A neighbor that publishes a type of that name would have whatever is installed here run."""
     path = tmp_path / layout
     path.parent.mkdir(exist_ok=True)
     path.write_text('raise SystemExit("it was run")')

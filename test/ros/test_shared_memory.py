@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.core.durable_files import flock
-from shadowhound_data_logger.ros.shared_memory import MOST_DEAD_PORTS, Orphan, dead_ports_avoided, orphans
+from shadowhound_data_logger.ros.shared_memory import MAX_DEAD_PORTS, Orphan, dead_ports_avoided, orphans
 
 DEAD, ALIVE, YOUNG = 'fastrtps_0123456789abcdef', 'fastdds_00000000000000aa', 'fastdds_00000000000000bb'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'fast_datasharing_01.0f.78.fd.2f.45.bd.0f.00.00.00.00_0.0.6.3',
@@ -127,6 +127,6 @@ def test_where_one_cannot_look_all_are_avoided(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(Path, 'read_text', refuse)
     with dead_ports_avoided(0, shm, tmp_path / 'proc') as avoided:
-        assert avoided == dead[: -MOST_DEAD_PORTS - 1 : -1]
+        assert avoided == dead[: -MAX_DEAD_PORTS - 1 : -1]
     with dead_ports_avoided(0, tmp_path / 'none', tmp_path / 'proc') as avoided:
         assert avoided == []

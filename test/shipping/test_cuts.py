@@ -79,7 +79,7 @@ def stored(desk: Desk, bag: str, folder: Path) -> list[Recorded]:
     remote = find_bag(desk.store, 'thor', bag)
     manifest = read_manifest(desk.store, remote)
     assert state_of(remote, manifest, {}) == 'complete'
-    assert verify_remote(desk.store, remote, deep=True).is_sound
+    assert verify_remote(desk.store, remote, deep=True).is_intact
     cut_remote(desk.store, remote, folder / 'read', Choice())
     path = folder / f'{bag}.mcap'
     path.write_bytes(desk.store.get('sensor-data', remote.slices[0].key))

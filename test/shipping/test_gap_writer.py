@@ -13,15 +13,15 @@ import pytest
 from spool.making import NOON_NS, FakeClock, abandon, make, new_spool
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake.gaps import folded, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import gap_table
 from shadowhound_data_logger.spool.gaps import FORGOTTEN
-from shadowhound_data_logger.spool.listing import retry, tell_gaps_again
+from shadowhound_data_logger.spool.listing import resend_gaps, retry
 from shadowhound_data_logger.spool.spool import Spool
 
 CAMERA = '/camera'
@@ -41,8 +41,8 @@ def spool(root: Path) -> Iterator[Spool]:
     opened.close()
 
 
-def writer(root: Path, clock: FakeClock | None = None, **more: Any) -> CatalogueWriter:
-    return CatalogueWriter(root, CatalogueSettings(), 'thor', clock or FakeClock(), **more)
+def writer(root: Path, clock: FakeClock | None = None, **more: Any) -> CatalogWriter:
+    return CatalogWriter(root, CatalogSettings(), 'thor', clock or FakeClock(), **more)
 
 
 def told(parts: list[DataObject]) -> list[dict[str, Any]]:
@@ -86,14 +86,14 @@ def test_what_was_missed_is_told_once_with_a_watermark_behind_it(spool: Spool, r
     store(spool, 'a')
     hear(spool, 6)
     store(spool, 'b')
-    catalogue = writer(root)
-    made = catalogue.parts()
+    catalog = writer(root)
+    made = catalog.parts()
     assert what(told(made)) == [('gap', 'transport', 4, 0.6), ('complete', None, None, 0.6)]
     (part,) = [part for part in made if part.key.startswith('thor/_gaps/')]
     assert part.key == 'thor/_gaps/date=2025-10-18/thor_20251018T120000_a-boot.parquet'
     assert (part.protected, part.sensor, part.metadata['count'], part.metadata['gap_version']) == (True, '_catalog', '2', '1')
     spool.commit(made)
-    assert catalogue.parts() == []
+    assert catalog.parts() == []
 
 
 def test_another_process_goes_on_where_parts_are_durable(spool: Spool, root: Path) -> None:
@@ -112,13 +112,13 @@ def test_another_process_goes_on_where_parts_are_durable(spool: Spool, root: Pat
 
 def test_a_late_message_withdraws_its_gap(spool: Spool, root: Path) -> None:
     """The same name, a higher revision."""
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1, 3)
     spool.commit()
-    (gap,) = told(catalogue.parts())
+    (gap,) = told(catalog.parts())
     hear(spool, 2)
     spool.commit()
-    (withdrawn,) = told(catalogue.parts())
+    (withdrawn,) = told(catalog.parts())
     assert (withdrawn['what'], withdrawn['id'], withdrawn['revision'] > gap['revision']) == ('withdrawn', gap['id'], True)
 
 
@@ -130,13 +130,13 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
     waiting = store(spool, 'b', State.PENDING, t_start_ns=NOON_NS + 2 * SECOND, t_end_ns=NOON_NS + 2 * SECOND)
     hear(spool, 40)
     store(spool, 'c', t_start_ns=NOON_NS + 4 * SECOND, t_end_ns=NOON_NS + 4 * SECOND)
-    catalogue = writer(root)
-    assert what(told(catalogue.parts()))[-1] == ('complete', None, None, 2.0)
+    catalog = writer(root)
+    assert what(told(catalog.parts()))[-1] == ('complete', None, None, 2.0)
     spool.commit(outcomes=[Outcome(waiting, State.QUARANTINED, 'AccessDenied')])
-    rows = told(catalogue.parts())
+    rows = told(catalog.parts())
     assert what(rows) == [('gap', 'AccessDenied', 1, 2.0), ('complete', None, None, 4.0)]
     assert retry(root).objects == 1
-    again = told(catalogue.parts())
+    again = told(catalog.parts())
     assert what(again) == [('withdrawn', 'AccessDenied', 0, 2.0), ('complete', None, None, 2.0)]
     newest = folded(pyarrow.Table.from_pylist([*rows, *again], schema=arrow_schema(GAPS))).to_pylist()
     known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, newest)
@@ -145,53 +145,53 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
 
 def test_no_watermark_overtakes_its_gaps(spool: Spool, root: Path) -> None:
     """While a part with gaps is on its way, or refused, the store must not hear that all is known."""
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1, 6)
     item = store(spool, 'a', State.PENDING, samples=2)
-    made = catalogue.parts()
+    made = catalog.parts()
     assert [row['what'] for row in told(made)] == ['gap']
     (part,) = spool.commit(made)
     spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
-    assert told(catalogue.parts()) == []
+    assert told(catalog.parts()) == []
     spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'AccessDenied')])
-    assert told(catalogue.parts()) == []
+    assert told(catalog.parts()) == []
     assert retry(root).objects == 1
     spool.commit(outcomes=[Outcome(part, State.DELIVERED)])
-    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+    assert [row['what'] for row in told(catalog.parts())] == ['complete']
 
 
 def test_gaps_of_another_date_are_told_before_the_watermark(spool: Spool, root: Path) -> None:
     """They are parts of their own, of which any may come first."""
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1)
     store(spool, 'a')
     store(spool, 'b', State.QUARANTINED, topic='/old', t_start_ns=NOON_NS - DAY_NS, t_end_ns=NOON_NS - DAY_NS)
     hear(spool, 2)
     store(spool, 'c')
-    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
-    assert [row['what'] for row in told(catalogue.parts())] == ['complete']
+    assert [row['what'] for row in told(catalog.parts())] == ['gap']
+    assert [row['what'] for row in told(catalog.parts())] == ['complete']
 
 
 def test_what_a_lost_part_told_is_told_again(spool: Spool, root: Path) -> None:
     """Somebody deleted its file before it was delivered."""
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1, 6)
     spool.commit()
-    (part,) = spool.commit(catalogue.parts())
-    assert catalogue.parts() == []
+    (part,) = spool.commit(catalog.parts())
+    assert catalog.parts() == []
     spool.commit(outcomes=[Outcome(part, State.QUARANTINED, 'missing')])
-    assert [row['what'] for row in told(catalogue.parts())] == ['gap']
-    assert catalogue.parts() == []
+    assert [row['what'] for row in told(catalog.parts())] == ['gap']
+    assert catalog.parts() == []
 
 
 def test_a_full_disk_keeps_the_parts(root: Path) -> None:
     """None is evicted, nor left out: what they told would not be told again."""
     spool = new_spool(root, FakeClock(), max_bytes=1)
     spool.open()
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1, 6)
     spool.commit([make('a')])
-    (part,) = spool.commit([part for part in catalogue.parts() if '/_gaps/' in part.key])
+    (part,) = spool.commit([part for part in catalog.parts() if '/_gaps/' in part.key])
     spool.commit([make('b', priority=0)])
     assert spool.states('sensor-data', '') == {'a': State.EVICTED, 'b': State.EVICTED, part.key: State.PENDING}
     spool.close()
@@ -199,20 +199,20 @@ def test_a_full_disk_keeps_the_parts(root: Path) -> None:
 
 def test_all_that_is_remembered_is_told_again_when_asked(spool: Spool, root: Path) -> None:
     """Where the store lost its parts: every gap, and the watermark behind them."""
-    catalogue = writer(root)
+    catalog = writer(root)
     hear(spool, 1, 6)
     store(spool, 'a', samples=2)
-    before = told(catalogue.parts())
+    before = told(catalog.parts())
     assert [row['what'] for row in before] == ['gap', 'complete']
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
-    assert catalogue.parts() == []
-    assert tell_gaps_again(root) == 1
-    again = catalogue.parts()
+    assert catalog.parts() == []
+    assert resend_gaps(root) == 1
+    again = catalog.parts()
     assert told(again) == before
-    assert catalogue.parts() == [], 'once'
+    assert catalog.parts() == [], 'once'
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(again)])
     assert [row['what'] for row in told(writer(root).parts())] == ['complete'], 'a new process does not begin anew'
-    assert tell_gaps_again(root) == 1
+    assert resend_gaps(root) == 1
     assert len(told(writer(root).parts())) == len(before), 'also where no process ran when it was asked'
 
 
@@ -230,7 +230,7 @@ def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, r
             spool._index._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
     (mark,) = told(writer(root).parts())
     assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was told'
-    tell_gaps_again(root)
+    resend_gaps(root)
     (mark,) = told(writer(root).parts())
     begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
@@ -269,11 +269,11 @@ def test_a_session_that_died_ends_where_it_was_heard_last(root: Path) -> None:
     later = FakeClock(NOON_NS + 100 * SECOND)
     second = new_spool(root, later)
     second.open()
-    catalogue = writer(root, later)
-    assert what(told(catalogue.parts())) == [('complete', None, None, 0.2)]
+    catalog = writer(root, later)
+    assert what(told(catalog.parts())) == [('complete', None, None, 0.2)]
     hear(second, 1000, 1010)
     store(second, 'b', samples=2)
-    rows = told(catalogue.parts())
+    rows = told(catalog.parts())
     assert [(row['what'], row['cause'], row['count']) for row in rows] == [
         ('gap', 'restart', 997), ('gap', 'transport', 9), ('complete', None, None),
     ]  # fmt: skip
@@ -305,33 +305,33 @@ def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: 
     with spool.accounts.entry(CAMERA) as account:
         account.drop('queue_full', 3, 5 * SECOND, 6 * SECOND)
     spool.commit()
-    catalogue = writer(root)
-    made = catalogue.parts()
+    catalog = writer(root)
+    made = catalog.parts()
     (row,) = told(made)
     assert (row['clock'], row['t_from']) == ('unset', None)
     assert made[0].key.startswith('thor/_gaps/date=1970-01-01/')
     record = {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'offsets': {'a-boot': NOON_NS}}
     (root / 'clock-thor.json').write_text(json.dumps(record), encoding='utf-8')
-    (dated,) = told(catalogue.parts())
+    (dated,) = told(catalog.parts())
     assert (dated['id'], dated['clock'], dated['from_ns']) == (row['id'], 'set_later', NOON_NS + 5 * SECOND)
     (newest,) = folded(pyarrow.Table.from_pylist([dated, row], schema=arrow_schema(GAPS))).to_pylist()
     assert newest['clock'] == 'set_later'
-    assert catalogue.parts() == []
+    assert catalog.parts() == []
 
 
 def test_a_mission_s_end_is_told_soon(spool: Spool, root: Path) -> None:
     """Within seconds, not within the period."""
     now = [0.0]
-    catalogue = writer(root, monotonic=lambda: now[0])
-    catalogue.due()
+    catalog = writer(root, monotonic=lambda: now[0])
+    catalog.due()
     hear(spool, 1, 6)
     spool.commit()
     now[0] = 20.0
-    assert catalogue.due() == []
-    catalogue.hasten()
-    assert catalogue.due() == []
+    assert catalog.due() == []
+    catalog.expedite()
+    assert catalog.due() == []
     now[0] = 25.0
-    assert len(told(catalogue.due())) == 1
+    assert len(told(catalog.due())) == 1
 
 
 def test_a_backlog_of_rows_is_told_in_pieces_and_the_watermark_last(
@@ -342,7 +342,7 @@ def test_a_backlog_of_rows_is_told_in_pieces_and_the_watermark_last(
     for number in range(1, 100, 20):
         hear(spool, number)
         store(spool, f'n{number}')
-    catalogue = writer(root)
-    found = [[row['what'] for row in told(catalogue.due())] for _ in range(4)]
+    catalog = writer(root)
+    found = [[row['what'] for row in told(catalog.due())] for _ in range(4)]
     assert [what for part in found for what in part] == ['gap'] * 4 + ['complete']
     assert max(map(len, found)) <= 3

@@ -316,7 +316,7 @@ def test_a_mailbox_that_changes_at_each_look_asks_once(desk: Desk) -> None:
 
 def test_many_requests_are_remembered_and_the_first_ones_forgotten(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where that is too many, so that those who asked for nothing, again and again, keep nobody out."""
-    monkeypatch.setattr('shadowhound_data_logger.shipping.requests.MOST_REQUESTS', 4)
+    monkeypatch.setattr('shadowhound_data_logger.shipping.requests.MAX_REQUESTS', 4)
     desk.keeps(frame(1))
     for number in range(10):
         desk.entries.clear()

@@ -58,7 +58,7 @@ def test_walls_stand_where_the_pinhole_puts_them(front: Camera) -> None:
 
 @pytest.mark.long('every pixel')
 def test_rooms_look_different(front: Camera) -> None:
-    """Mean colours of frames from different rooms are well apart, so that a picture tells where it was taken."""
+    """Mean colors of frames from different rooms are well apart, so that a picture tells where it was taken."""
     means: dict[str, list[np.ndarray]] = {}
     for t in np.arange(0, 59, 1.5):
         means.setdefault(front.world.room(float(t)), []).append(_frame(front, float(t)).reshape(-1, 3).mean(axis=0))

@@ -26,11 +26,11 @@ from shadowhound_sim.demo_run import Record, SpoolReading, StoreOutage
 from shipping.fakes import until
 from spool.making import FakeClock, make, new_spool, settle
 
-from shadowhound_data_logger.core.config import CatalogueSettings
+from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.formats.rows.parts import encode
 from shadowhound_data_logger.formats.rows.schema import row_of
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.memory import MemoryStore
 
@@ -67,8 +67,8 @@ class Scene:
         self.store.put(item)
         settle(self.spool, item, State.DELIVERED)
 
-    def catalogue(self) -> None:
-        for part in self.spool.commit(CatalogueWriter(self.root, CatalogueSettings(), 'thor', FakeClock()).parts()):
+    def catalog(self) -> None:
+        for part in self.spool.commit(CatalogWriter(self.root, CatalogSettings(), 'thor', FakeClock()).parts()):
             self.deliver(part)
 
     def audit(self) -> DemoAudit:
@@ -93,7 +93,7 @@ def good(scene: Scene) -> Scene:
     """Everything is delivered."""
     for item in scene.items:
         scene.deliver(item)
-    scene.catalogue()
+    scene.catalog()
     return scene
 
 
@@ -123,22 +123,22 @@ def test_a_delivered_object_that_is_not_there_is_found(scene: Scene) -> None:
     for item in scene.items[1:]:
         scene.deliver(item)
     settle(scene.spool, scene.items[0], State.DELIVERED)
-    scene.catalogue()
+    scene.catalog()
     assert scene.audit().problems == (
         'thor/camera/20251018/120000_front.jpg was delivered, but is not in the bucket',
         f'{CAMERA}: 2 messages are delivered, but 1 lie in the bucket',
-        'thor/camera/20251018/120000_front.jpg has a row in the catalogue, but is not in the bucket',
+        'thor/camera/20251018/120000_front.jpg has a row in the catalog, but is not in the bucket',
     )
 
 
 def test_an_object_without_a_row_is_found(good: Scene) -> None:
-    """What the catalogue does not have, or has twice, is named by its key."""
+    """What the catalog does not have, or has twice, is named by its key."""
     late, twice = 'thor/imu/20251018/120009_imu.json', 'thor/camera/20251018/120000_front.jpg'
     good.deliver(good.spool.commit([an_object(late, b'{"samples": []}', IMU, samples=0)])[0])
     body = encode([row_of('sensor-data', twice, 3, 'image/jpeg', {'robot': 'thor'})])
     again = make('thor/_catalog/date=2025-10-18/again.parquet', body, sensor='_catalog', topic=None, samples=0)
     good.deliver(good.spool.commit([again])[0])
-    assert good.audit().problems == (f'{twice} has 2 rows in the catalogue', f'{late} has 0 rows in the catalogue')
+    assert good.audit().problems == (f'{twice} has 2 rows in the catalog', f'{late} has 0 rows in the catalog')
 
 
 def test_a_message_after_the_last_one_heard_is_found(good: Scene) -> None:

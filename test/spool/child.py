@@ -17,7 +17,7 @@ from spool.making import make, new_spool, put, receive
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import Binding, State
-from shadowhound_data_logger.spool.estimator import Hearing
+from shadowhound_data_logger.spool.estimator import ArrivalContext
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Outcome
@@ -74,7 +74,7 @@ def load(root: Path) -> None:
             for _ in range(30):
                 account.receive(None, None)
             stamps = [(40 * number + place) * PERIOD_NS for place in range(30)]  # in each turn ten are lost
-            account.observe({'': stamps}, Hearing(gid='p'))
+            account.observe({'': stamps}, ArrivalContext(gid='p'))
             account.skipped += 30
         items = spool.commit([make(f'thor/{os.getpid()}/{number % 7}/{index}.jpg', os.urandom(2000)) for index in range(2)])
         say(committed=[[item.key, item.sha256] for item in items])

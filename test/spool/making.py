@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.catalog_table import UncataloguedObject
+from shadowhound_data_logger.spool.catalog_table import UncatalogedObject
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Outcome, Spool
 
@@ -84,13 +84,13 @@ def index_of(root: Path) -> Iterator[Index]:
         yield index
 
 
-def uncatalogued(root: Path, limit: int = 99) -> list[UncataloguedObject]:
-    """The oldest of what no part of the catalogue has a row of yet."""
+def uncataloged(root: Path, limit: int = 99) -> list[UncatalogedObject]:
+    """The oldest of what no part of the catalog has a row of yet."""
     with index_of(root) as index:
-        return index.catalog.uncatalogued(limit)
+        return index.catalog.uncataloged(limit)
 
 
-def clear_uncatalogued(root: Path) -> None:
+def clear_uncataloged(root: Path) -> None:
     with index_of(root) as index:
         index.catalog.clear()
 

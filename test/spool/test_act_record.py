@@ -8,21 +8,21 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.spool import act_record
-from shadowhound_data_logger.spool.act_record import MOST_ACTS, MOST_BYTES, MOST_SAID, ActRecord
+from shadowhound_data_logger.spool.act_record import MAX_ACTS, MAX_SAID, MOST_BYTES, ActRecord
 
 
 def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
     """So many of them, in their order, each with who, what, when and the answer; of another robot none."""
     now_ns = count(1).__next__
     record = ActRecord(tmp_path, 'thor', now_ns)
-    for number in range(MOST_ACTS):
+    for number in range(MAX_ACTS):
         record.add('operator at 10.0.0.7', 'flush', ok=True, said=f'{number} objects')
     ActRecord(tmp_path, 'thor', now_ns).add('operator at 10.0.0.8', 'pause', ok=False, said='x' * 1000)
     found = act_record.read(tmp_path, 'thor')
-    assert len(found) == MOST_ACTS
+    assert len(found) == MAX_ACTS
     assert found[0] == {'at_ns': 2, 'who': 'operator at 10.0.0.7', 'do': 'flush', 'ok': True, 'said': '1 objects'}
     assert found[-1] == {
-        'at_ns': MOST_ACTS + 1, 'who': 'operator at 10.0.0.8', 'do': 'pause', 'ok': False, 'said': 'x' * MOST_SAID
+        'at_ns': MAX_ACTS + 1, 'who': 'operator at 10.0.0.8', 'do': 'pause', 'ok': False, 'said': 'x' * MAX_SAID
     }  # fmt: skip
     assert act_record.file(tmp_path, 'thor').stat().st_mode & 0o077 == 0
     assert act_record.read(tmp_path, 'loki') == []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Open
-from spool.making import FakeClock, clear_uncatalogued, index_of, make, new_spool, receive, settle
+from spool.making import FakeClock, clear_uncataloged, index_of, make, new_spool, receive, settle
 
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, State
@@ -94,7 +94,7 @@ def test_totals_stay_when_slices_are_forgotten(opened: Open, root: Path, clock: 
     receive(spool, 3, IMU)
     (item,) = spool.commit([a_slice(0, imu=3)])
     settle(spool, item, State.DELIVERED)
-    clear_uncatalogued(root)
+    clear_uncataloged(root)
     clock.now_ns += 3 * 24 * 3600 * 10**9
     spool.commit()
     with sqlite3.connect(root / 'index.db') as db:

@@ -19,8 +19,8 @@ from shadowhound_data_logger.spool.estimator import (
     RESTART,
     SILENCE,
     TRANSPORT,
+    ArrivalContext,
     Expectation,
-    Hearing,
     LossEstimator,
     TopicEstimate,
     learned,
@@ -52,7 +52,7 @@ class Ear:
             batch = [stamp for stamp in waiting if stamp <= self.now_s * SECOND]
             if batch:
                 del waiting[: len(batch)]
-                heard = Hearing(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**hearing)  # type: ignore[arg-type]
+                heard = ArrivalContext(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**hearing)  # type: ignore[arg-type]
                 found = self.estimator.observe([stamp + shift for stamp in batch], heard)
                 self.heard_s = self.now_s
                 self.received += len(batch)
@@ -151,7 +151,7 @@ def test_what_the_network_held_for_a_node_that_stood_still() -> None:
     held, later = sent[500:550], sent[650:]
     ear.now_s += 3.0
     for batch in (held[:20], held[20:], [stamp for stamp in later if stamp <= ear.now_s * SECOND]):
-        ear.missed.update(ear.estimator.observe(batch, Hearing(ear.now_s)).missed)
+        ear.missed.update(ear.estimator.observe(batch, ArrivalContext(ear.now_s)).missed)
         ear.now_s += 0.01
     assert ear.missed == {TRANSPORT: 100}
 
@@ -223,8 +223,8 @@ def test_a_clock_that_drifts(drift: float) -> None:
     """A step is still told from loss after hours, in which the clocks have gone apart by more than that."""
     estimator = LossEstimator(Expectation(period=10 * SECOND))
     for second in range(0, 15_000, 10):
-        estimator.observe([int(second * (1 + drift) * SECOND)], Hearing(second))
-    found = estimator.observe([int(15_000 * (1 + drift) * SECOND) + 6 * SECOND], Hearing(15_000))
+        estimator.observe([int(second * (1 + drift) * SECOND)], ArrivalContext(second))
+    found = estimator.observe([int(15_000 * (1 + drift) * SECOND) + 6 * SECOND], ArrivalContext(15_000))
     assert found.missed == {}
 
 
@@ -240,7 +240,7 @@ def test_overtaken_messages_fill_their_gap() -> None:
     estimator = LossEstimator(Expectation(period=PERIOD))
     missed: Counter[str] = Counter()
     for places in ([0, 1, 4], [2, 3, 5, 6]):
-        missed.update(estimator.observe([place * PERIOD for place in places], Hearing()).missed)
+        missed.update(estimator.observe([place * PERIOD for place in places], ArrivalContext()).missed)
     assert missed.total() == 0
 
 
@@ -270,14 +270,14 @@ def test_a_counter_counts_exactly(first: int, step: int, wrap: int, start: int, 
         values = [(first + place * step) % wrap for place in without(range(1500), (start, start + length))]
         missed: Counter[str] = Counter()
         for place in range(0, len(values), 10):
-            missed.update(estimator.observe(values[place : place + 10], Hearing()).missed)
+            missed.update(estimator.observe(values[place : place + 10], ArrivalContext()).missed)
         assert missed.total() == length
 
 
 def test_a_counter_that_nobody_fills() -> None:
     """It says nothing, and nothing is claimed."""
     estimator = LossEstimator(Expectation('counter:tick', 0.0, 1 << 32))
-    assert sum(estimator.observe([0] * 10, Hearing()).covered for _ in range(100)) == 0
+    assert sum(estimator.observe([0] * 10, ArrivalContext()).covered for _ in range(100)) == 0
 
 
 def test_a_counter_that_begins_anew_is_no_loss() -> None:
@@ -285,7 +285,7 @@ def test_a_counter_that_begins_anew_is_no_loss() -> None:
     estimator = LossEstimator(Expectation('counter:tick', 2.0, 1 << 32))
     missed: Counter[str] = Counter()
     for values in (range(1000, 1100, 2), range(0, 100, 2)):
-        missed.update(estimator.observe(list(values), Hearing()).missed)
+        missed.update(estimator.observe(list(values), ArrivalContext()).missed)
     assert missed.total() == 0
 
 
@@ -300,7 +300,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
     """While several publish, and nobody knows who, nothing is claimed; with the last one the rhythm goes on."""
     estimate = TopicEstimate()
     sent = even(1000, jitter=0.0)
-    alone, crowd = Hearing(gid='a'), Hearing(alone=False, crowded=True)
+    alone, crowd = ArrivalContext(gid='a'), ArrivalContext(alone=False, crowded=True)
     assert estimate.observe({'': sent[:300]}, alone).covered == 300
     found = estimate.observe({'': sent[300:400]}, crowd)
     assert (found.covered, found.lost, estimate.known) == (0, None, False)
@@ -312,7 +312,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
 def test_publishers_that_are_told_apart_have_rhythms_of_their_own() -> None:
     """Whatever their rates, and whether the graph knows several."""
     estimate = TopicEstimate()
-    hearing = Hearing(alone=False, crowded=True)
+    hearing = ArrivalContext(alone=False, crowded=True)
     stamps = {'p': without(even(500), (300, 320)), 'q': even(300, 3 * PERIOD)}
     found = estimate.observe(stamps, hearing)
     assert (found.covered, found.missed) == (780, {TRANSPORT: 20})
@@ -322,11 +322,11 @@ def test_the_next_session_goes_on() -> None:
     """With the rhythm and the last stamp: what was sent meanwhile was missed by the restart."""
     before = TopicEstimate()
     sent = even(600)
-    before.observe({'': sent[:300]}, Hearing(gid='a'))
+    before.observe({'': sent[:300]}, ArrivalContext(gid='a'))
     after = TopicEstimate(before=before.row('/odom'))
-    assert after.observe({'': sent[450:460]}, Hearing(gid='a')).missed == {RESTART: 150}
+    assert after.observe({'': sent[450:460]}, ArrivalContext(gid='a')).missed == {RESTART: 150}
     another = TopicEstimate(before=before.row('/odom'))
-    assert another.observe({'': sent[450:460]}, Hearing(gid='b')).missed == {}
+    assert another.observe({'': sent[450:460]}, ArrivalContext(gid='b')).missed == {}
 
 
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=2, max_size=300))

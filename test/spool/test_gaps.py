@@ -59,7 +59,7 @@ def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA,
     clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * period_ns)
 
 
-def test_a_gap_has_the_times_of_its_neighbours(spool: Spool, root: Path) -> None:
+def test_a_gap_has_the_times_of_its_neighbors(spool: Spool, root: Path) -> None:
     """From the stamp of the last message before to that of the first after, of its publisher, in its mission."""
     hear(spool, 1, 2)
     spool.commit()
@@ -406,7 +406,7 @@ class BootedAtNoon(FakeClock):
 
 def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Publishers that come and go, with stamps of any time: further gaps of a cause share a row, and each message is counted."""
-    monkeypatch.setattr(gaps, 'MOST_NEW_ROWS', 20)
+    monkeypatch.setattr(gaps, 'MAX_NEW_ROWS', 20)
     clock = BootedAtNoon(NOON_NS + 1800 * SECOND)
     spool = new_spool(root, clock)
     spool.open()
@@ -555,7 +555,7 @@ def test_the_journal_adds_up_at_every_commit(
 ) -> None:
     """Whatever comes late, fails, dies, is evicted, quarantined, tried again, forgotten, or too much for rows of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gaps, 'MOST_NEW_ROWS', bounds[0])
+        patch.setattr(gaps, 'MAX_NEW_ROWS', bounds[0])
         patch.setattr(gap_table, 'MOST_ROWS', bounds[1])
         _take_steps(tmp_path_factory.mktemp('any') / 'spool', steps)
 

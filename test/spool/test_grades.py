@@ -13,15 +13,15 @@ from spool.making import abandon, new_spool
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
-from shadowhound_data_logger.spool.estimator import Expectation, Hearing
+from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation
 from shadowhound_data_logger.spool.spool import Spool
 
 TOPIC = '/odom'
 PERIOD_NS = SECOND // 100
-ALONE = Hearing(gid='a')
+ALONE = ArrivalContext(gid='a')
 
 
-def session(opened: Callable[..., Spool], received: int, first: int | None = None, hearing: Hearing = ALONE, *,
+def session(opened: Callable[..., Spool], received: int, first: int | None = None, hearing: ArrivalContext = ALONE, *,
             at: int | None = None, died: bool = False) -> None:  # fmt: skip
     """So many messages come: numbered from ``first``, or sent in a rhythm from its place ``at``, or neither."""
     spool = opened()
@@ -100,7 +100,7 @@ def test_the_rhythm_survives_a_death(opened: Open, root: Path) -> None:
 
 
 @pytest.mark.parametrize('hearing', [ALONE._replace(gid='b'), ALONE._replace(gid='', alone=False)])
-def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, hearing: Hearing) -> None:
+def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, hearing: ArrivalContext) -> None:
     """Nor one before several; the rhythm is known all the same."""
     session(opened, 300, at=0)
     session(opened, 20, hearing=hearing, at=400)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from spool.conftest import Open
-from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncatalogued
+from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncataloged
 
 from shadowhound_data_logger.core.metadata_words import CONTENT_KEY
 from shadowhound_data_logger.core.model import DataObject, State
@@ -111,12 +111,12 @@ def test_a_restart_stores_the_picture_anew(opened: Open, root: Path) -> None:
     assert_whole(root)
 
 
-def test_the_catalogue_has_a_row_for_each_repeat(spool: Spool, root: Path) -> None:
+def test_the_catalog_has_a_row_for_each_repeat(spool: Spool, root: Path) -> None:
     """With its own time and the key of its content, so that a query by time finds the picture."""
     (item,) = put(spool, picture(0))
     put(spool, picture(1))
     settle(spool, item, State.DELIVERED)
-    found = uncatalogued(root, 9)
+    found = uncataloged(root, 9)
     assert [each.key for each in found] == [item.key, item.key]
     assert [each.metadata['t_start_ns'] for each in found] == [str(picture(0).t_start_ns), str(picture(1).t_start_ns)]
 

@@ -37,13 +37,13 @@ def frame(second: int, **fields: object) -> DataObject:
 
 
 def leave(spool: Spool, *objects: DataObject, state: State = State.DELIVERED) -> None:
-    """Spool them, and have them leave; the catalogue has their rows."""
+    """Spool them, and have them leave; the catalog has their rows."""
     items = put(spool, *objects)
     spool.commit(outcomes=[Outcome(item, state, 'no_room' if state is State.EVICTED else None) for item in items])
-    catalogue(spool)
+    catalog(spool)
 
 
-def catalogue(spool: Spool) -> None:
+def catalog(spool: Spool) -> None:
     with closing(Index(spool.root / 'index.db')) as index:
         index.open()
         index.catalog.clear()
@@ -115,7 +115,7 @@ def test_what_a_key_needs_stays_known(opened: Open, spool: Spool, root: Path) ->
 
 
 def test_an_audit_asks_for_both(spool: Spool, root: Path) -> None:
-    """Objects with full rows and with short ones, each once, also one that changes meanwhile; not the catalogue's parts."""
+    """Objects with full rows and with short ones, each once, also one that changes meanwhile; not the catalog's parts."""
     part = make('thor/_catalog/a', b'part', sensor='_catalog', topic=None, samples=0)
     leave(spool, *(frame(second) for second in range(5)), part)
     age(spool)
@@ -136,13 +136,13 @@ def test_an_audit_asks_for_both(spool: Spool, root: Path) -> None:
         assert sum(map(len, deliveries.pages())) == 5, 'what is noted is not asked for again'
 
 
-def test_what_the_catalogue_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
-    """Its metadata are what a part of the catalogue is made of."""
+def test_what_the_catalog_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
+    """Its metadata are what a part of the catalog is made of."""
     (item,) = put(spool, frame(1))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED)])
     age(spool, 30 * DAY_NS)
     assert len(rows(root)) == 1
-    catalogue(spool)
+    catalog(spool)
     age(spool)
     assert rows(root) == []
 
@@ -183,7 +183,7 @@ def test_rows_are_made_short_step_by_step(opened: Open, root: Path, monkeypatch:
 @pytest.mark.parametrize(
     'damage',
     ['UPDATE compact_objects SET state = 7', "UPDATE compact_objects SET sha256 = 'text'", "UPDATE folders SET path = x'00'",
-     "UPDATE gaps_told SET version = 'x'"],
+     "UPDATE gaps_reported SET version = 'x'"],
 )  # fmt: skip
 def test_a_short_row_that_cannot_be_is_found(opened: Open, root: Path, damage: str) -> None:
     """As one of any other table: the index is made anew."""
@@ -224,7 +224,7 @@ def test_keys_that_begin_so_are_the_same_with_short_rows(
             for place, name in enumerate(names):
                 number = index.objects.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
                 index.objects.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
-            index._db.execute('DELETE FROM uncatalogued')
+            index._db.execute('DELETE FROM uncataloged')
             index.history.compact(before_ns)
         assert [index.objects.has(BUCKET, name) for name in names] == [True] * len(names)
         found.append((

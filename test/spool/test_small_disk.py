@@ -168,6 +168,6 @@ def test_a_disk_that_takes_nothing(
 def test_what_an_io_error_means(disk: Path) -> None:
     """SQLite's word for a log that cannot be begun is a full disk only where nothing is free."""
     error = sqlite3.OperationalError('disk I/O error')
-    assert not ballast.says_full(error, disk)
+    assert not ballast.is_disk_full(error, disk)
     fill(disk)
-    assert ballast.says_full(error, disk)
+    assert ballast.is_disk_full(error, disk)

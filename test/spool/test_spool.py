@@ -14,7 +14,7 @@ from spool.making import (
     NOON_NS,
     FakeClock,
     assert_whole,
-    clear_uncatalogued,
+    clear_uncataloged,
     files,
     make,
     new_spool,
@@ -175,8 +175,8 @@ def test_old_deliveries_are_forgotten_and_totals_stay(spool: Spool, root: Path, 
     before = assert_whole(root)
     clock.now_ns += 31 * DAY_NS
     spool.commit()
-    assert len(rows(root)) == 2, 'the catalogue has no row of it yet'
-    clear_uncatalogued(root)
+    assert len(rows(root)) == 2, 'the catalog has no row of it yet'
+    clear_uncataloged(root)
     clock.now_ns += DAY_NS
     spool.commit()
     assert [row['id'] for row in rows(root)] == [kept.id]
@@ -188,7 +188,7 @@ def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeyp
     monkeypatch.setattr('shadowhound_data_logger.spool.history_table.FORGET_STEP', 2)
     items = put(spool, *(make(str(number)) for number in range(5)))
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
-    clear_uncatalogued(root)
+    clear_uncataloged(root)
     clock.now_ns += 31 * DAY_NS
     left = []
     for _ in range(3):

@@ -20,7 +20,7 @@ from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import CatalogueSettings, KeepSettings, SpoolSettings
+from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, FileBody
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE
 from shadowhound_data_logger.formats.archive import ArchiveFile, pack_tar, pack_zip
@@ -30,7 +30,7 @@ from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.node.encoding.halving import Halving
-from shadowhound_data_logger.shipping.catalog_writer import CatalogueWriter
+from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.thinning import Thinner, may_halve
 from shadowhound_data_logger.spool.files import description_of
 from shadowhound_data_logger.spool.ledger import read as read_ledger
@@ -68,7 +68,7 @@ class Robot:
 
     def told(self) -> None:
         """The store knows of all."""
-        with self.spool._index.transaction():  # what a part of the catalogue does when it is spooled
+        with self.spool._index.transaction():  # what a part of the catalog does when it is spooled
             self.spool._index._db.execute('DELETE FROM unreported')
 
     def thin(self) -> int:
@@ -291,15 +291,15 @@ def test_at_the_least_rate_the_oldest_goes(make_robot: Callable[..., Robot]) -> 
     assert_whole(robot.root)
 
 
-def test_the_catalogue_is_told_of_each_step(make_robot: Callable[..., Robot]) -> None:
+def test_the_catalog_is_told_of_each_step(make_robot: Callable[..., Robot]) -> None:
     """Also of an object that a part told of alone: it is told of again, with what is left of it."""
     robot, now_s = make_robot(1 << 20), [0.0]
-    catalogue = CatalogueWriter(robot.root, CatalogueSettings(), 'thor', robot.clock, lambda: now_s[0], keeps=True)
+    catalog = CatalogWriter(robot.root, CatalogSettings(), 'thor', robot.clock, lambda: now_s[0], keeps=True)
 
     def told() -> list[int]:
         """The messages of each row of a part that is spooled now."""
         now_s[0] += 3600.0
-        made = catalogue.due()
+        made = catalog.due()
         robot.spool.commit(made)
         return [item.samples for item in made] and [
             count

@@ -87,7 +87,7 @@ def test_what_was_delivered_is_there(store: ObjectStore, spooled: Spool, bucket:
     assert not list(spooled.root.glob('verify*'))
 
 
-def test_the_catalogues_parts_are_not_asked_for(spooled: Spool) -> None:
+def test_the_catalogs_parts_are_not_asked_for(spooled: Spool) -> None:
     """They go once a larger part stands for them: one that is gone is not a finding, and none is counted."""
     store = MemoryStore()
     part = replace(make('thor/_catalog/date=2026-11-21/a.parquet'), sensor='_catalog', topic=None, samples=0)

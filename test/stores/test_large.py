@@ -161,10 +161,10 @@ def test_a_key_that_is_taken_meanwhile(server: S3Store, item: SpooledObject, spo
 
 def test_no_file_has_more_parts_than_s3_allows() -> None:
     """From 80 GB on the parts grow."""
-    for size in (1, 100 * MEBI, content.MOST_PARTS * content.PART_BYTES, 1 << 40, (1 << 40) + 1):
+    for size in (1, 100 * MEBI, content.MAX_PARTS * content.PART_BYTES, 1 << 40, (1 << 40) + 1):
         step = content.part_bytes(size)
         assert step >= content.PART_BYTES
-        assert -(-size // step) <= content.MOST_PARTS
+        assert -(-size // step) <= content.MAX_PARTS
 
 
 def test_a_part_can_be_read_twice(tmp_path: Path) -> None:

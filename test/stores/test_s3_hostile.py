@@ -163,7 +163,7 @@ def test_a_password_in_the_endpoint_is_not_shown() -> None:
 
 
 def test_any_number_of_buckets_takes_the_memory_of_a_few() -> None:
-    """The rows of a catalogue name the buckets, whoever wrote those."""
+    """The rows of a catalog name the buckets, whoever wrote those."""
     with refused() as url:
         store = ObstoreStore(settings_for(url), UPLOAD)
         for number in range(40):

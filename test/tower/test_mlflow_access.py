@@ -409,8 +409,8 @@ def test_whoever_guesses_has_to_wait_and_nobody_else(tower: Tower) -> None:
     """After some wrong passwords an address gets no answer to the right one either; other addresses do."""
     password = tower.tracking('spark')['MLFLOW_TRACKING_PASSWORD']
     guesser, other = Neighbor(tower, '127.0.9.1'), Neighbor(tower, '127.0.9.2')
-    wrong = [guesser.status('spark', f'guess {number}')[0] for number in range(mlflow_access.MOST_WRONG + 2)]
-    assert wrong == [401] * mlflow_access.MOST_WRONG + [429] * 2
+    wrong = [guesser.status('spark', f'guess {number}')[0] for number in range(mlflow_access.MAX_WRONG + 2)]
+    assert wrong == [401] * mlflow_access.MAX_WRONG + [429] * 2
     assert guesser.status('spark', password) == (429, '60')
     assert other.status('spark', password) == (200, None)
     assert Neighbor(tower, '127.0.0.1').status('spark', password) == (200, None)
@@ -420,13 +420,13 @@ def test_what_is_remembered_of_wrong_passwords_is_bounded() -> None:
     """Any number of addresses may guess; those that guess now are remembered, and a wait ends."""
     now = [0.0]
     wrong = mlflow_access.WrongPasswords(lambda: now[0])
-    for number in range(3 * mlflow_access.MOST_ADDRESSES):
+    for number in range(3 * mlflow_access.MAX_ADDRESSES):
         wrong.add(f'10.0.{number >> 8}.{number & 255}')
-    assert len(wrong._failures) == mlflow_access.MOST_ADDRESSES
-    for number in range(3 * mlflow_access.MOST_WRONG):
-        assert bool(wrong.wait_s('fd00::1')) is (number >= mlflow_access.MOST_WRONG)
+    assert len(wrong._failures) == mlflow_access.MAX_ADDRESSES
+    for number in range(3 * mlflow_access.MAX_WRONG):
+        assert bool(wrong.wait_s('fd00::1')) is (number >= mlflow_access.MAX_WRONG)
         wrong.add(f'fd00::{number:x}')
-    assert len(wrong._failures['fd00::/64']) == mlflow_access.MOST_WRONG
+    assert len(wrong._failures['fd00::/64']) == mlflow_access.MAX_WRONG
     assert (wrong.wait_s('fd00:0:0:1::'), wrong.wait_s('10.9.9.9')) == (0.0, 0.0)
     now[0] += mlflow_access.WRONG_S
     assert wrong.wait_s('fd00::1') == 0.0

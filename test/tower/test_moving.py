@@ -1,4 +1,4 @@
-"""The way from one Tower to another in docs/tower.md: side by side, by rclone, verified by the catalogue."""
+"""The way from one Tower to another in docs/tower.md: side by side, by rclone, verified by the catalog."""
 
 from __future__ import annotations
 
@@ -132,9 +132,9 @@ def test_a_tower_is_moved_as_the_manual_says(towers: Towers) -> None:
     towers.store(towers.new, {('sensor-data', 'thor/camera/20261028/new.jpg'): b'to the new one'}, 'new')
     towers.copy()
 
-    catalogue = towers.tmp / 'catalogue'
-    assert towers.run(towers.old, 'fetch', 'thor/_catalog/', '--to', str(catalogue))[1]['moved'] == 2
-    assert towers.run(towers.new, 'lake', 'verify', '--catalogue', str(catalogue))[1]['sound'] == len(BODIES) + 2
+    catalog = towers.tmp / 'catalog'
+    assert towers.run(towers.old, 'fetch', 'thor/_catalog/', '--to', str(catalog))[1]['moved'] == 2
+    assert towers.run(towers.new, 'lake', 'verify', '--catalog', str(catalog))[1]['sound'] == len(BODIES) + 2
     assert towers.verify() == towers.verify('--deep') == {}
 
     keys = [key for bucket, key in BODIES if bucket == 'sensor-data']
@@ -150,4 +150,4 @@ def test_a_tower_is_moved_as_the_manual_says(towers: Towers) -> None:
     for entry in new.list_objects_v2(Bucket='sensor-data', Prefix='thor/_catalog/')['Contents']:
         if entry['Key'].endswith('_late.parquet'):
             new.delete_object(Bucket='sensor-data', Key=entry['Key'])
-    assert towers.verify('--catalogue', str(catalogue))['unlisted'] == ['thor/camera/20261028/late.jpg']
+    assert towers.verify('--catalog', str(catalog))['unlisted'] == ['thor/camera/20261028/late.jpg']

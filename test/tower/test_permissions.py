@@ -128,7 +128,7 @@ def test_spark_reads_everything_and_changes_nothing_of_a_robot(as_user: Connect)
 
 
 def test_training_sets_are_sparks(as_user: Connect) -> None:
-    """It puts data sets into their bucket, replaces and deletes them; a robot does none of this."""
+    """It puts datasets into their bucket, replaces and deletes them; a robot does none of this."""
     spark, thor, key = as_user('spark'), as_user('thor'), 'datasets/go2/set/meta/info.json'
     spark.put_object(Bucket='lerobot', Key=key, Body=b'one')
     for call in (thor.put_object, thor.get_object, thor.delete_object):
@@ -281,7 +281,7 @@ class _Ignoring:
 
 
 @pytest.mark.long('a second of CPU or more')
-@pytest.mark.parametrize(('makes', 'says'), [(False, 'does not honour If-Match'), (True, 'MinIO')])
+@pytest.mark.parametrize(('makes', 'says'), [(False, 'does not honor If-Match'), (True, 'MinIO')])
 def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
     """Or that makes what is not there."""
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]

@@ -147,7 +147,7 @@ def composed(folder: Path) -> Iterator[Running]:
 
 
 @contextmanager
-def neighbour() -> Iterator[tuple[str, str]]:
+def neighbor() -> Iterator[tuple[str, str]]:
     """Another network namespace, and our address on the cable to it; skips where none can be made."""
     name = f'stranger{os.getpid()}'
     net = f'10.{random.randrange(200, 250)}.{random.randrange(250)}'
@@ -172,11 +172,11 @@ def neighbour() -> Iterator[tuple[str, str]]:
 
 @contextmanager
 def made(folder: Path) -> Iterator[Running]:
-    """``make tower`` in a folder that an older version left, bound to an address that a neighbour reaches."""
+    """``make tower`` in a folder that an older version left, bound to an address that a neighbor reaches."""
     folder.mkdir()
     users = _older(folder)
     offset = free_offset()
-    with neighbour() as (namespace, host), (folder / 'log').open('w') as log:
+    with neighbor() as (namespace, host), (folder / 'log').open('w') as log:
         command = [sys.executable, str(TOWER / 'run.py'), '--folder', str(folder), '--offset', str(offset), '--bind', host]
         with subprocess.Popen(command, stdout=log, stderr=log) as process:
             try:
@@ -379,7 +379,7 @@ def test_keys_do_what_they_did(closed: Running) -> None:
 
 
 @pytest.mark.parametrize('closed', [pytest.param(made, marks=LONG, id='made')], indirect=True)
-def test_a_neighbour_reaches_s3_and_mlflow_alone(closed: Running) -> None:
+def test_a_neighbor_reaches_s3_and_mlflow_alone(closed: Running) -> None:
     """Of all ports that a Tower listens on, those two take a connection from another namespace, and S3's gRPC, which refuses."""
     listening = _listening(closed.secrets.parent)
     assert {port + extra for port in closed.ports.values() for extra in (0, GRPC)} <= listening

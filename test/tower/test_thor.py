@@ -31,7 +31,7 @@ pytestmark = [
 START_S = 120.0
 MANUAL = Path(__file__).parents[2] / 'docs' / 'tower.md'
 PARAMETERS = {
-    'bag.record': 'always', 'bag.slice_s': 2.0, 'catalogue.period_s': 2.0, 'lowstate.batch_s': 1.0,
+    'bag.record': 'always', 'bag.slice_s': 2.0, 'catalog.period_s': 2.0, 'lowstate.batch_s': 1.0,
     'mission.frame_every_s': 1.0,
 }  # fmt: skip
 
@@ -105,7 +105,7 @@ def everything(environ: dict[str, str]) -> list[str]:
 def test_a_robot_lives_with_its_own_keys(
     tower: Path, offset: int, processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sensors, a mission, a bag and the catalogue arrive; two rotations meanwhile lose and quarantine nothing."""
+    """Sensors, a mission, a bag and the catalog arrive; two rotations meanwhile lose and quarantine nothing."""
     environ = environment(tower, 'thor', offset)
     secrets = [environ.pop('AWS_SECRET_ACCESS_KEY'), environ.pop('MLFLOW_TRACKING_PASSWORD')]
     del environ['AWS_ACCESS_KEY_ID'], environ['MLFLOW_TRACKING_USERNAME']

@@ -57,9 +57,9 @@ SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^
 BODY_BYTES: Final = 32 << 20
 """The longest body of a request that MLflow keeps in memory whole; the inputs of a run
 may have 17 MB. Artifacts are streamed."""
-MOST_WRONG, WRONG_S = 10, 60.0
+MAX_WRONG, WRONG_S = 10, 60.0
 """After this many wrong passwords within this time an address must wait."""
-MOST_ADDRESSES: Final = 1000
+MAX_ADDRESSES: Final = 1000
 """Addresses whose wrong passwords are remembered; beyond it the one that failed least recently is forgotten."""
 LOOPBACK: Final = frozenset({'', '127.0.0.1', '::1'})
 """Addresses that never wait: of programs of this machine, such as a proxy in front, behind which are all others."""
@@ -171,14 +171,14 @@ class WrongPasswords:
     def wait_s(self, address: str) -> float:
         """How long the address must wait before it may try another password; 0 where it need not."""
         known = self._failures.get(_network_of(address))
-        return max(0.0, known[0] + WRONG_S - self._now()) if known is not None and len(known) == MOST_WRONG else 0.0
+        return max(0.0, known[0] + WRONG_S - self._now()) if known is not None and len(known) == MAX_WRONG else 0.0
 
     def add(self, address: str) -> None:
         network = _network_of(address)
-        known = self._failures.pop(network, None) or deque(maxlen=MOST_WRONG)
+        known = self._failures.pop(network, None) or deque(maxlen=MAX_WRONG)
         known.append(self._now())
         self._failures[network] = known  # the last one now
-        if len(self._failures) > MOST_ADDRESSES:
+        if len(self._failures) > MAX_ADDRESSES:
             del self._failures[next(iter(self._failures))]
 
 

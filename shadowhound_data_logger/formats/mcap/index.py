@@ -25,7 +25,7 @@ from mcap.records import Chunk as ChunkRecord
 from mcap.records import ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
 
 from shadowhound_data_logger.core.errors import BagDamaged
-from shadowhound_data_logger.core.untrusted import MOST_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
 from shadowhound_data_logger.formats.mcap.format import MAGIC, RECORD, REPEATED
 from shadowhound_data_logger.formats.mcap.ranges import Ranged
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import in_numbers
@@ -40,7 +40,7 @@ FIRST_READ: Final = 64 << 10
 MOST_SUMMARY_BYTES: Final = 64 << 20
 """That of a hundred thousand chunks: a bag of 100 GB in one file."""
 MOST_HEADER_BYTES: Final = 4 << 10
-MOST_RECORD_BYTES: Final = MOST_CHUNK_BYTES + 1024
+MAX_RECORD_BYTES: Final = MAX_CHUNK_BYTES + 1024
 """A chunk with the fields before its data."""
 BLOCK_BYTES: Final = 4 << 20
 """Of a file that is read from one end to the other, and of the messages outside chunks that are read together."""
@@ -333,7 +333,7 @@ def walk(source: Ranged, end: int, wanted: Container[int]) -> Iterator[tuple[int
             raise BagDamaged(f'{source.name} has no record at {start}, but zeros', path=source.name)
         if kind not in wanted:
             yield kind, start, size, memoryview(b'')
-        elif size > MOST_RECORD_BYTES:
+        elif size > MAX_RECORD_BYTES:
             raise BagDamaged(f'{source.name} has a record of {size:,} bytes at {start}', path=source.name)
         else:
             yield kind, start, size, content(size)[RECORD.size :]

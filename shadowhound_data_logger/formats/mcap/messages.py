@@ -16,8 +16,8 @@ from mcap.opcode import Opcode
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.formats.mcap.format import RECORD
 from shadowhound_data_logger.formats.mcap.index import (
+    MAX_RECORD_BYTES,
     MESSAGE,
-    MOST_RECORD_BYTES,
     Chunk,
     McapIndex,
     message_head,
@@ -65,7 +65,7 @@ def read_messages(source: Ranged, index: McapIndex, wanted: MessageFilter) -> It
         and any(count and number in channels for number, count in chunk.counts.items())
     ]  # fmt: skip
     for chunk in chunks:
-        if chunk.length > MOST_RECORD_BYTES:
+        if chunk.length > MAX_RECORD_BYTES:
             raise BagDamaged(f'{source.name} has a chunk of {chunk.length:,} bytes at {chunk.start}', path=source.name)
     for chunk, record in _read_chunks(source, chunks):
         yield from _messages(_records(source, chunk, record), channels, wanted, source.name)
@@ -91,7 +91,7 @@ def _messages(content: memoryview, channels: dict[int, Channel], wanted: Message
 
 
 def _read_chunks(source: Ranged, chunks: Sequence[Chunk]) -> Iterator[tuple[Chunk, memoryview]]:
-    """Each chunk's record, neighbours together, a few requests ahead."""
+    """Each chunk's record, neighbors together, a few requests ahead."""
     reading: deque[tuple[list[Chunk], Future[bytes]]] = deque()
     waiting = deque(_spans(chunks))
     pool = ThreadPoolExecutor(READ_AHEAD, 'bag-read')

@@ -54,7 +54,7 @@ from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 
 PENDING_BYTES: Final = 1 << 20
 """Messages without a chunk are written in chunks of about this size."""
-MOST_LOSSES: Final = 1000
+MAX_LOSSES: Final = 1000
 """Listed one by one; further ones are added up."""
 MORE: Final = 'further damage'
 WRONG_DATA: Final = 'the checksum of the data does not match: something in it is wrong, and it is unknown what'
@@ -155,9 +155,9 @@ class _Losses:
     def add(self, at: int, size: int, what: str, messages: int | None, times: tuple[int, int] | None) -> None:
         from_ns, to_ns = times or (self.last_ns, None)
         loss, last = Loss(at, size, what, messages, from_ns, to_ns), self.found[-1] if self.found else None
-        if last is not None and (len(self.found) >= MOST_LOSSES or (last.what == what and last.at + last.bytes == at)):
+        if last is not None and (len(self.found) >= MAX_LOSSES or (last.what == what and last.at + last.bytes == at)):
             known = None if last.messages is None or messages is None else last.messages + messages
-            is_more = len(self.found) >= MOST_LOSSES
+            is_more = len(self.found) >= MAX_LOSSES
             self.found[-1] = replace(last, bytes=last.bytes + size, messages=known, to_ns=to_ns, what=MORE if is_more else what)
             self._open = min(self._open, len(self.found) - 1)
         else:

@@ -29,7 +29,7 @@ _POLICIES: Final = {
 }
 """The words of version 9, each in the place of its number (rmw/types.h)."""
 _IN_WORDS: Final = re.compile(rf'\b({"|".join(_POLICIES)})\W{{0,4}}:\W{{0,4}}[a-z]')
-MOST_CACHED_BYTES: Final = 4096
+MAX_CACHED_BYTES: Final = 4096
 
 
 def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None) -> bytes:
@@ -81,7 +81,7 @@ def in_numbers(qos: str) -> str:
     """A topic's offered QoS profiles, which bags of Jazzy and Kilted keep in words, as version 8 does; all else stays."""
     if not _IN_WORDS.search(qos):  # as we write them, and Humble
         return qos
-    return _in_numbers(qos) if len(qos) > MOST_CACHED_BYTES else _cached_in_numbers(qos)
+    return _in_numbers(qos) if len(qos) > MAX_CACHED_BYTES else _cached_in_numbers(qos)
 
 
 def _in_numbers(qos: str) -> str:

@@ -2,7 +2,7 @@
 
 One pass in the order of the file. A chunk is intact if its CRC-32 matches (or has none, and its records are complete); a record
 outside of chunks is intact if its fields are consistent and another record follows it. After damage, the next intact record is
-searched for. Whatever the file claims, this takes the memory of one chunk, packed and unpacked, ``MOST_CHUNK_BYTES`` each, and of
+searched for. Whatever the file claims, this takes the memory of one chunk, packed and unpacked, ``MAX_CHUNK_BYTES`` each, and of
 its schemas and channels, at most ``MOST_SUMMARY_BYTES``; the search reads each byte a few times at most.
 
 ``recovery.py`` completes an open slice of ours in place, ``repair.py`` copies any file: both use this.
@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.untrusted import partly_unpacked, unpacked
 from shadowhound_data_logger.formats.mcap.format import CHUNK, MAGIC, RECORD, ChunkPacking
 from shadowhound_data_logger.formats.mcap.index import UNREADABLE, length_of, parsed
 
-MOST_CHUNK_BYTES: Final = 128 << 20
+MAX_CHUNK_BYTES: Final = 128 << 20
 """Packed and unpacked; larger chunks are not read by this package (``untrusted.py``)."""
 MOST_SUMMARY_BYTES: Final = 64 << 20
 PRIVATE: Final = 0x80
@@ -254,7 +254,7 @@ class Salvage:
         """The intact piece that begins there; None if there is none."""
         op, length = self._head(at)
         fits = self._fits(at, op, length)
-        if op == Opcode.CHUNK and fits and length <= MOST_CHUNK_BYTES and (chunk := self._chunk(at, length)):
+        if op == Opcode.CHUNK and fits and length <= MAX_CHUNK_BYTES and (chunk := self._chunk(at, length)):
             return chunk
         if op not in _LEAST and (chunk := self._misnamed_chunk(at)):
             return chunk
@@ -276,7 +276,7 @@ class Salvage:
         elif op == Opcode.MESSAGE_INDEX or (op == Opcode.MESSAGE and self._follows_chunk and self._is_index(at, length)):
             is_intact, op = self._is_index(at, length), Opcode.MESSAGE_INDEX  # a message there would be one by a damaged opcode
         elif op == Opcode.MESSAGE:
-            is_intact = length <= MOST_CHUNK_BYTES and self._knows(int.from_bytes(self.read(start, 2), 'little'))
+            is_intact = length <= MAX_CHUNK_BYTES and self._knows(int.from_bytes(self.read(start, 2), 'little'))
             content = self.read(start, length) if is_intact else None
         elif op in _DECLARED or op == Opcode.METADATA:
             content = self.read(start, length) if length <= MOST_SUMMARY_BYTES else None
@@ -341,7 +341,7 @@ class Salvage:
         length = self._chunk_length(at)
         if not length or self.read(at + RECORD.size + CHUNK.size - 4, 4) == bytes(4):
             return None
-        if length > MOST_CHUNK_BYTES or at + RECORD.size + length > self.size or not self._spend(length):
+        if length > MAX_CHUNK_BYTES or at + RECORD.size + length > self.size or not self._spend(length):
             return None
         return self._chunk(at, length)
 
@@ -432,7 +432,7 @@ class Salvage:
         name = head[CHUNK.size + 4 : CHUNK.size + 4 + length].decode(errors='replace')
         if not is_torn:
             return self._contradictory(damaged, name, size, crc, times)
-        if name not in _COMPRESSIONS or size > MOST_CHUNK_BYTES:
+        if name not in _COMPRESSIONS or size > MAX_CHUNK_BYTES:
             return Salvaged(f'{what}, and compressed with {name[:20]!r}', None, False, False, times)
         data = self._packed(damaged, name, head)
         raw = partly_unpacked(name, data, size) if name else data
@@ -441,7 +441,7 @@ class Salvage:
     def _packed(self, damaged: Damaged, compression: str, head: bytes) -> bytes:
         """The content of a chunk that is compressed so, as far as it is there."""
         place = CHUNK.size + 4 + len(compression)
-        length = min(int.from_bytes(head[place : place + 8], 'little'), damaged.size - RECORD.size - place - 8, MOST_CHUNK_BYTES)
+        length = min(int.from_bytes(head[place : place + 8], 'little'), damaged.size - RECORD.size - place - 8, MAX_CHUNK_BYTES)
         return self.read(damaged.at + RECORD.size + place + 8, max(length, 0))
 
     def _contradictory(self, damaged: Damaged, name: str, size: int, crc: int, times: tuple[int, int] | None) -> Salvaged:
@@ -451,7 +451,7 @@ class Salvage:
         for compression in sorted(_COMPRESSIONS, key=lambda each: each != name):
             data = self._packed(damaged, compression, head)
             likely = 16 * len(data) + BLOCK_BYTES  # also where the size is what is wrong
-            most = size if likely < size <= MOST_CHUNK_BYTES else min(likely, MOST_CHUNK_BYTES)
+            most = size if likely < size <= MAX_CHUNK_BYTES else min(likely, MAX_CHUNK_BYTES)
             raw = partly_unpacked(compression, data, most) if compression else data
             contents, end = self._walk(memoryview(raw))
             if crc and zlib.crc32(raw) == crc:
@@ -495,10 +495,10 @@ class Salvage:
     def _is_strong(self, at: int) -> bool:
         """Whether a record found by the search is surely one: verified by its checksum, or followed by another."""
         op, length = self._head(at)
-        if not self._fits(at, op, length) or not self._spend(min(length, MOST_CHUNK_BYTES)):
+        if not self._fits(at, op, length) or not self._spend(min(length, MAX_CHUNK_BYTES)):
             return False
         if op == Opcode.CHUNK and self.read(at + RECORD.size + CHUNK.size - 4, 4) != bytes(4):
-            return length <= MOST_CHUNK_BYTES and self._unpacked(at, length) is not None  # also one of unknown channels
+            return length <= MAX_CHUNK_BYTES and self._unpacked(at, length) is not None  # also one of unknown channels
         piece = self._piece(at)
         if piece is None:
             return False
@@ -514,7 +514,7 @@ class Salvage:
         op, length = self._head(at)
         if self._fits(at, op, length):
             return True
-        return op in {Opcode.CHUNK, Opcode.MESSAGE} and _LEAST[op] <= length <= MOST_CHUNK_BYTES
+        return op in {Opcode.CHUNK, Opcode.MESSAGE} and _LEAST[op] <= length <= MAX_CHUNK_BYTES
 
     # -- helpers ---------------------------------------------------------------------------------------------------
 

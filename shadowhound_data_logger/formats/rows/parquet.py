@@ -1,4 +1,4 @@
-"""Writes a table as a Parquet file, in pure Python: the little of the format that the catalogue needs, which all readers read.
+"""Writes a table as a Parquet file, in pure Python: the little of the format that the catalog needs, which all readers read.
 
 One row group, a PLAIN page a column, gzip; nulls as definition levels; null counts, least and greatest value of each column.
 https://github.com/apache/parquet-format (Encodings.md, LogicalTypes.md, src/main/thrift/parquet.thrift); the metadata is

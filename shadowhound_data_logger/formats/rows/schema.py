@@ -1,7 +1,7 @@
-"""The catalogue: one row for each object in the store, its columns, and how a row is made from an object's metadata.
+"""The catalog: one row for each object in the store, its columns, and how a row is made from an object's metadata.
 
-A row holds nothing that is not in the object's S3 metadata and in a listing: a catalogue that is lost is made again from those.
-Every object of a robot is a row but the files of the catalogue itself. Parts lie at
+A row holds nothing that is not in the object's S3 metadata and in a listing: a catalog that is lost is made again from those.
+Every object of a robot is a row but the files of the catalog itself. Parts lie at
 ``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC.
 Beside them lie the parts of the gap journal (formats/rows/gaps.py), in ``<robot>/_gaps/``, and of the statistics of the objects
 (formats/rows/statistics.py), in ``<robot>/_stats/``.
@@ -21,7 +21,7 @@ from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, S
 FORMAT_VERSION: Final = 1
 """Of the rows. Columns are only ever added, at the end."""
 BUCKET: Final = 'sensor-data'
-"""Of the catalogue; its rows name objects of any bucket."""
+"""Of the catalog; its rows name objects of any bucket."""
 COLUMNS: Final[Mapping[str, str]] = {
     'robot': STRING,
     'sensor': STRING,
@@ -52,7 +52,7 @@ COLUMNS: Final[Mapping[str, str]] = {
 """Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are always there; all else is null where it is not known.
 
 Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact ones stand beside them as int64.
-``x y yaw`` are metres and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
+``x y yaw`` are meters and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
 message, the middle of a batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date:
 ``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the part lies under ``date=1970-01-01``.
 ``clock_offset_ns`` is to be added to the times in the content, with ``set_later``.
@@ -60,7 +60,7 @@ message, the middle of a batch. ``clock`` is how well the times are known (spool
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
 UNDATED: Final = '1970-01-01'
 SENSOR: Final = '_catalog'
-"""Of the catalogue's own objects and of the gap journal's, which have no rows in it."""
+"""Of the catalog's own objects and of the gap journal's, which have no rows in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,11 +94,11 @@ OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': 
 KEPT: Final = TableSchema(
     '_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)}
 )
-"""What robots keep until somebody asks for it: rows as of the catalogue, and ``where`` each object is.
+"""What robots keep until somebody asks for it: rows as of the catalog, and ``where`` each object is.
 
 ``robot``: on the robot's disk. ``lost``: it was evicted there, or refused; ``reason`` says why. A row of the same object in the
-catalogue, which says that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of
-the catalogue that know nothing of this table see only what the store has.
+catalog, which says that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of
+the catalog that know nothing of this table see only what the store has.
 """
 FORGOTTEN: Final = TableSchema(
     '_forgotten',
@@ -122,10 +122,10 @@ FORGOTTEN: Final = TableSchema(
     {'shadowhound.forgotten': '1'},
     is_apart=True,
 )
-"""What ``lake prune`` deleted from the store on purpose: of each object the columns of its row in the catalogue, ``forgotten``
+"""What ``lake prune`` deleted from the store on purpose: of each object the columns of its row in the catalog, ``forgotten``
 when, and by which ``rule``.
 
-The row in the catalogue stays; one here, under the same date, supersedes it. It is there before the object is deleted: a robot
+The row in the catalog stays; one here, under the same date, supersedes it. It is there before the object is deleted: a robot
 that could write one could have an object deleted.
 """
 GAPS_FOLDER: Final = '_gaps'
@@ -138,7 +138,7 @@ Row = dict[str, Any]
 
 
 def is_row(bucket: str, key: str) -> bool:
-    """Whether an object belongs into the catalogue: all do but its own files, and those of the tables beside it."""
+    """Whether an object belongs into the catalog: all do but its own files, and those of the tables beside it."""
     folders = {SENSOR, GAPS_FOLDER, KEPT.folder, STATISTICS_FOLDER, LABELS_FOLDER}
     return bucket != BUCKET or ''.join(key.split('/')[1:2]) not in folders
 

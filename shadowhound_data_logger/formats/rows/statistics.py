@@ -2,7 +2,7 @@
 
 A row is one field of one object (formats/statistics.py). Parts lie at
 ``<robot>/_stats/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC, as in the
-catalogue. A row may be in two parts: a robot whose power failed tells the last ones again.
+catalog. A row may be in two parts: a robot whose power failed tells the last ones again.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STATISTICS: Final = TableSchema(
     required=('bucket', 'key', 'field', 'count', 'nan_count', 'format_version'),
     about={'shadowhound.statistics': str(FORMAT_VERSION)},
 )
-"""``robot sensor bucket key t_start t_start_ns`` are those of the object's row in the catalogue.
+"""``robot sensor bucket key t_start t_start_ns`` are those of the object's row in the catalog.
 
 ``first last min max mean`` are of the ``count`` finite numbers of a ``field``; ``nan_count`` were NaN or infinite. The row whose
 ``field`` is empty is of the object as a whole: ``count`` messages, and ``nan_count`` fields without statistics.
@@ -47,7 +47,7 @@ _OF_OBJECT: Final = ('robot', 'sensor', 'bucket', 'key', 't_start', 't_start_ns'
 
 
 def statistic_rows(of: Row, found: Mapping[str, Statistic]) -> Iterator[Row]:
-    """The rows of an object by its row in the catalogue."""
+    """The rows of an object by its row in the catalog."""
     common = {name: of[name] for name in _OF_OBJECT}
     for field, each in found.items():
         numbers = dict(zip(NUMBERS, numbers_of(each), strict=True))

@@ -74,7 +74,7 @@ export class Plot {
     const { clientWidth: width, clientHeight: height } = this.box;
     if (!width || !height || !lines.length) return;
     const style = getComputedStyle(this.box);
-    const colour = (name) => style.getPropertyValue(name).trim();
+    const color = (name) => style.getPropertyValue(name).trim();
     const many = lines.length > COLOURS.length;
     this.made = lines.length;
     this.plot = inMemory(() => new uPlot(
@@ -82,14 +82,14 @@ export class Plot {
         width, height, padding: [8, 8, 0, 0], legend: { show: false }, cursor: { show: false }, pxAlign: true,
         scales: { x: { time: false, range: (_, low, high) => [high - this.seconds, high] }, y: this.range ? { range: this.range } : {} },
         axes: [
-          { stroke: colour('--faint'), grid: { stroke: colour('--rule'), width: 1 }, ticks: { show: false }, font: '11px system-ui', size: 22,
+          { stroke: color('--faint'), grid: { stroke: color('--rule'), width: 1 }, ticks: { show: false }, font: '11px system-ui', size: 22,
             splits: (plot) => [0.9, 0.6, 0.3].map((share) => plot.scales.x.max - share * this.seconds),
             values: (_, ticks) => ticks.map((_tick, place) => ago([0.9, 0.6, 0.3][place] * this.seconds)) },
-          { stroke: colour('--faint'), grid: { stroke: colour('--rule'), width: 1 }, ticks: { show: false }, font: '11px system-ui', size: 40, space: 28 },
+          { stroke: color('--faint'), grid: { stroke: color('--rule'), width: 1 }, ticks: { show: false }, font: '11px system-ui', size: 40, space: 28 },
         ],
         series: [{}, ...lines.map(([, label], place) => ({
           label, width: many ? 1 : 1.5, points: { show: false },
-          stroke: many ? `hsl(${Math.round((place / lines.length) * 360)} 55% 52%)` : colour(COLOURS[place % COLOURS.length]),
+          stroke: many ? `hsl(${Math.round((place / lines.length) * 360)} 55% 52%)` : color(COLOURS[place % COLOURS.length]),
         }))],
       },
       this.data(lines), this.box,

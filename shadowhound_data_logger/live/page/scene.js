@@ -280,14 +280,14 @@ export class FloorPlan {
       to.fill();
       to.stroke();
     }
-    const metre = 5 / CELL;
+    const meter = 5 / CELL;
     to.setTransform(1, 0, 0, 1, 0, 0);
     to.strokeStyle = to.fillStyle = style.getPropertyValue('--faint');
     to.lineWidth = 1.5 * ratio;
     to.font = `${11 * ratio}px system-ui, sans-serif`;
     to.beginPath();
     to.moveTo(12 * ratio, this.canvas.height - 12 * ratio);
-    to.lineTo(12 * ratio + metre * scale, this.canvas.height - 12 * ratio);
+    to.lineTo(12 * ratio + meter * scale, this.canvas.height - 12 * ratio);
     to.stroke();
     to.fillText('5 m', 12 * ratio, this.canvas.height - 18 * ratio);
   }

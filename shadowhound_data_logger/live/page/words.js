@@ -36,7 +36,7 @@ export const moment = (ms) => `${new Date(ms).toISOString().slice(0, 10)} ${new 
 const CAUSES = {
   transport: ['Lost on the way to the node', 'red', 'solid'], silence: ['None came for long', 'sky', 'solid'], restart: ['The node was not running', 'purple', 'solid'],
   paused: ['The node was paused', 'blue', 'solid'], queue_full: ['The queue was full', 'yellow', 'solid'], no_room: ['The disk was full', 'brown', 'solid'],
-  damaged: ['The file in the spool was damaged', 'ink', 'solid'], keep_limit: ['More was kept than keep.max_bytes allows', 'pink', 'solid'], unknown: ['Of unknown cause', 'grey', 'solid'],
+  damaged: ['The file in the spool was damaged', 'ink', 'solid'], keep_limit: ['More was kept than keep.max_bytes allows', 'pink', 'solid'], unknown: ['Of unknown cause', 'gray', 'solid'],
   ring_full: ['The ring of events was full', 'yellow', 'bands'], unwritable: ['The disk took nothing', 'brown', 'bands'], shutdown: ['The node ended before they were stored', 'purple', 'bands'],
   stopped: ['The bag had ended', 'purple', 'stripes'], keep_days: ['They were kept for long enough', 'pink', 'bands'], thinned: ['Room ran short: others of that time are kept', 'pink', 'stripes'],
   retention: ['Removed from the store by a rule', 'pink', 'dots'], sampler_failed: ['The node failed to sort them', 'red', 'bands'], encoder_failed: ['The node failed to encode them', 'red', 'stripes'],

@@ -159,7 +159,7 @@ class EncodePool:
     New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake.
     """
 
-    def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbour
+    def __init__(self, robot: str, queue: BatchQueue, sensors: Mapping[str, SensorSettings], types: MessageTypes,  # noqa: PLR0913 - each is a neighbor
                  writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *,
                  preview: Preview = lambda _: None, reports: RejectionLog | None = None,
                  threads: int = THREADS) -> None:  # fmt: skip

@@ -123,7 +123,7 @@ class Consumer(Protocol):
         return
 
 
-def hand_on(drained: Drained, consumers: Iterable[Consumer]) -> None:
+def deliver(drained: Drained, consumers: Iterable[Consumer]) -> None:
     """Each of them takes the messages, whatever happens to one."""
     for consumer in consumers:
         try:

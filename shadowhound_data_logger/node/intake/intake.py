@@ -146,9 +146,9 @@ class Intake:
         if refreshes and self._listening:
             todo.append(partial(self._follow, now_s))
         todo += [partial(consumer.tick, now_s) for consumer in self._consumers]
-        _each([*todo, self._obey])
+        _each([*todo, self._handle_requests])
 
-    def _obey(self) -> None:
+    def _handle_requests(self) -> None:
         while self._requests:
             self._requests.popleft()()
 

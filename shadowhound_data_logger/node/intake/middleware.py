@@ -34,7 +34,7 @@ MEASURED: Final = {(6, 2): 'Humble', (8, 4): 'Jazzy', (9, 3): 'Kilted'}
 FAST_DDS_3: Final = (9, 0)
 HAS_RANGE: Final = (7, 0)
 """Versions of rmw_fastrtps_cpp: the first with Fast DDS 3, and the first that knows ROS_AUTOMATIC_DISCOVERY_RANGE."""
-MOST_BUFFER: Final = 32 * MEBI
+MAX_BUFFER: Final = 32 * MEBI
 """Bytes of a receive buffer beyond which more is no use: two seconds of raw images. The kernel takes it only as it is filled."""
 SEGMENT: Final = 32 * MEBI
 """Bytes of shared memory, as in the profile for drivers: what runs beside the node may publish images."""
@@ -123,7 +123,7 @@ class Sockets:
     """Datagrams that found no room in them."""
 
 
-def asked_for(arguments: Sequence[str]) -> str:
+def requested_rmw(arguments: Sequence[str]) -> str:
     """The parameter ``capture.rmw`` of the command line. Whatever is wrong with it is told when ROS has read it as well."""
     try:
         given = parameter(arguments, SETTING)
@@ -167,9 +167,9 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
 
 
 def possible_buffer() -> int:
-    """Bytes of the largest receive buffer that the kernel gives a socket here (net.core.rmem_max), at most MOST_BUFFER."""
+    """Bytes of the largest receive buffer that the kernel gives a socket here (net.core.rmem_max), at most MAX_BUFFER."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, MOST_BUFFER)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, MAX_BUFFER)
         return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel doubles it, socket(7)
 
 

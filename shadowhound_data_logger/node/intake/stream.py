@@ -18,9 +18,9 @@ from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.stamps import StampReport, StampRule, StampTracks
 from shadowhound_data_logger.formats.types import CounterField, MessageTypes, header_stamp_ns
-from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, hand_on
+from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, deliver
 from shadowhound_data_logger.spool.accounts import Accounts
-from shadowhound_data_logger.spool.estimator import Expectation, Hearing, TopicEstimate
+from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation, TopicEstimate
 from shadowhound_data_logger.spool.gaps import EXACT
 
 log = logging.getLogger(__name__)
@@ -105,13 +105,13 @@ class Arrivals:
         """All that waited was taken."""
         self._looked_s = now_s
 
-    def hear(self, senders: Senders, now_s: float) -> Hearing:
+    def hear(self, senders: Senders, now_s: float) -> ArrivalContext:
         """Some came."""
         looked_s = now_s if self._looked_s is None else self._looked_s
         since_s = now_s if self._heard_s is None else self._heard_s
         self._heard_s = now_s
         alone = len(senders.gids) == 1
-        return Hearing(
+        return ArrivalContext(
             now_s=now_s, quiet_s=max(0.0, looked_s - since_s), alone=alone,
             gid=senders.gids[0] if alone else '',
             crowded=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
@@ -173,7 +173,7 @@ class TopicStream:
         lost = self._estimate.observe(unnumbered, self._arrivals.hear(senders, now_s)).lost if unnumbered else None
         if fresh:
             drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
-            hand_on(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
+            deliver(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""
@@ -259,8 +259,8 @@ class SensorStream:
         for consumer, defect in failed.items():
             count_failure(consumer, self._topic, defect)
         if fresh:
-            hand_on(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
-            hand_on(drained, [each for each in self._of_own_topics if self._topic in each.topics])
+            deliver(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
+            deliver(drained, [each for each in self._of_own_topics if self._topic in each.topics])
 
     def look(self, now_s: float) -> None:
         """All that waited was taken."""

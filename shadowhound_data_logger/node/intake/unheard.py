@@ -21,10 +21,10 @@ by default with Cyclone DDS, 20 s with Fast DDS as ROS has it), and the two side
 SILENT_S: Final = 30.0
 """After a longer silence of the front nothing is known, and what is reported then starts again; it reports every other second, or
 every 20 s in a crowd of publishers."""
-MOST_PUBLISHERS: Final = 8
+MAX_PUBLISHERS: Final = 8
 """Of a topic, in a report: a crowd of them costs no more."""
-MOST_NODES: Final = 3
-MOST_LETTERS: Final = 200
+MAX_NODES: Final = 3
+MAX_LETTERS: Final = 200
 """Of a name, in what is said."""
 REMEDY: Final = (
     "listen through the robot's own RMW (capture.rmw: robot), or have both look in the same networks: interfaces and peers of "
@@ -85,8 +85,8 @@ class Unheard:
             return
         nodes = sorted({node for _, node in publishers.values()} - {''})
         seconds = round(now_s - min(self._since_s[topic, gid] for gid in publishers))
-        whose = f' (of {", ".join(nodes[:MOST_NODES])}{" and others" if len(nodes) > MOST_NODES else ""})' if nodes else ''
-        more = ' or more' if len(publishers) >= MOST_PUBLISHERS else ''
+        whose = f' (of {", ".join(nodes[:MAX_NODES])}{" and others" if len(nodes) > MAX_NODES else ""})' if nodes else ''
+        more = ' or more' if len(publishers) >= MAX_PUBLISHERS else ''
         count, what = (f'{len(publishers)}{more} publishers', 'they send') if len(publishers) > 1 else ('a publisher', 'it sends')
         text = (f'{topic} is not all heard: {self._robot} finds {count}{whose} that {self._rmw}, by which the node listens, '
                 f'has not found; what {what} is not logged')  # fmt: skip
@@ -101,7 +101,7 @@ def _publishers(given: Any, type_name: str, known: set[str]) -> dict[str, tuple[
     found = {}
     for row in rows:
         if isinstance(row, list) and len(row) == 3 and all(isinstance(word, str) for word in row):
-            gid, type_found, node = (printable(word[:MOST_LETTERS]) for word in row)
+            gid, type_found, node = (printable(word[:MAX_LETTERS]) for word in row)
             if gid not in known and type_name in {'', type_found}:
                 found[gid] = type_found, node
     return found

@@ -117,7 +117,7 @@ def _picture(body: bytes, content_type: str) -> bytes | None:
 
 
 def _small(picture: bytes | None) -> bytes | None:
-    """The picture as a JPEG of at most ``PREVIEW_BYTES``; None for one that has no colours or greys, such as depth."""
+    """The picture as a JPEG of at most ``PREVIEW_BYTES``; None for one that has no colors or greys, such as depth."""
     if picture is None:
         return None
     with open_image(picture) as opened:

@@ -16,7 +16,7 @@ from shadowhound_data_logger.shipping.uploader import UploadStatus
 
 SAMPLE_S: Final = 5.0
 """Of uploading without a pause, for one sample: shorter ones would measure single objects."""
-MOST_SAMPLES: Final = 120
+MAX_SAMPLES: Final = 120
 """In one object: ten minutes of uploading."""
 FIRST_S, LONGEST_S = 60.0, 900.0
 """From the first sample of an object to its end: of the first object, so that a pace is known soon, and of any other."""
@@ -64,7 +64,7 @@ class LinkTrack:
         if not self._samples:
             return None
         age_s = (self._clock.wall_ns() - self._samples[0]['stamp_ns']) / SECOND
-        return self._object() if is_last or len(self._samples) >= MOST_SAMPLES or age_s >= self._longest_s else None
+        return self._object() if is_last or len(self._samples) >= MAX_SAMPLES or age_s >= self._longest_s else None
 
     def _sample(self, mbps: float, *, is_away: bool) -> None:
         stamp_ns = self._clock.wall_ns()

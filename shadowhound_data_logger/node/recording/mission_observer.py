@@ -23,7 +23,7 @@ from shadowhound_data_logger.formats.records import ODOMETRY
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions.node_log import Cloud, Frame, MissionFact, Reading
 from shadowhound_data_logger.missions.odometer import Pose
-from shadowhound_data_logger.missions.story import BATTERY, TEMPERATURE
+from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE
 
 log = logging.getLogger(__name__)
 

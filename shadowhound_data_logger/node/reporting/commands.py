@@ -29,13 +29,13 @@ MANUAL: Final = 'manual'
 """Name of an event that somebody asked for and did not name."""
 ASKERS: Final = ('command', 'service', 'page')
 """By whom it is said to have been triggered."""
-MOST_NAME: Final = 100
+MAX_NAME: Final = 100
 """Letters of an event's name."""
 YIELD_S: Final = 5.0
 """For so long uploads yield to whoever watches, unless it is asked for again: a live page that was killed slows nothing down."""
 WHO: Final = 'who'
 """With any request: whom somebody asks for, to be said in the log, in the ledger and in the manifest of an event."""
-MOST_NOTE: Final = 1000
+MAX_NOTE: Final = 1000
 """Letters of what is said of it."""
 
 
@@ -105,23 +105,23 @@ class Commands:
         if isinstance(done, dict):
             return {'ok': True, 'robot': self._robot, **done}
         if who := _who(request):
-            self._acts.add(who, printable(str(request.get('do')))[:MOST_NAME], ok=done[0], said=done[1])
+            self._acts.add(who, printable(str(request.get('do')))[:MAX_NAME], ok=done[0], said=done[1])
         return {'ok': done[0], 'robot': self._robot, 'message' if done[0] else 'error': done[1]}
 
     def _do(self, request: Mapping[str, Any]) -> Answer | dict[str, Any]:
         name = request.get('do')
         command = self._known.get(name) if isinstance(name, str) else None
         if command is None:
-            return False, f'"do" is one of {", ".join(self._known)}; it is {str(name)[:MOST_NAME]!r}'
+            return False, f'"do" is one of {", ".join(self._known)}; it is {str(name)[:MAX_NAME]!r}'
         who = _who(request)
         arguments = {key: value for key, value in request.items() if key not in ('do', WHO)}
         for key, value in arguments.items():
             kind = command.arguments.get(key)
             if kind is None:
                 takes = ', '.join(command.arguments) or 'nothing else'
-                return False, f'{name} takes {takes}, and no {key[:MOST_NAME]!r}'
+                return False, f'{name} takes {takes}, and no {key[:MAX_NAME]!r}'
             if not isinstance(value, kind):
-                return False, f'{key} of {name} is {_KINDS[kind]}, not {str(value)[:MOST_NAME]!r}'
+                return False, f'{key} of {name} is {_KINDS[kind]}, not {str(value)[:MAX_NAME]!r}'
         done = command.do(**arguments, **({WHO: who} if command.takes_who else {}))
         if not isinstance(done, dict) and (who or not (done[0] and command.quiet)):
             log.log(logging.INFO if done[0] else logging.WARNING, '%s%s: %s', who and f'{who}: ', name, done[1])
@@ -160,10 +160,10 @@ class Commands:
 
     def _trigger(self, name: str = MANUAL, note: str = '', by: str = ASKERS[0], who: str = '') -> Answer:
         """Begin an event, or make the one that goes on last longer; names the bag."""
-        if not 0 < len(name) <= MOST_NAME or len(note) > MOST_NOTE:
-            return False, f'an event has a name of 1 to {MOST_NAME} letters, and a note of up to {MOST_NOTE}'
+        if not 0 < len(name) <= MAX_NAME or len(note) > MAX_NOTE:
+            return False, f'an event has a name of 1 to {MAX_NAME} letters, and a note of up to {MAX_NOTE}'
         if by not in ASKERS:
-            return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MOST_NAME]!r}'
+            return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MAX_NAME]!r}'
         return self._stages.event_buffer.events.trigger(name, by, note, who=who)
 
     def _pull(self, want: Mapping[str, Any] | None = None, cancel: str = '', by: str = MANUAL) -> Answer | dict[str, Any]:
@@ -227,4 +227,4 @@ def _count(number: int, noun: str) -> str:
 
 def _who(request: Mapping[str, Any]) -> str:
     """For whom it is asked; empty where nobody says so."""
-    return printable(str(request.get(WHO, '')))[:MOST_NAME]
+    return printable(str(request.get(WHO, '')))[:MAX_NAME]

@@ -24,7 +24,7 @@ from shadowhound_data_logger.spool.control import ANSWER_S, MAX_REQUEST_BYTES, N
 
 log = logging.getLogger(__name__)
 
-MOST_CLIENTS: Final = 16
+MAX_CLIENTS: Final = 16
 IDLE_S: Final = 60.0
 """Within which a client that is connected sends a whole line; the front does every second."""
 READ_S: Final = 5.0
@@ -42,7 +42,8 @@ Waiting = tuple[_Request, 'Future[dict[str, Any]]']
 class ControlSocket:
     """Serves commands to programs without ROS, through a Unix socket in the spool.
 
-    Life: New; open once, by the robot's one node; ``obey`` by the main thread whenever ``wake`` was called; close once.
+    Life: New; open once, by the robot's one node; ``handle_requests`` by the main thread whenever ``wake`` was called; close
+    once.
 
     Owns the thread ``control``, which reads and writes; what is asked for waits in a queue for the main thread.
     """
@@ -79,7 +80,7 @@ class ControlSocket:
         """Where it is, once it is open."""
         return self._spool / self._name
 
-    def obey(self, do: Callable[[_Request], dict[str, Any]]) -> None:
+    def handle_requests(self, do: Callable[[_Request], dict[str, Any]]) -> None:
         """Have all that is asked for done, one after the other; ``do`` returns what to answer."""
         while self._waiting:
             request, answer = self._waiting.popleft()
@@ -126,8 +127,8 @@ class ControlSocket:
         self._clients.add(this)
         writer.transport.set_write_buffer_limits(0)  # so that ``drain`` waits until all is read
         try:
-            if len(self._clients) > MOST_CLIENTS:
-                await self._tell(writer, self._refused(f'{MOST_CLIENTS} clients are connected, which is the most there may be'))
+            if len(self._clients) > MAX_CLIENTS:
+                await self._tell(writer, self._refused(f'{MAX_CLIENTS} clients are connected, which is the most there may be'))
             else:
                 await self._converse(reader, writer)
         except (OSError, asyncio.TimeoutError):  # it went away, or reads nothing

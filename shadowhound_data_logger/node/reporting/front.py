@@ -30,7 +30,7 @@ from shadowhound_data_logger.core.config import NOT_SETTINGS
 from shadowhound_data_logger.core.errors import DataLoggerError, NodeUnavailable
 from shadowhound_data_logger.core.ros_arguments import NODE
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.node.intake.unheard import MOST_PUBLISHERS
+from shadowhound_data_logger.node.intake.unheard import MAX_PUBLISHERS
 from shadowhound_data_logger.node.parameters import Described, declare, parameter, plain
 from shadowhound_data_logger.node.reporting.interface import Interface
 from shadowhound_data_logger.ros.reader import endpoints
@@ -39,7 +39,7 @@ from shadowhound_data_logger.spool.control import Connection
 COMPARE_S: Final = 2.0
 """How often it looks at the publishers of what is logged, or more seldom: it takes at most so much of the time."""
 COMPARE_SHARE, LONGEST_COMPARE_S = 0.05, 20.0
-MOST_REPORTED, MOST_LETTERS = 64, 150
+MAX_REPORTED, MAX_LETTERS = 64, 150
 """Publishers in a report, and letters of a name: together they fit into a request."""
 LOOK_S: Final = 1.0
 """How often it asks what is new, and so finds out that the node is no more."""
@@ -155,11 +155,11 @@ class PublicNode:
         """Tell the node which publishers of its topics it has not found, as far as that is known here."""
         began_s = time.monotonic()
         found: dict[str, list[list[str]]] = {}
-        room = MOST_REPORTED
+        room = MAX_REPORTED
         for topic in self._topics:
             others = [each for each in endpoints(self._node, topic) if each.gid not in self._gids]
             others.sort(key=lambda each: (each.gid not in self._reported, each.gid))
-            del others[min(room, MOST_PUBLISHERS) :]
+            del others[min(room, MAX_PUBLISHERS) :]
             room -= len(others)
             if others:
                 found[topic] = [[each.gid, _ascii(each.type), _ascii(each.node)] for each in others]
@@ -197,7 +197,7 @@ class PublicNode:
 
 def _ascii(name: str) -> str:
     """As ROS has names; who is not a ROS may have others."""
-    return name[:MOST_LETTERS].encode('ascii', 'replace').decode()
+    return name[:MAX_LETTERS].encode('ascii', 'replace').decode()
 
 
 def main() -> int:

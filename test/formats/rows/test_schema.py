@@ -1,4 +1,4 @@
-"""What the catalogue says of an object is what the object says of itself."""
+"""What the catalog says of an object is what the object says of itself."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_nothing_in_metadata_or_key_raises(metadata: dict[str, str], key: str) -
     assert re.fullmatch(r'\d{4}-\d\d-\d\d', schema.date_of(found))
 
 
-def test_the_catalogue_is_not_in_itself() -> None:
+def test_the_catalog_is_not_in_itself() -> None:
     """Everything else is, also another bucket's folder of that name."""
     key = schema.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
     assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.parquet'

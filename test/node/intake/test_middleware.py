@@ -11,11 +11,11 @@ import pytest
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.node.intake.middleware import (
     FROM_PROFILE,
-    MOST_BUFFER,
+    MAX_BUFFER,
     Middleware,
-    asked_for,
     choose,
     possible_buffer,
+    requested_rmw,
     sockets,
 )
 
@@ -148,15 +148,15 @@ def test_what_is_asked_for_is_done_or_refused(installed: dict[str, str], tmp_pat
 
 def test_what_cannot_be_read_yet_is_left_to_ros(tmp_path: Path) -> None:
     """Who starts the node is told by rcl, as ever, what is wrong with a file."""
-    assert asked_for(['--ros-args', '--params-file', str(tmp_path / 'none.yaml')]) == 'auto'
-    assert asked_for(['--ros-args', '-p', 'capture.rmw:=robot']) == 'robot'
+    assert requested_rmw(['--ros-args', '--params-file', str(tmp_path / 'none.yaml')]) == 'auto'
+    assert requested_rmw(['--ros-args', '-p', 'capture.rmw:=robot']) == 'robot'
 
 
 def test_the_buffer_is_read_back() -> None:
     """Of the sockets that this process has: what the kernel gave them, and what it dropped."""
     before = sockets()
     wanted = possible_buffer()
-    assert 0 < wanted <= MOST_BUFFER
+    assert 0 < wanted <= MAX_BUFFER
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
         receiver.bind(('127.0.0.1', 0))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.node.intake.unheard import MOST_PUBLISHERS, SETTLED_S, SILENT_S, Unheard
+from shadowhound_data_logger.node.intake.unheard import MAX_PUBLISHERS, SETTLED_S, SILENT_S, Unheard
 
 IMU = 'sensor_msgs/msg/Imu'
 STEP_S = 2.0
@@ -121,7 +121,7 @@ def test_the_front_is_told_what_is_known_already() -> None:
 
 
 @pytest.mark.parametrize(('count', 'words'), [
-    (2, 'finds 2 publishers that'), (MOST_PUBLISHERS, f'finds {MOST_PUBLISHERS} or more publishers'),
+    (2, 'finds 2 publishers that'), (MAX_PUBLISHERS, f'finds {MAX_PUBLISHERS} or more publishers'),
 ])  # fmt: skip
 def test_several_are_one_error(count: int, words: str, caplog: pytest.LogCaptureFixture) -> None:
     """A report has no more of them than a limit, so the words claim no number then."""

@@ -10,7 +10,7 @@ from spool.making import NOON_NS, FakeClock
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import DataObject
-from shadowhound_data_logger.node.keeping.link_track import MOST_SAMPLES, LinkTrack
+from shadowhound_data_logger.node.keeping.link_track import MAX_SAMPLES, LinkTrack
 from shadowhound_data_logger.shipping.uploader import UploadStatus
 
 IDLE = UploadStatus('idle', '', 0, 0, 0, 0, 0)
@@ -66,7 +66,7 @@ def test_the_first_object_comes_after_a_minute_and_others_after_ten() -> None:
     link.send(65, 1000)
     assert link.made == []
     link.send(1, 1000)
-    link.send(5 * MOST_SAMPLES, 1000)
+    link.send(5 * MAX_SAMPLES, 1000)
     assert [(one.sensor, one.key) for one in link.made] == [
         ('_wifi', 'thor/_wifi/20251018/120006_wifi.json'), ('_wifi', 'thor/_wifi/20251018/120111_wifi.json'),
     ]  # fmt: skip

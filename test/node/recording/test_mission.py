@@ -174,7 +174,7 @@ def test_batches_end_where_missions_begin_and_end(tmp_path: Path, opened: ExitSt
     assert setting.intake.asked == asked
 
 
-def test_what_the_robot_says_is_journalled(tmp_path: Path, opened: ExitStack) -> None:
+def test_what_the_robot_says_is_journaled(tmp_path: Path, opened: ExitStack) -> None:
     """From start to end, and the journal is let go of then; with ``join: false`` there is none."""
     setting, logger = watching(opened, tmp_path)
     logger.start_mission('patrol', '')

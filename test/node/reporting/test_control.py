@@ -19,7 +19,7 @@ import pytest
 from node.serving import Serving
 
 from shadowhound_data_logger.core.errors import NodeUnavailable
-from shadowhound_data_logger.node.reporting.control import MOST_CLIENTS
+from shadowhound_data_logger.node.reporting.control import MAX_CLIENTS
 from shadowhound_data_logger.spool import control
 from shadowhound_data_logger.spool.control import MAX_REQUEST_BYTES, Connection, address, connect
 
@@ -213,9 +213,9 @@ def test_there_are_so_many_clients_at_most(serve: Callable[..., Serving]) -> Non
         with suppress(BrokenPipeError, ConnectionResetError):
             client.sendall(b'{"do": "flush"}\n')
     answers = [json.loads(client.makefile().readline()) for client in clients]
-    assert [answer['ok'] for answer in answers].count(True) == MOST_CLIENTS
+    assert [answer['ok'] for answer in answers].count(True) == MAX_CLIENTS
     assert {answer['error'] for answer in answers if not answer['ok']} == {
-        f'{MOST_CLIENTS} clients are connected, which is the most there may be'
+        f'{MAX_CLIENTS} clients are connected, which is the most there may be'
     }
     for client in clients:
         client.close()

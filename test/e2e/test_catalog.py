@@ -1,4 +1,4 @@
-"""The catalogue of a simulated robot: read by pyarrow, held against the bucket and against where the simulator says it was."""
+"""The catalog of a simulated robot: read by pyarrow, held against the bucket and against where the simulator says it was."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ TOLD_OTHERWISE = {'t_start', 't_end', 'content_type'}
 """Times come as datetimes, and SeaweedFS guesses what an application/octet-stream is."""
 WITH_HEADER = ('camera', 'joints', 'lidar', 'odom')
 """Whose objects have the pose of their header's time. What is encoded while odometry is late, on a busy machine, has none."""
-FAST = {'catalogue.period_s': 2.0, 'lowstate.batch_s': 2.0}
+FAST = {'catalog.period_s': 2.0, 'lowstate.batch_s': 2.0}
 
 
 def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
-    """All objects of a robot, with what they say of themselves; but not the catalogue."""
+    """All objects of a robot, with what they say of themselves; but not the catalog."""
     found = {}
     for bucket in ('sensor-data', 'trajectories'):
         for info in store.list(bucket, f'{robot}/'):
@@ -48,7 +48,7 @@ def listed(store: S3Store, robot: str) -> dict[tuple[str, str], ObjectInfo]:
     return found
 
 
-def catalogued(store: S3Store, robot: str) -> list[dict[str, Any]]:
+def cataloged(store: S3Store, robot: str) -> list[dict[str, Any]]:
     """All rows of all parts; each has the schema and the date of its folder."""
     rows = []
     for info in store.list(schema.BUCKET, schema.OBJECTS.prefix(robot)):
@@ -78,7 +78,7 @@ def started_ns(rows: list[dict[str, Any]], store: S3Store) -> int:
 
 
 def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo], store: S3Store) -> None:
-    """All of the bucket but the catalogue is in it once, as the bucket says it, and poses are the simulator's within 10 cm."""
+    """All of the bucket but the catalog is in it once, as the bucket says it, and poses are the simulator's within 10 cm."""
     assert Counter((row['bucket'], row['key']) for row in rows) == Counter(objects.keys())
     for row in rows:
         info = objects[row['bucket'], row['key']]
@@ -103,7 +103,7 @@ def check(rows: list[dict[str, Any]], objects: dict[tuple[str, str], ObjectInfo]
 @pytest.mark.timeout(300 + 2 * DURATION_S)
 def test_every_object_has_one_row_and_the_right_pose(session: Session, store: S3Store) -> None:
     """Those of the sensors and the slices of the bag, in several parts."""
-    check(catalogued(store, session.robot), listed(store, session.robot), store)
+    check(cataloged(store, session.robot), listed(store, session.robot), store)
     assert len(list(store.list(schema.BUCKET, schema.OBJECTS.prefix(session.robot)))) > 1
 
 
@@ -169,6 +169,6 @@ def test_a_node_that_is_killed_leaves_nothing_out(processes: Processes, seaweed:
     (_, died_ns), (again_ns, _) = spans(source, processes.robot, '/odom')
     known = lake.known(processes.robot, '/odom', died_ns, again_ns, source=source)
     assert ('restart',) in [each.causes for each in known.stretches]
-    rows = catalogued(store, processes.robot)
+    rows = cataloged(store, processes.robot)
     check(rows, listed(store, processes.robot), store)
     assert {row['mission_type'] for row in rows} == {None, 'patrol'}

@@ -69,8 +69,8 @@ def test_the_sender_stays_until_the_last_row_is_written(tmp_path: Path, is_haste
                 spooler.drain()
         assert (spooler.pending(), rows(), spooler.owes) == (0, 1, True)
         if is_hastened:
-            spooler.hasten()
-        now[0] += SOON_S if is_hastened else settings.catalogue.period_s
+            spooler.expedite()
+        now[0] += SOON_S if is_hastened else settings.catalog.period_s
         for _ in range(2):
             spooler.drain()
         assert (spooler.pending(), rows(), spooler.owes) == (0, 2, False)

@@ -1,4 +1,4 @@
-"""The list of what no part of the catalogue has yet: nothing leaves it but with a part, and then once."""
+"""The list of what no part of the catalog has yet: nothing leaves it but with a part, and then once."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from spool.making import (
     FakeClock,
     abandon,
     assert_whole,
-    clear_uncatalogued,
+    clear_uncataloged,
     make,
     new_spool,
     put,
     rows,
     settle,
-    uncatalogued,
+    uncataloged,
 )
 
 from shadowhound_data_logger.core.model import DataObject, Outcome, State
@@ -28,13 +28,13 @@ ALL = 1000
 
 
 def listed(root: Path) -> list[str]:
-    return [item.key for item in uncatalogued(root, ALL)]
+    return [item.key for item in uncataloged(root, ALL)]
 
 
 def part(root: Path, name: str, *keys: str) -> DataObject:
     """A part with rows of all that is listed, or of these."""
-    ids = tuple(item.id for item in uncatalogued(root, ALL) if not keys or item.key in keys)
-    return make(f'thor/_catalog/{name}.parquet', name.encode(), sensor='_catalog', topic=None, protected=True, catalogues=ids)
+    ids = tuple(item.id for item in uncataloged(root, ALL) if not keys or item.key in keys)
+    return make(f'thor/_catalog/{name}.parquet', name.encode(), sensor='_catalog', topic=None, protected=True, catalogs=ids)
 
 
 def delivered(spool: Spool, *keys: str) -> None:
@@ -50,11 +50,11 @@ def test_what_the_store_holds_is_listed(spool: Spool, root: Path) -> None:
     settle(spool, items[3], State.DELIVERED)
     settle(spool, items[0], State.DELIVERED)
     assert listed(root) == ['a', 'd']
-    (first, _) = uncatalogued(root, ALL)
+    (first, _) = uncataloged(root, ALL)
     assert first == (items[0].id, 'sensor-data', 'a', 1, 'image/jpeg', items[0].metadata, b'')
     settle(spool, items[2], State.DELIVERED)  # it was on its way when it was evicted
     assert listed(root) == ['a', 'c', 'd']
-    assert [item.key for item in uncatalogued(root, 2)] == ['a', 'c']
+    assert [item.key for item in uncataloged(root, 2)] == ['a', 'c']
 
 
 def test_a_part_takes_its_rows_off(spool: Spool, root: Path) -> None:
@@ -132,7 +132,7 @@ def test_what_is_listed_is_not_forgotten(opened: Open, root: Path, clock: FakeCl
     clock.now_ns += 10**18
     spool.commit()
     assert [row['key'] for row in rows(root)] == listed(root) == ['a']
-    clear_uncatalogued(root)
+    clear_uncataloged(root)
     assert listed(root) == []
     clock.now_ns += 10**14
     spool.commit()

@@ -1,10 +1,10 @@
-"""What a mission's journal says as a whole: its first and last values, its counts, and how the run ends.
+"""The state of a mission, computed from its journal: first and last values, counts, and how the run ends.
 
 The records of a journal, by their ``k``: ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
-``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``policy`` (another one is active from then on, or
+``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``policy`` (active from then on, or
 none), ``refused`` (reason), ``end`` (status, what the agent stated, elapsed_s: how long it took), and of the node ``poses``.
-Every record has ``t``, ns since 1970 UTC. ``summary_of`` makes ``summary.json`` of it, the same in the run, in the store and in
-the mission's folder.
+Every record has ``t``, ns since 1970 UTC. ``summary_of`` computes ``summary.json``, the same in the run, in the store and in the
+mission's folder.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ KILLED, FAILED, FINISHED = 'KILLED', 'FAILED', 'FINISHED'
 MOST_ERRORS: Final = 20
 MOST_EVENTS: Final = 200
 MOST_EVENT: Final = 2000
-"""Letters of an event that stands in the summary; ``events.jsonl`` in the run has all."""
+"""Characters of an event in the summary; ``events.jsonl`` in the run has longer ones, too."""
 MOST_POLICIES: Final = 100
 MOST_RENAMED: Final = 1000
 BUCKET: Final = 'sensor-data'
@@ -42,8 +42,8 @@ class Point(NamedTuple):
 
 
 @dataclass(slots=True)
-class Story:
-    """The state of a mission, folded from its journal's records in their order; the same journal always gives the same story."""
+class MissionState:
+    """The state of a mission, computed from its journal's records in their order; depends on nothing else."""
 
     start: Mapping[str, Any] = field(default_factory=dict)
     end: Mapping[str, Any] = field(default_factory=dict)
@@ -54,17 +54,17 @@ class Story:
     renamed: dict[str, str] = field(default_factory=dict)
     """Artifacts whose names MLflow cannot hold: path in the run -> path that the agent passed."""
     policies: list[tuple[str | None, int]] = field(default_factory=list)
-    """The one that was active at the start and those that followed it, each with the time from which on; None: there was none."""
+    """The active policies in their order, each with the time of its start; None if there was none."""
     first: dict[str, float] = field(default_factory=dict)
     last: dict[str, float] = field(default_factory=dict)
     latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Step and time (ms) of each key's point that MLflow shows: that of the highest step, then of the latest time."""
+    """Step and time (ms) of each key's point that MLflow shows: the one with the highest step, then the latest time."""
     last_ns: int = 0
-    node: Story | None = None
-    """What the node measured beside the agent; where both state the same, the agent's stands."""
+    node: MissionState | None = None
+    """The state of the node's journal; where both have a value, the agent's is used."""
 
     def add(self, record: Mapping[str, Any] | None) -> list[Point]:
-        """Take the next record (None: a damaged one); returns the metric points it stands for."""
+        """Take the next record (None: a damaged one); returns its metric points."""
         if record is None:
             self.counts['damaged'] += 1
             return []
@@ -75,7 +75,7 @@ class Story:
             self.start = record
             self.policies = [(record.get('policy'), time_ns)]
             self._note_latest(DISTANCE, 0, time_ns)
-            return [Point(DISTANCE, 0.0, time_ns // MS, 0)]  # so that every run has one, whatever becomes of it
+            return [Point(DISTANCE, 0.0, time_ns // MS, 0)]  # so that every run has one, however it ends
         if kind == 'metrics':
             step = int(record['s'])
             for key, value in record['m'].items():
@@ -106,7 +106,7 @@ class Story:
 
     @property
     def battery_consumed_pct(self) -> float | None:
-        """First minus last; None where nobody said."""
+        """First minus last; None if unknown."""
         if BATTERY in self.first:
             return self.first[BATTERY] - self.last[BATTERY]
         return self.node.battery_consumed_pct if self.node else None
@@ -130,7 +130,7 @@ class Story:
 
     @property
     def measured_s(self) -> float:
-        """From start to end by a clock that never steps; of an agent that died, by the times of its records."""
+        """From start to end by a clock that never steps; for an agent that was killed, by the times of its records."""
         elapsed_s = self.end.get('elapsed_s')
         if elapsed_s is not None:
             return float(elapsed_s)
@@ -142,7 +142,7 @@ class Story:
 
     @property
     def frames(self) -> int:
-        """Of agent and node."""
+        """Of agent and node together."""
         return self.counts['frame'] + (self.node.counts['frame'] if self.node else 0)
 
     @property
@@ -151,11 +151,11 @@ class Story:
 
     @property
     def policy_names(self) -> str:
-        """Of all policies, in their order; empty where none was active at any time."""
+        """All policies in their order; empty if none was ever active."""
         return named(name for name, _ in self.policies)
 
     def params(self) -> dict[str, str]:
-        """What the run begins with."""
+        """The parameters at the start of the run."""
         return {
             'mission_type': self.start['type'],
             'mission_command': self.start['command'][:MAX_PARAM],
@@ -169,16 +169,16 @@ class Story:
         return {'duration_s': f'{self.duration_s:.3f}', **changed}
 
     def _note_event(self, record: Mapping[str, Any], time_ns: int) -> None:
-        """The first ones, as far as they are short."""
-        said = {'time': iso(time_ns), 'name': record.get('name'), **record.get('data', {})}
-        if len(self.events) < MOST_EVENTS and len(str(said)) <= MOST_EVENT:
-            self.events.append(said)
+        """Keep the first events, if they are short."""
+        event = {'time': iso(time_ns), 'name': record.get('name'), **record.get('data', {})}
+        if len(self.events) < MOST_EVENTS and len(str(event)) <= MOST_EVENT:
+            self.events.append(event)
 
     def _note_latest(self, key: str, step: int, time_ns: int) -> None:
         self.latest[key] = max((step, time_ns // MS), self.latest.get(key, (-MAX_STEP, 0)))
 
     def _final(self, time_ms: int) -> list[Point]:
-        """The values that MLflow shows of a run that has ended: those of ``summary.json``."""
+        """The values that MLflow shows for an ended run: those of ``summary.json``."""
         stated: dict[str, float | None] = {
             'success': float(self.success), 'duration_s': self.duration_s, 'distance_m': self.distance_m,
             DISTANCE: self.distance_m, 'battery_consumed_pct': self.battery_consumed_pct,
@@ -190,8 +190,8 @@ class Story:
         return [self._newest(key, value, time_ms) for key, value in stated.items() if value is not None]
 
     def _newest(self, key: str, value: float, time_ms: int) -> Point:
-        """A point that MLflow shows, whatever agent and node logged under its key."""
-        logged = [story.latest[key] for story in (self, self.node) if story is not None and key in story.latest]
+        """A point that MLflow shows, regardless of what agent and node logged under its key."""
+        logged = [state.latest[key] for state in (self, self.node) if state is not None and key in state.latest]
         step, last_ms = max(logged, default=(-1, 0))
         if step < MAX_STEP:
             return Point(key, value, time_ms, max(step + 1, 0))
@@ -199,68 +199,68 @@ class Story:
 
 
 def run_request(start: Mapping[str, Any]) -> tuple[str, int, dict[str, str]]:
-    """Name, start (ms) and tags of the run of a mission that started so."""
+    """Name, start (ms) and tags of the run of a mission with this first record."""
     tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
     return run_name(start['type'], int(start['t'])), int(start['t']) // MS, tags
 
 
 def named(policies: Iterable[str | None]) -> str:
-    """``go2_patrol@7#..., go2_patrol@6#...``, where none was active ``none``; empty where none ever was."""
+    """``go2_patrol@7#..., none, go2_patrol@6#...``; empty if none was ever active."""
     names = [*policies]
     return ', '.join(name or 'none' for name in names) if any(names) else ''
 
 
-def summary_of(story: Story, mission_id: str, run: Run, sent: MissionSent, pictures: Mapping[str, str]) -> dict[str, Any]:
-    """``summary.json`` of a mission that is over and whose points and files are handed on."""
-    start, end = story.start, story.end
-    node = story.node or Story()
+def summary_of(state: MissionState, mission_id: str, run: Run, sent: MissionSent, pictures: Mapping[str, str]) -> dict[str, Any]:
+    """``summary.json`` of an ended mission, once its points and files were passed on."""
+    start, end = state.start, state.end
+    node = state.node or MissionState()
     return {
         'mission_id': mission_id, 'run_id': run.run_id, 'run_name': run_name(start['type'], int(start['t'])),
         'robot': start['robot'], 'mission_type': start['type'], 'mission_command': start['command'],
-        'policy': start.get('policy'), 'policies': story.policy_names or None,
-        'policy_changes': [{'policy': name, 'time': iso(time_ns)} for name, time_ns in story.policies[1:]],
+        'policy': start.get('policy'), 'policies': state.policy_names or None,
+        'policy_changes': [{'policy': name, 'time': iso(time_ns)} for name, time_ns in state.policies[1:]],
         'start': iso(int(start['t'])), 'end': iso(int(end['t'])), 'start_ns': int(start['t']), 'end_ns': int(end['t']),
-        'result': end['status'], 'success': story.success, 'ended_by': end.get('by', 'agent'),
-        'errors': [*story.errors, *([end['error']] if end.get('error') else [])],
-        'events': story.events,
-        'distance_m': story.distance_m, 'duration_s': story.duration_s, 'battery_consumed_pct': story.battery_consumed_pct,
+        'result': end['status'], 'success': state.success, 'ended_by': end.get('by', 'agent'),
+        'errors': [*state.errors, *([end['error']] if end.get('error') else [])],
+        'events': state.events,
+        'distance_m': state.distance_m, 'duration_s': state.duration_s, 'battery_consumed_pct': state.battery_consumed_pct,
         'stated': {name: end.get(name) for name in ('success', 'distance_m', 'duration_s')},
-        'measured': {'distance_m': story.newest.get(DISTANCE), 'duration_s': story.measured_s},
+        'measured': {'distance_m': state.newest.get(DISTANCE), 'duration_s': state.measured_s},
         'by_node': dict(sorted(node.last.items())),
-        'last': dict(sorted(story.newest.items())),
+        'last': dict(sorted(state.newest.items())),
         'counts': {
-            'metric_points': story.counts['points'], 'camera_frames': story.frames,
-            'trajectories': story.counts['trajectory'], 'artifacts': story.counts['artifact'], 'events': story.counts['event'],
+            'metric_points': state.counts['points'], 'camera_frames': state.frames,
+            'trajectories': state.counts['trajectory'], 'artifacts': state.counts['artifact'], 'events': state.counts['event'],
         },
-        'ledger': _ledger(story, sent),
-        'renamed_artifacts': dict(story.renamed),
+        'ledger': _ledger(state, sent),
+        'renamed_artifacts': dict(state.renamed),
         'pictures': dict(pictures),
-        'data': _places(story, run),
+        'data': _places(state, run),
     }  # fmt: skip
 
 
-def _ledger(story: Story, sent: MissionSent) -> dict[str, Any]:
-    """What became of all that the agent logged: each ``logged`` is the sum of what follows it.
+def _ledger(state: MissionState, sent: MissionSent) -> dict[str, Any]:
+    """What became of everything that the agent logged: each ``logged`` is the sum of the values after it.
 
-    ``not_logged`` is what could not be taken, by reason; ``disk_full`` is not known (null) of an agent that died.
+    ``not_logged`` counts what could not be logged, by reason; ``disk_full`` is unknown (null) if the agent was killed.
     """
-    points, files = story.counts['points'], story.counts['frame'] + story.counts['trajectory']
+    points, files = state.counts['points'], state.counts['frame'] + state.counts['trajectory']
     refused, missing = min(points, sent.refused), min(files, sent.missing)
     return {
         'metric_points': {'logged': points, 'in_run': points - refused, 'refused_by_server': refused},
         'files': {'logged': files, 'spooled': files - missing, 'missing': missing},
-        'not_logged': {**story.refused, 'disk_full': story.end.get('lost')},
-        'damaged_records': story.counts['damaged'],
+        'not_logged': {**state.refused, 'disk_full': state.end.get('lost')},
+        'damaged_records': state.counts['damaged'],
     }
 
 
-def _places(story: Story, run: Run) -> dict[str, Any]:
-    """Where its data are: buckets and prefixes; the node's objects of that time carry the mission's id as metadata."""
-    robot, start, end = story.start['robot'], utc(int(story.start['t'])), utc(int(story.end['t']))
-    name = stamped(story.start['type'], int(story.start['t']))
+def _places(state: MissionState, run: Run) -> dict[str, Any]:
+    """Where its data are: buckets and prefixes; the node's objects of that time have the mission's id in their metadata."""
+    robot, start, end = state.start['robot'], utc(int(state.start['t'])), utc(int(state.end['t']))
+    name = stamped(state.start['type'], int(state.start['t']))
     return {
         'mission': f'{BUCKET}/{robot}/missions/{run.run_id}/',
-        'trajectory': f'{TRAJECTORIES}/{robot}/{name}.csv' if story.has_trajectory else None,
+        'trajectory': f'{TRAJECTORIES}/{robot}/{name}.csv' if state.has_trajectory else None,
         'sensors': {
             'prefix': f'{BUCKET}/{robot}/',
             'days': [f'{start + timedelta(days=day):%Y%m%d}' for day in range((end.date() - start.date()).days + 1)],
