@@ -54,7 +54,8 @@ class NewRun:
     def settle(self, run: Run | None = None, *, is_unreachable: bool = False) -> None:
         """Write down the run, if there is one, and unlock the folder."""
         self.run, self.is_unreachable = run, is_unreachable
-        self.is_settled.set()  # the agent does not wait for the disk: a run that was not written down is found by the mission's id
+        # The agent does not wait for the disk: a run that was not written down is found by the mission's id.
+        self.is_settled.set()
         try:
             if run is not None:
                 self.folder.set_run(run)

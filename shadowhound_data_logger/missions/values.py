@@ -40,8 +40,8 @@ MAX_NAME_BYTES: Final = 240
 MAX_EXTENSION: Final = 16
 _ODD: Final = re.compile(r'[\x00-\x1f\x7f-\x9f#?\\\ud800-\udfff]|%(?=[0-9A-Fa-f]{2})|=(?=[0-9A-F]{2})|^ ')
 """What does not arrive, tested with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX`` until
-none is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and a
-leading blank."""
+none is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and
+a leading blank."""
 _ODD_FOLDER: Final = re.compile(rf"{_ODD.pattern}|'|^\.(?=\.)")
 """MLflow puts a folder into a query between quotes, and takes ``..x`` for a way out."""
 _SCHEME: Final = re.compile(r'^([A-Za-z][A-Za-z0-9+.-]*):')

@@ -7,9 +7,9 @@ fails); Jazzy and Kilted tell the two forms apart. Source: rosbag2_storage, meta
 from __future__ import annotations
 
 import functools
-import json
+import io
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from shadowhound_data_logger.core.untrusted import from_yaml
@@ -18,8 +18,8 @@ from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 VERSION: Final = 8
 STORAGE: Final = 'mcap'
 _INFINITE_NS: Final = (1 << 63) - 1
-_PLAIN: Final = re.compile(r'(?!(true|false|null|yes|no|on|off|y|n)$)[a-z_]+')
-"""Keys that need no quotes: YAML 1.1 reads the others as something else, or may."""
+WIDTH: Final = 1 << 30
+"""Of a line: none is folded."""
 
 _POLICIES: Final = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
@@ -74,7 +74,7 @@ def bagfile_information(
 def offered_qos(profiles: Iterable[Any]) -> str:
     """The QoS of a topic's publishers (rclpy's QoSProfile, or what looks like one) as rosbag2 keeps it with the topic."""
     described = [_profile(profile) for profile in profiles]
-    return '\n'.join(_sequence(described)) if described else ''
+    return to_yaml(described).rstrip('\n') if described else ''
 
 
 def in_numbers(qos: str) -> str:
@@ -92,10 +92,7 @@ def _in_numbers(qos: str) -> str:
     if not isinstance(profiles, list) or not all(isinstance(profile, dict) for profile in profiles):
         return qos
     numbered = [{str(name): _number(name, value) for name, value in profile.items()} for profile in profiles]
-    try:
-        return '\n'.join(_sequence(numbered))
-    except TypeError:  # a date, say, which no profile has
-        return qos
+    return to_yaml(numbered).rstrip('\n')
 
 
 _cached_in_numbers = functools.lru_cache(256)(_in_numbers)
@@ -107,9 +104,24 @@ def _number(policy: object, value: Any) -> Any:
     return words.index(value) if value in words else value
 
 
-def to_yaml(value: Mapping[str, Any]) -> str:
+def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
     """Mappings, sequences, strings and integers as block YAML; strings in double quotes, so that none is misread."""
-    return ''.join(f'{line}\n' for line in _mapping(value))
+    from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not
+
+    yaml, stream = YAML(), io.StringIO()
+    yaml.width = WIDTH
+    yaml.dump(_quoted(value), stream)
+    return stream.getvalue()
+
+
+def _quoted(value: Any) -> Any:
+    from ruamel.yaml.scalarstring import DoubleQuotedScalarString  # noqa: PLC0415
+
+    if isinstance(value, Mapping):
+        return {key: _quoted(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_quoted(inner) for inner in value]
+    return DoubleQuotedScalarString(value) if isinstance(value, str) else value
 
 
 def _topics(slices: Sequence[SliceInfo]) -> list[dict[str, Any]]:
@@ -159,34 +171,3 @@ def _duration(nanoseconds: int) -> dict[str, int]:
     """A duration of 0 means that none was set, which rosbag2 writes as rmw's infinity: both mean the default."""
     seconds, rest = divmod(nanoseconds or _INFINITE_NS, 10**9)
     return {'sec': seconds, 'nsec': rest}
-
-
-def _mapping(value: Mapping[str, Any]) -> Iterator[str]:
-    for key, inner in value.items():
-        yield from _entry(f'{key if _PLAIN.fullmatch(key) else _scalar(key)}:', inner)
-
-
-def _sequence(value: Sequence[Any]) -> Iterator[str]:
-    for inner in value:
-        if isinstance(inner, Mapping) and inner:
-            lines = _mapping(inner)
-            yield f'- {next(lines)}'
-            yield from (f'  {line}' for line in lines)
-        else:
-            yield from _entry('-', inner)
-
-
-def _entry(head: str, value: Any) -> Iterator[str]:
-    if isinstance(value, Mapping) and value:
-        yield head
-        yield from (f'  {line}' for line in _mapping(value))
-    elif isinstance(value, list) and value:
-        yield head
-        yield from (f'  {line}' for line in _sequence(value))
-    else:
-        yield f'{head} {_scalar(value)}'
-
-
-def _scalar(value: Any) -> str:
-    """JSON's scalars and its empty mapping and sequence are YAML's. Outside ASCII no escapes: YAML's differ from JSON's."""
-    return json.dumps(value, ensure_ascii=False)

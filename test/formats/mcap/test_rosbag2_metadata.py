@@ -125,7 +125,6 @@ def test_qos_in_words_becomes_numbers() -> None:
         'history: of a robot',
         '- [',
         '\x00',
-        '- durability: volatile\n  on: 2025-10-18',
         '- &a {history: *a}',
     ):
         assert in_numbers(text) == text
