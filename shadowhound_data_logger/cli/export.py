@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.datasets.features import ExportOptions
     from shadowhound_data_logger.datasets.imports import Demonstration
     from shadowhound_data_logger.datasets.transfer import DatasetPlace
-    from shadowhound_data_logger.datasets.verify import Proved, Seen
+    from shadowhound_data_logger.datasets.verify import DatasetUse, VerifyResult
 
 SCHEME: Final = 's3://'
 SHOWN: Final = 30
@@ -243,10 +243,10 @@ def _exporting() -> Iterator[None]:
 def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
     for mission, streams in list(result.streams.items())[:SHOWN]:
         yield plain(f'  {mission}')
-        yield from (plain(f'    {name}: {told}') for name, told in streams.items())
-    for told in result.added[:SHOWN]:
-        stale = max((each['stale_share'] for each in told['streams'].values()), default=0.0)
-        yield plain(f'  {told["mission_id"]}: {number(told["frames"])} frames, {stale:.1%} stale')
+        yield from (plain(f'    {name}: {source}') for name, source in streams.items())
+    for episode in result.added[:SHOWN]:
+        stale = max((each['stale_share'] for each in episode['streams'].values()), default=0.0)
+        yield plain(f'  {episode["mission_id"]}: {number(episode["frames"])} frames, {stale:.1%} stale')
     for mission, why in list(result.refused.items())[:SHOWN]:
         yield plain(f'  {mission} is refused: {why}', 'red')
     for mission, why in list(result.waiting.items())[:SHOWN]:
@@ -345,7 +345,7 @@ def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool)
 
     check_name(arm, '--arm')
     with _exporting(), the_store() as store:
-        found = library.bring(demonstrations, arm, store)
+        found = library.import_episodes(demonstrations, arm, store)
     if is_json:
         print_json(asdict(found))
         return exit_code(finding=found.refused)
@@ -359,7 +359,7 @@ def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool)
     return exit_code(finding=found.refused)
 
 
-def _proof(found: Proved, place: str) -> Iterator[Text]:
+def _proof(found: VerifyResult, place: str) -> Iterator[Text]:
     for wrong in found.wrong[:SHOWN]:
         yield plain(f'  {wrong}', 'red')
     said = f'{number(len(found.wrong))} things are wrong' if found.wrong else 'all is as it was written'
@@ -380,27 +380,27 @@ def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCod
     """
     with _exporting():
         from shadowhound_data_logger.lake.training import runs_trained_on  # noqa: PLC0415
-    found = list(_seen(key, places))
+    found = list(_uses(key, places))
     runs, unknown = dict[str, list[str]](), None
     try:
         runs = runs_trained_on(digest for each in found for digest in each.digests)
     except TrackingError as error:
         unknown = error
         click.echo(f'Which models were trained on it is not known: {error}', err=True)
-    told = [
+    uses = [
         {**asdict(each), 'runs': None if unknown else sorted({run for digest in each.digests for run in runs[digest]})}
         for each in found
     ]
     if as_json:
-        print_json(told)
+        print_json(uses)
         return exit_code(finding=unknown)
     lines = []
     if (date := _date_of(key)) is not None:
         lines.append(plain(f'It was deleted from the store on {date} (lake prune).'))
-    for each in told:
+    for each in uses:
         lines.append(plain(f'{each["where"]}: {number(each["frames"])} frames of {", ".join(each["missions"])}'))
         lines += [plain(f'  trained on it: run {run}') for run in each['runs'] or ()]
-    print_lines(*lines, *([] if told else [plain(f'No dataset has values of {key}.')]))
+    print_lines(*lines, *([] if uses else [plain(f'No dataset has values of {key}.')]))
     return exit_code(finding=unknown)
 
 
@@ -438,7 +438,7 @@ def _copied() -> list[DatasetPlace]:
     return [DatasetPlace.of(f'{SCHEME}{each.as_posix()}') for each in mine]
 
 
-def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
+def _uses(key: str, places: tuple[str, ...]) -> Iterator[DatasetUse]:
     from shadowhound_data_logger.datasets import verify as library  # noqa: PLC0415
     from shadowhound_data_logger.datasets.transfer import DatasetPlace  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import Bucket  # noqa: PLC0415
@@ -449,11 +449,11 @@ def _seen(key: str, places: tuple[str, ...]) -> Iterator[Seen]:
     if not places:
         folders, stored = all_datasets()
     for folder in folders:
-        if (seen := library.seen_in_folder(folder, key)) is not None:
-            yield seen
+        if (use := library.use_in_folder(folder, key)) is not None:
+            yield use
     for place in stored:
-        if (seen := library.seen_in_store(Bucket(settings, place.bucket), place, key)) is not None:
-            yield seen
+        if (use := library.use_in_store(Bucket(settings, place.bucket), place, key)) is not None:
+            yield use
 
 
 @export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
@@ -502,6 +502,6 @@ def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> Exit
     if as_json:
         print_json(dropped)
     else:
-        told = [plain(f'{where}: dropped; its digest is {digest[:16]} now.') for where, digest in dropped.items()]
-        print_lines(*told or [plain(f'No dataset has an episode of {mission}.', 'yellow')])
+        lines = [plain(f'{where}: dropped; its digest is {digest[:16]} now.') for where, digest in dropped.items()]
+        print_lines(*lines or [plain(f'No dataset has an episode of {mission}.', 'yellow')])
     return exit_code(finding=not dropped)

@@ -1,4 +1,4 @@
-"""``shadowhound-data label``: what people say of the data, kept beside them in layers that are never changed."""
+"""``shadowhound-data label``: labels on the data, stored next to the data in layers that are never changed."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
 
 SHOWN: Final = 100
 _robot = click.option('--robot', metavar='NAME', callback=robot_name, help='Whose data  [default: SHADOWHOUND_ROBOT]')
-_by = click.option('--by', metavar='NAME', help='Who says so  [default: the user of this machine]')
+_by = click.option('--by', metavar='NAME', help='Who labels  [default: the user of this machine]')
 
 
 @click.group(epilog=examples('label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31', 'label list'))
 def label() -> None:
-    """Label times, objects and boxes in pictures.
+    """Label times, objects and boxes in images.
 
-    Labels lie in the store, beside what they are about. Nothing is overwritten: a removal is added, too. `query`, `fetch`,
+    Labels are in the store, next to the data. Nothing is overwritten: a removal is added, too. `query`, `fetch`,
     `search` and `export` take --label NAME.
     """
 
@@ -64,12 +64,12 @@ def label() -> None:
 )
 @click.argument('name')
 @_robot
-@click.option('--since', metavar='TIME', help='From then on: 2h, 2026-11-20T12:30 (UTC).')
-@click.option('--until', metavar='TIME', help='Until then, which is included.')
+@click.option('--since', metavar='TIME', help='Start: 2h ago, 2026-11-20T12:30 (UTC).')
+@click.option('--until', metavar='TIME', help='End, included.')
 @click.option('--key', metavar='KEY', help='Of this object instead, as `query --format keys` prints it.')
-@click.option('--box', metavar='X,Y,W,H', help='Of this box in it, in pixels from the left upper corner.')
+@click.option('--box', metavar='X,Y,W,H', help='Of this box in it, in pixels from the upper left corner.')
 @ranges_option
-@click.option('--note', default='', metavar='TEXT', help='Why, or what else there is to say.')
+@click.option('--note', default='', metavar='TEXT', help='A remark.')
 @_by
 @as_json
 def label_add(*, name: str, robot: str | None, since: str | None, until: str | None, key: str | None, box: str | None,  # noqa: PLR0913 - one an option
@@ -105,7 +105,7 @@ def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool)
     """Import labels from a CSV, or boxes from a COCO file.
 
     A CSV names its columns: label, since and until, or key; and any of robot bucket x y width height note. The file names of a
-    COCO file are keys, as `fetch` lays pictures out. Exit code 1 when the catalog lacks one of them: the others are imported.
+    COCO file are keys, as `fetch` arranges images. Exit code 1 if the catalog lacks one of them: the others are imported.
     """
     body = file.read(MOST_DOCUMENT_BYTES + 1)
     now_ns = SystemClock.of_this_machine().wall_ns()
@@ -120,10 +120,10 @@ def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool)
 
 @label.command('list', epilog=examples('label list', 'label list --label stairs --json'))
 @_robot
-@click.option('--label', 'name', metavar='NAME', help='Of this name.')
+@click.option('--label', 'name', metavar='NAME', help='Only this label.')
 @as_json
 def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCode:
-    """Show the labels that stand."""
+    """Show the labels in force."""
     with asking():
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
@@ -155,7 +155,7 @@ _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', '
 @label.command('remove', epilog=examples('label remove 3f2a9c0d11e45b67', 'label remove --label stairs --robot thor'))
 @click.argument('ids', nargs=-1)
 @_robot
-@click.option('--label', 'name', metavar='NAME', help='All of this name.')
+@click.option('--label', 'name', metavar='NAME', help='All labels with this name.')
 @_by
 @as_json
 def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by: str | None, as_json: bool) -> ExitCode:
@@ -228,7 +228,7 @@ def _named(robot: str | None) -> str:
 
 
 def _only_robot() -> str:
-    """The one that the store has. Raises BadUsage where there are several."""
+    """The only robot of the store. Raises BadUsage if there are several."""
     from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
@@ -239,7 +239,7 @@ def _only_robot() -> str:
 
 
 def _place(key: str, robot: str) -> tuple[str, str]:
-    """Bucket and key of an object, which may be told as BUCKET/KEY."""
+    """Bucket and key of an object, which may be given as BUCKET/KEY."""
     from shadowhound_data_logger.formats.rows.schema import BUCKET  # noqa: PLC0415
 
     bucket, _, rest = key.partition('/')

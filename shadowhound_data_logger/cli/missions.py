@@ -1,4 +1,4 @@
-"""``shadowhound-data missions``: what was logged as missions on this machine, how far it is sent, and sending the rest."""
+"""``shadowhound-data missions``: the missions logged on this machine, how far they are sent, and sending the rest."""
 
 from __future__ import annotations
 
@@ -34,16 +34,18 @@ from shadowhound_data_logger.missions.overview import ACTIVE, export, find, is_s
 
 POLL_S: Final = 0.5
 STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}
-"""Of results; any other wants a look."""
+"""By result; any other is red."""
 COLUMNS: Final = ('time', 'kind', 'key', 'value', 'step', 'source')
 
 
 def _folder(_: click.Context, __: click.Parameter, wanted: str) -> MissionFolder:
     found = find(the_home(), wanted)
     if not found:
-        raise BadUsage(f'no mission here has the id {wanted!r}, nor has its run', 'shadowhound-data missions list shows the ids')
+        raise BadUsage(
+            f'there is no mission or run with the id {wanted!r} on this machine', 'shadowhound-data missions list shows the ids'
+        )
     if len(found) > 1:
-        raise BadUsage(f'{wanted!r} begins the ids of {len(found)} missions', 'give more of the id')
+        raise BadUsage(f'the ids of {len(found)} missions begin with {wanted!r}', 'give more of the id')
     return found[0]
 
 
@@ -63,7 +65,7 @@ def missions() -> None:
 def list_(*, as_json: bool) -> ExitCode:
     """List the missions, the newest last.
 
-    Exit code 1 when a mission that is over was not sent.
+    Exit code 1 if an ended mission is not sent.
     """
     where = the_home()
     found = overviews(where)
@@ -82,11 +84,11 @@ def list_(*, as_json: bool) -> ExitCode:
 def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
     """Show everything about one mission.
 
-    Exit code 1 when it is over and not sent; the output says what is left, and why.
+    Exit code 1 if it has ended and is not sent; the output shows what is left, and why.
     """
     found = overview(folder)
     if found is None:
-        raise BadUsage(f'{folder.path} has no mission in it', 'shadowhound-data missions list shows those that are whole')
+        raise BadUsage(f'{folder.path} does not contain a mission', 'shadowhound-data missions list shows the missions')
     if as_json:
         print_json(found)
     else:
@@ -99,9 +101,9 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
 @click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
 @as_json
 def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCode:
-    """Send what is not sent yet, and wait for it.
+    """Send what is unsent, and wait for it.
 
-    Exit code 1 when something is left after the deadline; sending continues for ten more minutes in the background.
+    Exit code 1 if something is left after the deadline; sending continues for ten more minutes in the background.
     """
     where = the_home()
     if not _late(overviews(where)):
@@ -158,12 +160,12 @@ def _rows(found: Mapping[str, Any]) -> Iterator[tuple[object, ...]]:
 
 
 def _late(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those that are over and not sent."""
+    """The ended missions that are not sent."""
     return [each for each in found if each['result'] != ACTIVE and not each['complete']]
 
 
 def _wait(where: Path, end_s: float) -> list[dict[str, Any]]:
-    """What is left in the end."""
+    """Returns what is left."""
     with progress(of='seconds') as bar:
         while (left := _late(overviews(where))) and time.monotonic() < end_s:
             records = sum(each['unsent']['records'] for each in left)
@@ -186,7 +188,7 @@ def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[Rende
     if late:
         how = 'being sent' if is_sending else 'shadowhound-data missions resume sends it'
         yield ''
-        yield Text(f'{number(len(late))} not sent whole: {how}', 'yellow')
+        yield Text(f'{number(len(late))} not completely sent: {how}', 'yellow')
         yield from _reason(late[-1])
 
 
@@ -207,15 +209,15 @@ def _page(found: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield ''
         yield value_table('Last values', {name: f'{value:g}' for name, value in found['last'].items()})
     yield from (plain(f'Error: {error}', 'red') for error in found['errors'])
-    yield from (plain(f'Left out: {count} by {reason}', 'yellow') for reason, count in found['refused'].items())
+    yield from (plain(f'Not logged: {count} by {reason}', 'yellow') for reason, count in found['refused'].items())
     yield ''
     yield from _reason(found)
 
 
 def _reason(found: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """Whether it is sent, and if not, what is left and why."""
+    """Whether it is sent; otherwise what is left, and why."""
     if found['complete']:
-        yield Text.assemble(('Sent', 'green'), ': the run and the spool have all of it.')
+        yield Text.assemble(('Sent', 'green'), ': everything is in the run and the spool.')
     else:
         unsent = ', '.join(f'{number(count)} {name}' for name, count in found['unsent'].items() if count) or 'the end of it'
         yield plain(f'{found["mission_id"]}: not sent yet: {unsent}', 'yellow')

@@ -1,4 +1,4 @@
-"""``shadowhound-data pull``: asks a robot for what it keeps, and tells what becomes of that."""
+"""``shadowhound-data pull``: requests kept data from a robot, and reports how far the request is."""
 
 from __future__ import annotations
 
@@ -34,20 +34,22 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
 @question
 @click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters.")
 @click.option('--priority', type=click.IntRange(0, 9), default=DEFAULT_PRIORITY, show_default=True, help='0 is sent first.')
-@click.option('--expires', metavar='AGE', default='7d', show_default=True, help='Ask for so long, such as 2h or 30d.')
-@click.option('--by', metavar='NAME', help='Who asks  [default: the user]')
+@click.option(
+    '--expires', metavar='AGE', default='7d', show_default=True, help='How long the request is valid, such as 2h or 30d.'
+)
+@click.option('--by', metavar='NAME', help='Who requests it  [default: the user]')
 @click.option('--wait', 'is_waiting', is_flag=True, help='Wait for the last answer, and until `query` knows what came.')
-@click.option('--dry-run', is_flag=True, help='Say what it would ask for.')
-@click.option('--list', 'is_listing', is_flag=True, help='Say what is asked for, and how far that is.')
-@click.option('--cancel', metavar='ID', help='Take a request back.')
+@click.option('--dry-run', is_flag=True, help='Only print what would be requested.')
+@click.option('--list', 'is_listing', is_flag=True, help='List the requests and how far they are.')
+@click.option('--cancel', metavar='ID', help='Cancel a request.')
 @as_json
 def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: str, by: str | None, is_waiting: bool,  # noqa: PLR0913 - one an option
          dry_run: bool, is_listing: bool, cancel: str | None, as_json: bool) -> ExitCode:  # fmt: skip
-    """Ask a robot for what it keeps (ship: on_request).
+    """Request data that a robot keeps (ship: on_request).
 
-    It says how many objects and bytes that are, and asks through the store; the robot looks every ten seconds.
+    It prints how many objects and bytes that is and puts the request into the store; the robot polls every ten seconds.
 
-    Exit code 1 where something of it is lost, or the robot refused.
+    Exit code 1 if some of it is lost, or the robot refused.
     """
     with asking():
         from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while
@@ -67,48 +69,48 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         with the_store() as store:
             if cancel is not None:
                 lake.cancel(store, source, robot, cancel, by=name)
-                click.echo(f'Asked {robot} to leave request {cancel}.', err=True)
+                click.echo(f'Asked {robot} to cancel request {cancel}.', err=True)
                 return ExitCode.FINE
             want, asked = _want(source, robot, flags, bag, left_out)
             table, want = _named(lake.known(source, robot, want, left_out), want, asked)
             rows = table.to_pylist()
             if not rows:
                 _check_names(source, robot, flags, bag, left_out)
-            said = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
+            offered = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
             if not as_json:
-                click.echo(_found_sentence(said))
+                click.echo(_found_sentence(offered))
             answer: dict[str, Any] | None = None
-            said['id'] = None
-            if not dry_run and said['objects']:
+            offered['id'] = None
+            if not dry_run and offered['objects']:
                 request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
-                said['id'] = request.id
+                offered['id'] = request.id
                 if not as_json:
-                    click.echo(f'Asked for them: request {request.id}.')
+                    click.echo(f'Requested: request {request.id}.')
                 if is_waiting:
-                    answer = lake.wait(source, robot, request.id, tell=_Told(is_quiet=as_json), made_ns=request.made_ns)
+                    answer = lake.wait(source, robot, request.id, tell=AnswerPrinter(is_quiet=as_json), made_ns=request.made_ns)
                     if answer['state'] == 'done':
                         lake.await_rows(source, robot, want, rows, left_out)
     if as_json:
-        print_json({**said, 'answer': answer})
+        print_json({**offered, 'answer': answer})
     code = report_skipped(left_out)
     return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
 
 
-def _found_sentence(said: Mapping[str, Any]) -> str:
-    """What the robot keeps, and what it has lost."""
-    text = f'{said["robot"]} keeps {number(said["objects"])} such objects, {volume(said["bytes"])}'
-    if said['lost']:
-        reasons = ', '.join(f'{reason} {count:,}' for reason, count in said['lost'].items())
-        text += f'; {sum(said["lost"].values()):,} are lost ({visible(reasons)})'
-    if said['objects'] and said['seconds'] is None:
-        text += '. How long that takes is not known: it has told no pace of its uploads yet'
-    elif said['objects']:
-        text += f'. At its pace, {said["mbps"]:.1f} Mbit/s, that takes {duration(said["seconds"])}'
+def _found_sentence(offered: Mapping[str, Any]) -> str:
+    """What the robot keeps and what it has lost."""
+    text = f'{offered["robot"]} keeps {number(offered["objects"])} such objects, {volume(offered["bytes"])}'
+    if offered['lost']:
+        reasons = ', '.join(f'{reason} {count:,}' for reason, count in offered['lost'].items())
+        text += f'; {sum(offered["lost"].values()):,} are lost ({visible(reasons)})'
+    if offered['objects'] and offered['seconds'] is None:
+        text += '. How long that takes is unknown: it has not reported the pace of its uploads yet'
+    elif offered['objects']:
+        text += f'. At its pace, {offered["mbps"]:.1f} Mbit/s, that takes {duration(offered["seconds"])}'
     return f'{text}.'
 
 
-class _Told:
-    """Says each answer once, on standard error."""
+class AnswerPrinter:
+    """Prints each answer once, on standard error."""
 
     def __init__(self, *, is_quiet: bool) -> None:
         self._is_quiet = is_quiet
@@ -121,7 +123,7 @@ class _Told:
 
 
 def _sentence(answer: Mapping[str, Any]) -> str:
-    """What an answer says."""
+    """An answer as a sentence."""
     outcomes = answer.get('outcomes')
     known = outcomes if isinstance(outcomes, dict) else {}
     parts = [f'{state} {each.get("objects")}' for state, each in known.items() if isinstance(each, dict)]
@@ -132,7 +134,7 @@ def _sentence(answer: Mapping[str, Any]) -> str:
 
 
 def _is_finding(answer: Mapping[str, Any]) -> bool:
-    """Whether something of a request did not come, or never will."""
+    """Whether something of a request did not arrive, or never will."""
     return answer['state'] != 'done' or bool(answer.get('lost'))
 
 
@@ -145,25 +147,25 @@ def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
     table = plain_table('', ('request', 'by', 'priority', 'state', 'objects', 'delivered'), {'request', 'by', 'state'})
     table.title = None
     for one in found:
-        told = lake.told_by(one.answer) if one.answer else None
-        cells = (one.id, one.by, one.priority, one.state, *((told.objects, told.sent) if told else ('-', '-')))
+        counts = lake.told_by(one.answer) if one.answer else None
+        cells = (one.id, one.by, one.priority, one.state, *((counts.objects, counts.sent) if counts else ('-', '-')))
         table.add_row(*(plain(str(cell)) for cell in cells))
-    print_page(*([table] if found else ['Nothing is asked for.']))
+    print_page(*([table] if found else ['Nothing is requested.']))
     return ExitCode.FINE
 
 
 def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, left_out: Any) -> tuple[KeptFilter, Wanted]:
-    """What the flags ask for, in words that a robot understands; and all that they say, times of labels among it."""
+    """The request of the flags, as a robot understands it, and the complete query, with the times of labels."""
     from shadowhound_data_logger.lake import labels, select  # noqa: PLC0415 - pyarrow
 
     if not {'success', 'policy'}.isdisjoint(flags):
-        raise BadUsage('a robot does not know how missions ended, or began', 'name the --mission')
+        raise BadUsage('a robot cannot select by the result or the policy of a mission', 'name the --mission')
     asked = select.wanted(time.time_ns(), **flags)
     sensor, patterns = asked.sensor, tuple[str, ...]()
     if bag is not None:
         if not _BAG.fullmatch(bag) or sensor not in {None, BAG_SENSOR}:
             raise BadUsage(
-                f'--bag {bag!r} is not the name of a bag, or another sensor is asked for', '`shadowhound-data bag list`'
+                f'--bag {bag!r} is not the name of a bag, or another sensor is requested', '`shadowhound-data bag list`'
             )
         sensor, patterns = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
     asked = labels.labelled(source, asked, left_out)
@@ -172,7 +174,7 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
         mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,
     )  # fmt: skip
     if not want.to_json() and asked.where is None:
-        raise BadUsage('nothing says what to ask for', "name a --sensor, a --bag or a time; --bag '*' is all bags")
+        raise BadUsage('nothing is requested', "name a --sensor, a --bag or a time; --bag '*' is all bags")
     return want, asked
 
 
@@ -191,7 +193,7 @@ def _check_names(source: Any, robot: str, flags: Mapping[str, Any], bag: str | N
 
 
 def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]:
-    """The rows that SQL and times choose, which a robot is asked for by name."""
+    """The rows that SQL and times select, which are requested by name."""
     from shadowhound_data_logger.lake import query  # noqa: PLC0415 - the extra lake
 
     if asked.where is None and not asked.chosen:
@@ -199,7 +201,7 @@ def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]
     rows = query.within_chosen(rows, asked)
     rows = rows if asked.where is None else query.chosen(rows, asked.where)
     if len(rows) > MAX_KEYS:
-        raise BadUsage(f'this chooses {len(rows):,} objects: more than {MAX_KEYS:,} cannot be asked for by name', 'ask for less')
+        raise BadUsage(f'this chooses {len(rows):,} objects: more than {MAX_KEYS:,} cannot be requested by name', 'request less')
     return rows, replace(want, patterns=(), keys=frozenset(rows['key'].to_pylist()))
 
 

@@ -1,4 +1,4 @@
-"""How far another machine's clock is from the robot's, and how well that is known: from events of which both told the time.
+"""The offset of another machine's clock from the robot's, and its uncertainty: from events that both machines timed.
 
 Such an event is a pair of times: ``sensor_msgs/TimeReference`` (``header.stamp`` by the robot's clock, ``time_ref`` by the
 other), or a line of a file. Between pairs the other clock runs evenly, up to ``MOST_DRIFT`` away from the robot's.
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 MOST_DRIFT: Final = 200e-6
 """Of two quartz clocks: each is within 100 ppm of its rate, most are within 30."""
 NEAR_NS: Final = 600 * SECOND
-"""Pairs that are farther from an episode say nothing of it."""
+"""Pairs farther from an episode are not used."""
 LEAST_SPAN_NS: Final = 5 * SECOND
-"""Of pairs from which a drift is told: over less, a tenth of a millisecond of noise would be 20 ppm."""
+"""The shortest span of pairs from which a drift is computed: over less, 0.1 ms of noise would be 20 ppm."""
 LEAST_PAIRS: Final = 5
 SHARE: Final = 95
-"""Percent of the pairs that lie within the uncertainty."""
+"""Percent of the pairs within the uncertainty."""
 COLUMNS: Final = ('robot_ns', 'arm_ns')
 
 
@@ -53,13 +53,13 @@ class ClockOffset:
         """The other way round."""
         return np.asarray(robot_ns + self.offset_ns + np.rint((robot_ns - self.at_ns) * self.drift).astype(np.int64))
 
-    def told(self) -> dict[str, Any]:
-        """As ``meta/episodes`` has it."""
+    def as_json(self) -> dict[str, Any]:
+        """For ``meta/episodes``."""
         return asdict(self)
 
 
 def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffset:
-    """Of an episode; ``pairs`` is (n, 2), the robot's time and the other's of each event. Raises LakeError where nobody knows.
+    """Of an episode; ``pairs`` is (n, 2), the robot's time and the other's of each event. Raises LakeError if it cannot be known.
 
     The uncertainty is how far 95 % of the pairs are from the line through them, and ``MOST_DRIFT`` for the time from the
     nearest pair to the end of the episode; where the pairs are too few or too near to each other for a line, from all of them.
@@ -68,7 +68,7 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
     robot = pairs[:, 0]
     near = pairs[(robot >= begin_ns - NEAR_NS) & (robot <= end_ns + NEAR_NS)]
     if not len(near):
-        raise LakeError("the offset of the arm's clock is not known: no event of which both machines told the time")
+        raise LakeError("the offset of the arm's clock is not known: no event was timed by both machines")
     near = near[np.argsort(near[:, 0], kind='stable')]
     at = int(near[len(near) // 2, 0])
     times, ahead = (near[:, 0] - at).astype(np.float64), near[:, 1] - near[:, 0]
@@ -79,11 +79,13 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
     if is_line:
         drift, offset = np.polyfit(times, rest, 1)
         if abs(drift) > MOST_DRIFT:
-            raise LakeError(f"the arm's clock is not known: it would run {drift * 1e6:.0f} ppm too fast, or it was set meanwhile")
+            raise LakeError(
+                f"the arm's clock is not known: it would run {drift * 1e6:.0f} ppm too fast, or it was set during that time"
+            )
     spread = float(np.percentile(np.abs(rest - offset - drift * times), SHARE))
     if is_line:
         beyond = max(0, int(near[0, 0]) - begin_ns, end_ns - int(near[-1, 0]))
-    else:  # no line: whatever the clock may have done since the farthest of them
+    else:  # no line: the clock may have drifted since the farthest of them
         beyond = max(abs(int(near[0, 0]) - end_ns), abs(begin_ns - int(near[-1, 0])))
     return ClockOffset(at, middle + round(float(offset)), float(drift), round(spread + MOST_DRIFT * beyond), len(near))
 

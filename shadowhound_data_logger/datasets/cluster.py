@@ -1,4 +1,4 @@
-"""Episodes made side by side on a Ray cluster, a mission a worker. This machine alone writes the data set.
+"""Makes episodes in parallel on a Ray cluster, one mission per worker. Only this machine writes the dataset.
 
 A worker reads the store itself, makes the episode in a folder of its own, and hands its files over in pieces: the machines need
 no disk in common. These are Ray's actors and not Daft's DataFrame, whose row would be a whole episode with its videos in memory;
@@ -27,20 +27,20 @@ import shadowhound_data_logger
 from shadowhound_data_logger.core.durable_files import fingerprint, flock, lock, replacing
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.datasets.episodes import TOLD, build
+from shadowhound_data_logger.datasets.episodes import EPISODE_JSON, build
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 
 ATTEMPTS: Final = 3
-"""Workers that a mission may lose before the export gives it up."""
+"""Workers that may fail on a mission before the export gives up on it."""
 PREFIX: Final = 'shadowhound-export-'
 REACH_S: Final = 10.0
 PIECE_BYTES: Final = 8 << 20
 LIBRARIES: Final = ('av', 'numpy', 'pillow', 'pyarrow', 'simplejpeg')
-"""What decides which bytes an episode has."""
+"""What determines the bytes of an episode."""
 
 EpisodeJob = tuple[EpisodePlan, ExportOptions, int, StoreSettings, Path]
-"""What ``build`` takes; the folder is one of this machine."""
+"""The arguments of ``build``; the folder is on this machine."""
 Files = Mapping[str, tuple[int, str]]
 """Name -> bytes and SHA-256."""
 
@@ -49,18 +49,18 @@ class Builder:
     """Lives in a worker. For each mission: ``build``, ``read`` its files, ``close``."""
 
     def __init__(self) -> None:
-        """Takes away what workers of this machine left when they were killed: one that lives has a lock on its folder."""
+        """Removes the folders of killed workers of this machine: a running one has a lock on its folder."""
         for left in Path(gettempdir()).glob(f'{PREFIX}*'):
             with suppress(OSError), flock(left / 'lock', wait=False) as is_dead:
                 if is_dead:
                     rmtree(left)
 
     def build(self, job: tuple[EpisodePlan, ExportOptions, int, StoreSettings], wanted: Mapping[str, str]) -> Files:
-        """Raises LakeError where this machine would make other bytes, StoreError, OSError."""
+        """Raises LakeError if this machine would make other bytes, StoreError, OSError."""
         here = made_with()
         if other := [name for name in wanted if here[name] != wanted[name]]:
-            told = ', '.join(f'{name} {here[name]} instead of {wanted[name]}' for name in other)
-            raise LakeError(f'the worker {platform.node()} has {told}: its episodes would have other bytes',
+            differences = ', '.join(f'{name} {here[name]} instead of {wanted[name]}' for name in other)
+            raise LakeError(f'the worker {platform.node()} has {differences}: its episodes would have other bytes',
                             remedy='install the same versions on all machines of the cluster')  # fmt: skip
         new = Path(mkdtemp(prefix=f'new-{PREFIX}'))
         self._lock = (new / 'lock').open('wb')
@@ -76,13 +76,13 @@ class Builder:
             return file.read(PIECE_BYTES)
 
     def close(self) -> None:
-        """The files are gone afterwards."""
+        """Delete the files."""
         rmtree(self._folder.parent, ignore_errors=True)
         self._lock.close()
 
 
 def made_with() -> dict[str, str]:
-    """What has to be the same on all machines for the same bytes."""
+    """What must be the same on all machines for the same bytes."""
     return {'architecture': platform.machine(), **{name: version(name) for name in LIBRARIES}}
 
 
@@ -99,11 +99,11 @@ class Cluster:
         ``workers`` episodes are made at a time, as many as there are cores in the cluster by default. A mission whose worker dies
         is given to another one. Raises LakeError where that did not help and where there is no such cluster, StoreError, OSError.
         """
-        todo = [job for job in jobs if not (job[-1] / TOLD).is_file()]
+        todo = [job for job in jobs if not (job[-1] / EPISODE_JSON).is_file()]
         if todo:
-            with _joined(self.address) as cores, redirect_stdout(sys.stderr):  # where Ray tells of dead workers
+            with _joined(self.address) as cores, redirect_stdout(sys.stderr):  # where Ray reports failed workers
                 _build_all(todo, workers or cores, say)
-        return [json.loads((job[-1] / TOLD).read_text(encoding='utf-8')) for job in jobs]
+        return [json.loads((job[-1] / EPISODE_JSON).read_text(encoding='utf-8')) for job in jobs]
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def _joined(address: str | None) -> Iterator[int]:
     import ray  # noqa: PLC0415 - only here it is needed
 
     ours = {'py_modules': [os.fspath(Path(shadowhound_data_logger.__file__).parent)]}
-    os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')  # else it tells its makers of each run, over the network
+    os.environ.setdefault('RAY_USAGE_STATS_ENABLED', '0')  # otherwise it reports each run over the network
     try:
         ray.init(address, log_to_driver=False, logging_level='ERROR', runtime_env=ours)
     except (OSError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
@@ -125,7 +125,7 @@ def _joined(address: str | None) -> Iterator[int]:
 
 
 def _reach(address: str) -> None:
-    """Ray itself tries for minutes where nothing answers. Raises LakeError."""
+    """Checked first because Ray keeps trying for minutes if nothing answers. Raises LakeError."""
     try:
         place = urlsplit(address if '//' in address else f'//{address}')
         if place.hostname and place.port:
@@ -175,21 +175,21 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
         done += 1
         say(f'episode {done} of {len(jobs)}: {mission}')
     if failed:
-        told = ', '.join(failed.values())
-        raise LakeError(f'{told}, {ATTEMPTS} times; nothing was added to the data set',
+        reasons = ', '.join(failed.values())
+        raise LakeError(f'{reasons}, {ATTEMPTS} times; nothing was added to the dataset',
                         remedy=f'run it again: the {done} episodes that were made need not be made again')  # fmt: skip
 
 
 def _download(builder: Any, files: Files, folder: Path) -> None:
-    """All that a worker wrote, ``episode.json`` last. Raises RayError, and LakeError for other bytes than were written."""
+    """Download what a worker wrote, ``episode.json`` last. Raises RayError, and LakeError for other bytes than were written."""
     import ray  # noqa: PLC0415
 
     rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    for name, written in sorted(files.items(), key=lambda each: each[0] == TOLD):
-        with replacing(folder / name, is_synced=name == TOLD) as file:
+    for name, written in sorted(files.items(), key=lambda each: each[0] == EPISODE_JSON):
+        with replacing(folder / name, is_synced=name == EPISODE_JSON) as file:
             for begin in range(0, written[0], PIECE_BYTES):
                 file.write(ray.get(builder.read.remote(name, begin)))
         if fingerprint(folder / name) != tuple(written):
-            raise LakeError(f'{name} of a worker came with other bytes than it was written with', remedy='run it again')
+            raise LakeError(f'{name} of a worker arrived with other bytes than were written', remedy='run it again')
     ray.get(builder.close.remote())

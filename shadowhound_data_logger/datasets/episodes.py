@@ -1,6 +1,6 @@
-"""Makes one episode of one mission in a folder of its own: rows, videos, where each value came from, and what was missing.
+"""Makes one episode from one mission, in a separate folder: rows, videos, the source of each value, and what was missing.
 
-The folder is whole once it has ``episode.json``; made again it has the same bytes. What numbers the episode has in its data set
+The folder is whole once it has ``episode.json``; made again it has the same bytes. What numbers the episode has in its dataset
 is settled later (``lerobot.py``): only then it is known which missions before it were refused.
 """
 
@@ -51,25 +51,25 @@ from shadowhound_data_logger.stores import open_store
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-ROWS, SOURCES, GAPS, LABELS, TOLD = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'labels.parquet', 'episode.json'
-"""Files of an episode's folder; beside them ``<camera>.mp4``."""
+ROWS, SOURCES, GAPS, LABELS, EPISODE_JSON = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'labels.parquet', 'episode.json'
+"""Files of an episode's folder, in addition to ``<camera>.mp4``."""
 BATCH: Final = 128
 """Rows with pictures that are written at a time."""
 AHEAD: Final = 4
 """Pictures that are decoded before they are encoded."""
 EPISODE: Final = 'episode_mission'
-"""The column that says whose row it is: statements about gaps have a ``mission_id`` of their own."""
+"""The column with the mission of a row: statements about gaps have their own ``mission_id``."""
 SOURCE_SCHEMA: Final = pa.schema([
     pa.field(EPISODE, pa.string(), nullable=False), pa.field('frame', pa.int64(), nullable=False),
     pa.field('stream', pa.string(), nullable=False), pa.field('bucket', pa.string(), nullable=False),
     pa.field('key', pa.string(), nullable=False), pa.field('sha256', pa.string(), nullable=False),
     pa.field('stamp_ns', pa.int64(), nullable=False), pa.field('held_s', pa.float64(), nullable=False),
 ])  # fmt: skip
-"""One row a frame and message that it was made from: ``held_s`` is how much older than the tick it was."""
+"""One row per frame and source message: ``held_s`` is how much older than the tick the message was."""
 GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
-"""The statements of the gap journal that were believed (formats/rows/gaps.py)."""
+"""The statements of the gap journal that were used (formats/rows/gaps.py)."""
 LABEL_SCHEMA: Final = narrow(labels.FIELDS, catalogue_labels.LABELS).insert(0, GAP_SCHEMA.field(EPISODE))
-"""The labels that stood, with their boxes (formats/rows/labels.py)."""
+"""The labels in force, with their boxes (formats/rows/labels.py)."""
 PICTURE: Final = pa.struct([('bytes', pa.binary()), ('path', pa.string())])
 
 
@@ -84,10 +84,10 @@ class _Stream:
 
 
 def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSettings, folder: Path) -> dict[str, Any]:
-    """Make the episode, or find out why there can be none; returns what ``episode.json`` says. Raises StoreError, OSError."""
-    told = folder / TOLD
-    if told.is_file():
-        return dict(json.loads(told.read_text(encoding='utf-8')))
+    """Make the episode, or find out why it cannot be made; returns ``episode.json``. Raises StoreError, OSError."""
+    path = folder / EPISODE_JSON
+    if path.is_file():
+        return dict(json.loads(path.read_text(encoding='utf-8')))
     rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     store = open_store(settings, UploadSettings())
@@ -106,7 +106,7 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
     finally:
         store.close()
         rmtree(folder / 'tmp', ignore_errors=True)
-    with replacing(told, is_synced=True) as file:
+    with replacing(path, is_synced=True) as file:
         file.write(json.dumps(found, indent=1).encode())
     return found
 
@@ -121,16 +121,16 @@ def _built(
     ticks = _ticks(plan, series, fps)
     streams = [_sampled(each, one, ticks, fps, options) for each, one in zip(plan.streams, series, strict=True)]
     causes = [_causes(each, ticks, plan.arm) for each in streams]
-    told = _told(plan, streams, causes, ticks, fps)
+    episode = _description(plan, streams, causes, ticks, fps)
     labelled = _labels(plan, streams, ticks)
-    told |= {'labels': sorted(set().union(*labelled))} if options.labels or options.validation_label else {}
-    if (why := _refusal(told, options)) and not options.allow_gaps:
-        return {**told, 'refused': why}
+    episode |= {'labels': sorted(set().union(*labelled))} if options.labels or options.validation_label else {}
+    if (why := _refusal(episode, options)) and not options.allow_gaps:
+        return {**episode, 'refused': why}
     pictures = [each for each in streams if each.plan.part is None]
-    told |= {'histograms': {}, 'sizes': {}}
+    episode |= {'histograms': {}, 'sizes': {}}
     for each in pictures:
         histogram, size = _write_pictures(each, fps, options, folder)
-        told['histograms'][each.plan.name], told['sizes'][each.plan.name] = histogram, size
+        episode['histograms'][each.plan.name], episode['sizes'][each.plan.name] = histogram, size
     _write_rows(streams, causes, ticks, fps, options, folder, labelled)
     _write_sources(plan, streams, ticks, folder / SOURCES)
     gaps = plan.gaps.add_column(0, EPISODE, pa.array([plan.mission.mission_id] * len(plan.gaps), pa.string()))
@@ -138,7 +138,7 @@ def _built(
     if options.labels:
         rows = [{EPISODE: plan.mission.mission_id, **asdict(each)} for each in plan.labels]
         pq.write_table(pa.Table.from_pylist(rows, schema=LABEL_SCHEMA), folder / LABELS, compression='zstd')
-    return told
+    return episode
 
 
 def _labels(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int64]) -> list[set[str]]:
@@ -160,7 +160,7 @@ def _is_of_arm(stream: StreamPlan) -> bool:
 
 
 def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, Recordings]) -> list[Series]:
-    """Each stream's own series; what two streams need of one sensor is read once."""
+    """The series of each stream; a sensor that two streams need is read once."""
     known: dict[tuple[str, tuple[str, ...]], Series] = {}
     found = []
     for each in plan.streams:
@@ -172,13 +172,13 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, R
                 known[name] = _moved(known[name], plan.arm.clock, plan.span_ns)
         one = known[name]
         if not len(one):
-            raise LakeError(f'{each.recording.topic} has no message in it')
+            raise LakeError(f'{each.recording.topic} has no message')
         if each.part is None:
             found.append(one)
             continue
         good = np.isfinite(one.values).all(axis=1)
         if not good.any():
-            raise LakeError(f'{each.recording.topic} has no finite numbers in it')
+            raise LakeError(f'{each.recording.topic} has no finite numbers')
         own = None if one.own_stamps is None else one.own_stamps[good]
         one = Series(one.recording, one.stamps[good], one.values[good], one.file[good], one.files, one.names, own_stamps=own)
         found.append(_derived(one, options) if each.part.is_derived else one)
@@ -202,13 +202,13 @@ def _derived(poses: Series, options: ExportOptions) -> Series:
 
 
 def _ticks(plan: EpisodePlan, series: Sequence[Series], fps: int) -> NDArray[np.int64]:
-    """From the first picture on at which all streams have begun, until the mission's end."""
+    """The ticks from the first image after all streams have started to the end of the mission."""
     cameras = [one for each, one in zip(plan.streams, series, strict=True) if each.part is None]
     slowest = min(cameras, key=len)
     bound = max(plan.mission.begin_ns, *(int(one.stamps[0]) for one in series))
     later = slowest.stamps[slowest.stamps >= bound]
     if not len(later):
-        raise LakeError('there is no time at which all of its streams have begun')
+        raise LakeError('at no time had all of its streams started')
     first = int(later[0])
     return ticks_of(first + phase_of(later, first, fps), plan.mission.end_ns, fps)
 
@@ -227,7 +227,7 @@ def _sampled(plan: StreamPlan, series: Series, ticks: NDArray[np.int64], fps: in
 
 
 def _causes(stream: _Stream, ticks: NDArray[np.int64], arm: ArmPlan | None) -> dict[int, str]:
-    """Tick -> why its newest message is too old. The journal speaks of messages by their own clock."""
+    """Tick -> why its newest message is too old. The journal uses the clock of the messages."""
     stamps = stream.series.stamps[stream.sampled.message]
     if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
         stamps, ticks = arm.clock.other_ns(stamps), arm.clock.other_ns(ticks)
@@ -237,13 +237,13 @@ def _causes(stream: _Stream, ticks: NDArray[np.int64], arm: ArmPlan | None) -> d
     }
 
 
-def _told(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]], ticks: NDArray[np.int64],
+def _description(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]], ticks: NDArray[np.int64],
           fps: int) -> dict[str, Any]:  # fmt: skip
     mission = plan.mission
     return {
         'mission_id': mission.mission_id, 'run_id': mission.run_id, 'robot': mission.robot, 'mission_type': mission.mission_type,
         'task': mission.task, 'frames': len(ticks), 'fps': fps, 'first_tick_ns': int(ticks[0]),
-        **({'clock': plan.arm.clock.told()} if plan.arm is not None and plan.arm.clock is not None else {}),
+        **({'clock': plan.arm.clock.as_json()} if plan.arm is not None and plan.arm.clock is not None else {}),
         'last_tick_ns': int(ticks[-1]), 'begins_late_s': round((int(ticks[0]) - mission.begin_ns) / SECOND, 3),
         'streams': {
             each.plan.name: {
@@ -260,7 +260,7 @@ def _told(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence[Mappin
 
 
 def _grades(stream: _Stream, arm: ArmPlan | None, ticks: NDArray[np.int64]) -> list[str]:
-    """How well it is known what is missing, from the first tick to the last."""
+    """The grade of what is known to be missing, from the first tick to the last."""
     if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
         ticks = arm.clock.other_ns(ticks)
     return sorted({each.grade or UNKNOWN for each in stream.plan.known.between(int(ticks[0]), int(ticks[-1])).stretches})
@@ -277,8 +277,8 @@ def _names(stream: _Stream) -> tuple[str, ...]:
     return tuple(f'{prefix}{name}.pos' for name in named)
 
 
-def _refusal(told: Mapping[str, Any], options: ExportOptions) -> str:
-    for name, each in told['streams'].items():
+def _refusal(episode: Mapping[str, Any], options: ExportOptions) -> str:
+    for name, each in episode['streams'].items():
         share, longest_s = each['stale_share'], each['longest_gap_s']
         if share > options.max_stale:
             why = ', '.join(f'{cause} {count}' for cause, count in each['causes'].items())
@@ -292,7 +292,7 @@ def _refusal(told: Mapping[str, Any], options: ExportOptions) -> str:
 
 
 def _write_pictures(stream: _Stream, fps: int, options: ExportOptions, folder: Path) -> tuple[list[list[int]], list[int]]:
-    """The video, unless pictures stay as they are; ((3, 256) pixels of each value by colour, (height, width))."""
+    """Write the video, unless images are kept unchanged; returns ((3, 256) pixels per value and color, (height, width))."""
     histogram = np.zeros((3, 256), np.int64)
     numbers, counts = np.unique(stream.sampled.message, return_counts=True)
     size = _picture(stream, int(numbers[0])).shape[:2]
@@ -310,7 +310,7 @@ def _write_pictures(stream: _Stream, fps: int, options: ExportOptions, folder: P
 
 
 def _pictures_ahead(stream: _Stream, numbers: Sequence[int]) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
-    """Each picture and its histogram, (3, 256); some are decoded on a thread of their own while others are encoded."""
+    """Each picture and its histogram, (3, 256); some are decoded on a separate thread while others are encoded."""
 
     def decoded(number: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
         pixels = _picture(stream, number)
@@ -335,7 +335,7 @@ def _picture(stream: _Stream, message: int) -> NDArray[np.uint8]:
     body, _ = stream.series.picture(message)
     pixels = decode.image(body)
     if pixels.ndim != 3 or pixels.dtype != np.uint8:
-        raise LakeError(f'the pictures of {stream.plan.recording.topic} are not colour pictures of 8 bits')
+        raise LakeError(f'the pictures of {stream.plan.recording.topic} are not color images with 8 bits')
     return np.asarray(pixels, np.uint8)
 
 
@@ -351,16 +351,16 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
     count = len(ticks)
     state = np.hstack([each.values for each in streams if each.plan.name.startswith('state.')]).astype(np.float32)
     action = np.hstack([each.values for each in _of_action(streams)]).astype(np.float32)
-    told = [''] * count
+    texts = [''] * count
     for each, why in zip(streams, causes, strict=True):
         for tick, word in why.items():
-            told[tick] = f'{told[tick]};{each.plan.name}={word}' if told[tick] else f'{each.plan.name}={word}'
+            texts[tick] = f'{texts[tick]};{each.plan.name}={word}' if texts[tick] else f'{each.plan.name}={word}'
     columns: dict[str, pa.Array] = {
         'observation.state': vectors(state, pa.float32()),
         'action': vectors(action, pa.float32()),
         'shadowhound.stale': vectors(np.column_stack([each.sampled.stale for each in streams]).astype(np.float32), pa.float32()),
         'shadowhound.age_s': vectors(np.column_stack([each.sampled.age_s for each in streams]), pa.float32()),
-        'shadowhound.cause': pa.array(told, pa.string()),
+        'shadowhound.cause': pa.array(texts, pa.string()),
         **({LABEL_FEATURE: pa.array([json.dumps(sorted(each)) for each in labelled], pa.string())} if options.labels else {}),
         'shadowhound.stamp_ns': pa.array(ticks, pa.int64()),
         'timestamp': pa.array((np.arange(count) / fps).astype(np.float32)),

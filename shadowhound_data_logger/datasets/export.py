@@ -1,6 +1,6 @@
-"""From a question to a data set: choose missions, make their episodes side by side, put them together, bring them to the store.
+"""Exports missions to a dataset: choose missions, make their episodes in parallel, combine them, upload them.
 
-Killed at any moment it goes on where it was: an episode that is made lies in ``DIR/.shadowhound/`` until the data set has it,
+Killed at any moment it goes on where it was: an episode that is made lies in ``DIR/.shadowhound/`` until the dataset has it,
 and what ``info.json`` does not count is made again, with the same bytes.
 """
 
@@ -25,7 +25,7 @@ from shadowhound_data_logger.core.durable_files import flock, replacing
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets import plan as planning
-from shadowhound_data_logger.datasets.episodes import TOLD, build
+from shadowhound_data_logger.datasets.episodes import EPISODE_JSON, build
 from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.lerobot import REPORT, Lerobot
 from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of, write_recordings
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.datasets.cluster import Cluster
 
 WORK: Final = '.shadowhound'
-"""What is not part of the data set, in its folder."""
+"""Working files in the dataset's folder that are not part of it."""
 DROPPING: Final = f'{WORK}/dropping.json'
 KNOWN: Final = 'exports.json'
 """In SHADOWHOUND_HOME: the folders that were exported to, or fetched into, from this machine."""
 LOOK_S: Final = 5.0
-"""Between two looks at what has arrived."""
+"""Between two checks for new objects."""
 PATIENCE_S: Final = 3600.0
-"""Waiting ends after so long in which nothing new was heard of what is waited for."""
+"""Waiting ends after this time without news about what is missing."""
 TRAIN, VALIDATION = 'train', 'validation'
 
 
@@ -59,18 +59,18 @@ class Exported:
 
     folder: Path
     added: list[Mapping[str, Any]] = field(default_factory=list)
-    """What ``episode.json`` says of each new episode."""
+    """``episode.json`` of each new episode."""
     present: list[str] = field(default_factory=list)
-    """Missions that were in it already."""
+    """Missions that were in the dataset already."""
     refused: dict[str, str] = field(default_factory=dict)
     """Mission -> why."""
     waiting: dict[str, str] = field(default_factory=dict)
-    """Mission -> what is not known yet."""
+    """Mission -> what is still unknown."""
     fps: int = 0
     action: str = ''
     digest: str = ''
     absent: list[str] = field(default_factory=list)
-    """Of the folder of a task, what there is nothing of."""
+    """What is missing in the folder of a task."""
     streams: dict[str, Mapping[str, str]] = field(default_factory=dict)
     """Mission -> stream -> where it comes from, of a dry run: those that were not refused before their messages were read."""
 
@@ -83,7 +83,7 @@ def export(  # noqa: PLR0913 - the flags of the command
     cluster: Cluster | None = None, wait: bool = False, is_dry: bool = False, findings: Findings | None = None,
     say: Say = lambda _: None, sleep: Callable[[float], object] = time.sleep,
 ) -> Exported:  # fmt: skip
-    """Add the missions that the flags choose to the data set in this folder, which is made where there is none.
+    """Add the missions that the flags select to the dataset in this folder, which is created if missing.
 
     Episodes are made here, one at a time unless ``workers`` says how many, or on a cluster, as many at a time as it has cores.
     With ``wait`` it comes back once it is known of each mission what is missing, or nothing new has been heard for an hour.
@@ -117,7 +117,7 @@ def export(  # noqa: PLR0913 - the flags of the command
             result.refused = {mission: reason for mission, reason in why.items() if reason}
             result.streams = {each.mission.mission_id: _where(each) for each in ready if not why[each.mission.mission_id]}
             return result
-        settings = {**options.told(), 'fps': fps, 'action': action}
+        settings = {**options.as_json(), 'fps': fps, 'action': action}
         built = _build(ready, options, fps, source.settings, folder / WORK, settings=settings, workers=workers, cluster=cluster,
                        say=say)  # fmt: skip
         task = task_of(folder)
@@ -134,7 +134,7 @@ def export(  # noqa: PLR0913 - the flags of the command
 
 @contextmanager
 def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
-    """One process at a time. Raises LakeError where another one is at work."""
+    """One process at a time. Raises LakeError while another one writes."""
     if is_dry:
         yield
         return
@@ -150,23 +150,23 @@ def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
 
 
 def resumed(folder: Path) -> Lerobot:
-    """The data set; where a drop was killed, after it has come to its end."""
+    """The dataset, after finishing a drop that was killed."""
     pending = folder / DROPPING
     if not pending.is_file():
         return Lerobot(folder)
-    told = json.loads(pending.read_text(encoding='utf-8'))
+    pending_drop = json.loads(pending.read_text(encoding='utf-8'))
     if not (folder / INFO).is_file():
         with replacing(folder / INFO) as file:
-            file.write(json.dumps(told['info']).encode())
+            file.write(json.dumps(pending_drop['info']).encode())
     made = Lerobot(folder)
-    _drop(made, told['mission_id'])
+    _drop(made, pending_drop['mission_id'])
     return Lerobot(folder)
 
 
 def drop(folder: Path, mission_id: str) -> str:
-    """Take a mission out of a data set, and remember that it must not come back; the new digest.
+    """Remove a mission from a dataset and remember not to add it again; returns the new digest.
 
-    Raises LakeError where it is not in it.
+    Raises LakeError if it is not in the dataset.
     """
     with writing(folder):
         made = resumed(folder)
@@ -197,30 +197,30 @@ def _drop(made: Lerobot, mission_id: str) -> str:
 
 
 def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
-    """What a data set was begun with holds for all of it. Raises LakeError for other settings."""
+    """The first settings of a dataset apply to all of it. Raises LakeError for others."""
     if made.settings is None:
         return options, options.fps, options.action
-    now = {**options.told(), 'fps': options.fps or made.settings['fps'],
+    now = {**options.as_json(), 'fps': options.fps or made.settings['fps'],
            'action': made.settings['action'] if options.action == 'auto' else options.action}  # fmt: skip
     if other := [name for name in {**made.settings, **now} if now.get(name) != made.settings.get(name)]:
         said = ', '.join(f'{name} {made.settings.get(name, "none")}' for name in other)
-        raise LakeError(f'{made.folder} was begun with {said}', remedy='export to another folder, or with the same settings')
+        raise LakeError(f'{made.folder} was started with {said}', remedy='export to another folder, or with the same settings')
     return options, made.settings['fps'], made.settings['action']
 
 
 def _new(made: Lerobot, missions: Sequence[ChosenMission]) -> list[ChosenMission]:
-    """Those that are neither in it nor were dropped."""
+    """The missions that are not in it and were not dropped."""
     known = {*made.mission_ids}
     return [each for each in missions if each.mission_id not in known and hashed(each.mission_id) not in made.dropped]
 
 
 def hashed(mission_id: str) -> str:
-    """As which a data set remembers a mission that was dropped."""
+    """How a dataset remembers a dropped mission."""
     return hashlib.sha256(mission_id.encode()).hexdigest()
 
 
 def _only(plan: EpisodePlan, action: str) -> EpisodePlan:
-    """With ``auto``, a mission may have what the data set does not take."""
+    """With ``auto``, a mission may have an action that the dataset does not use."""
     wrong = [each for each in plan.streams if each.name == 'action' and each.part is not None and each.part.name != action]
     if not wrong:
         return plan
@@ -228,13 +228,13 @@ def _only(plan: EpisodePlan, action: str) -> EpisodePlan:
 
 
 def _auto_fps(plans: Sequence[EpisodePlan]) -> int:
-    """Raises LakeError where no camera has a frame a second."""
+    """Raises LakeError if no camera has one frame per second."""
     rates = [each.camera_hz for each in plans if each.camera_hz]
     if not rates:
         return 1
     fps = whole_fps(min(rates))
     if fps < 1:
-        raise LakeError(f'the slowest camera has {min(rates):.3g} Hz, and LeRobot knows whole frames a second alone',
+        raise LakeError(f'the slowest camera has {min(rates):.3g} Hz, and LeRobot supports only whole frames per second',
                         remedy='record a bag (shadowhound-data node bag start), or name missions with --mission')  # fmt: skip
     return fps
 
@@ -254,7 +254,7 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
     folders = [work / f'{hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
     jobs = [(each, options, fps, store, folder) for each, folder in zip(plans, folders, strict=True)]
     if cluster is not None:
-        return [(job[0], told, job[-1]) for job, told in zip(jobs, cluster.built(jobs, workers, say), strict=True)]
+        return [(job[0], episode, job[-1]) for job, episode in zip(jobs, cluster.built(jobs, workers, say), strict=True)]
     found: Built = []
     if workers in {None, 1} or len(jobs) < 2:
         for number, job in enumerate(jobs):
@@ -268,7 +268,7 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
             try:
                 found.append((job[0], future.result(), job[-1]))
             except BrokenProcessPool as error:
-                raise LakeError(f'a process died while episodes were made; {mission} is not made, and nothing was added',
+                raise LakeError(f'a process was killed while episodes were made; {mission} is not made, and nothing was added',
                                 remedy='run it again, with fewer --workers if memory ran out: '
                                        'episodes that were made need not be made again') from error  # fmt: skip
             say(f'episode {number + 1} of {len(jobs)}: {mission}')
@@ -276,13 +276,13 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
 
 
 def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
-    """What is left of an earlier run is used where it was made in the same way of the same objects and gaps."""
-    told = [settings, options.validation_label, options.max_stale, options.allow_gaps, sorted(plan.topics.items()), plan.missing,
-            _where(plan),
+    """The result of an earlier run is reused if it was made in the same way from the same objects and gaps."""
+    inputs = [settings, options.validation_label, options.max_stale, options.allow_gaps, sorted(plan.topics.items()),
+              plan.missing, _where(plan),
             [(name, sorted(track.key.to_pylist())) for name, track in sorted(_tracks_of(plan).items())],
             [[each.sha256 for each in bag.slices] for bag in plan.bags],
-            plan.arm and (plan.arm.why, plan.arm.clock and plan.arm.clock.told())]  # fmt: skip
-    whole = hashlib.sha256(json.dumps(told, default=str).encode())
+            plan.arm and (plan.arm.why, plan.arm.clock and plan.arm.clock.as_json())]  # fmt: skip
+    whole = hashlib.sha256(json.dumps(inputs, default=str).encode())
     for column in (*plan.gaps.to_pydict().items(), *map(asdict, plan.labels)):
         whole.update(json.dumps(column, default=str).encode())
     return whole.hexdigest()[:16]
@@ -297,22 +297,22 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
     folder = made.folder
     report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(made), 'dropped': made.dropped}
     new: dict[str, Path] = {}
-    for plan, told, work in built:
+    for plan, episode, work in built:
         mission = plan.mission.mission_id
-        if 'refused' in told:
-            result.refused[mission] = told['refused']
+        if 'refused' in episode:
+            result.refused[mission] = episode['refused']
             continue
-        is_chosen = options.validation_label in told.get('labels', ())
+        is_chosen = options.validation_label in episode.get('labels', ())
         split = VALIDATION if is_chosen else split_of(mission, options.validation)
         try:
             recorded(plan)
-            made.add(told, work, options, split)
+            made.add(episode, work, options, split)
         except LakeError as error:
             result.refused[mission] = error.what
             continue
-        result.added.append(told)
+        result.added.append(episode)
         new[mission] = work
-        kept = {name: value for name, value in told.items() if name not in {'histograms', 'sizes'}}
+        kept = {name: value for name, value in episode.items() if name not in {'histograms', 'sizes'}}
         report['episodes'].append({'split': split, **kept})
     report |= {'refused': result.refused, 'waiting': result.waiting}
     if not made.rows:
@@ -324,17 +324,17 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
         made.commit(report, new)
     result.digest = made.digest
     for work in (folder / WORK).glob('*-*'):
-        if (work / TOLD).is_file():
+        if (work / EPISODE_JSON).is_file():
             rmtree(work)
 
 
 def split_of(mission_id: str, validation: float) -> str:
-    """Whether a mission is to learn from or to check with: by its id alone, so that it stays when others are added."""
+    """Training or validation split of a mission: by its id alone, so that it does not change when others are added."""
     return VALIDATION if int(hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
 def _told_before(made: Lerobot) -> list[dict[str, Any]]:
-    """Of the episodes that it has: a report was written before ``info.json``, and a kill may have come between."""
+    """Reports of the episodes in the dataset: a kill may have come between a report and ``info.json``."""
     found = _json_of(made.folder / REPORT) if made.info else {}
     return [each for each in found.get('episodes', []) if each['mission_id'] in made.mission_ids]
 
@@ -348,11 +348,11 @@ def _made_folder(path: Path) -> Path:
     return path
 
 
-# -- which data sets there are ---------------------------------------------------------------------------------------------
+# -- which datasets there are ---------------------------------------------------------------------------------------------
 
 
 def remember(home: Path, folder: Path) -> None:
-    """Note that this folder is a data set: ``export where`` and ``export drop`` look into all of them. Raises OSError."""
+    """Remember that this folder is a dataset: ``export where`` and ``export drop`` read all of them. Raises OSError."""
     home.mkdir(parents=True, exist_ok=True)
     with flock(home / f'{KNOWN}.lock'):
         found = {*known_folders(home), folder.absolute()}
@@ -361,9 +361,9 @@ def remember(home: Path, folder: Path) -> None:
 
 
 def known_folders(home: Path) -> list[Path]:
-    """Those that are there still."""
+    """The folders that still exist."""
     try:
-        told = json.loads((home / KNOWN).read_text(encoding='utf-8'))
+        folders = json.loads((home / KNOWN).read_text(encoding='utf-8'))
     except (OSError, ValueError):
         return []
-    return [Path(each) for each in told if isinstance(each, str) and (Path(each) / INFO).is_file()]
+    return [Path(each) for each in folders if isinstance(each, str) and (Path(each) / INFO).is_file()]

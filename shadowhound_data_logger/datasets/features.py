@@ -1,4 +1,4 @@
-"""What a data set consists of: which numbers make the state and the action, from which sensor, with names and units."""
+"""The features of a dataset: the numbers of state and action, from which sensor, with names and units."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _TWIST: Final = decode.ODOMETRY[7:]
 
 @dataclass(frozen=True, slots=True)
 class StatePart:
-    """Some numbers of one sensor that belong together."""
+    """A group of numbers of one sensor."""
 
     name: str
     sensor: str
     fields: tuple[str, ...]
-    """Paths in a message; empty: those that the lake takes of its type."""
+    """Paths in a message; empty: the lake's defaults for the type."""
     names: tuple[str, ...]
-    """Of the numbers; empty where the message names them (joints)."""
+    """Names of the numbers; empty if the message has them (joints)."""
     units: tuple[str, ...]
     turns: tuple[slice, ...] = ()
     """Quaternions x y z w among them."""
     is_derived: bool = False
-    """From two poses of odometry, instead of from a message."""
+    """Derived from two poses of odometry instead of read from a message."""
 
 
 STATE_PARTS: Final[Mapping[str, StatePart]] = {
@@ -50,13 +50,13 @@ COMMAND: Final = StatePart(
 )
 DERIVED: Final = StatePart('odometry', 'odom', _POSE, COMMAND.names, COMMAND.units, is_derived=True)
 ACTIONS: Final = {'auto': None, 'cmd_vel': COMMAND, 'odometry': DERIVED}
-"""By the word that ``--action`` takes; with ``auto``, the command topic in a data set whose first mission has it."""
+"""By the word that ``--action`` takes; with ``auto``, the command topic in a dataset whose first mission has it."""
 ARM_JOINTS, ARM_COMMANDS, ARM_CLOCK = 'arm_joints', 'arm_commands', 'arm_clock'
-"""What an arm's sensors are called here, whatever they are called where they were recorded: they are found by topic."""
+"""The names of an arm's sensors here, regardless of their names in the recording: they are found by topic."""
 ARM_TOPICS: Final = {ARM_JOINTS: 'joint_states', ARM_COMMANDS: 'joint_commands', ARM_CLOCK: 'clock'}
 """Below the arm's namespace: sensor_msgs/JointState twice, sensor_msgs/TimeReference."""
 JOINT_STATE: Final = 'sensor_msgs/msg/JointState'
-"""Positions in radians; of a recording that was imported without a unit the type is another one."""
+"""Positions in radians; a recording that was imported without a unit has another type."""
 ARM_STATE: Final = StatePart('arm', ARM_JOINTS, ('position',), (), ('rad',))
 ARM_COMMAND: Final = StatePart('arm', ARM_COMMANDS, ('position',), (), ('rad',))
 ARM_ACTION: Final = 'action.arm'
@@ -71,7 +71,7 @@ OWN_FILES, SHARED = 'episode', 'shared'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """How missions become episodes; the same for all of a data set."""
+    """How missions become episodes; the same for a whole dataset."""
 
     fps: int | None = None
     """None: the rate of the slowest camera."""
@@ -81,23 +81,23 @@ class ExportOptions:
     codec: str = AV1
     is_lossless: bool = False
     layout: str = OWN_FILES
-    """``episode``: videos of an episode in files of its own; ``shared``: those of all episodes in one file for each camera."""
+    """``episode``: separate video files for each episode; ``shared``: those of all episodes in one file for each camera."""
     resample: Mapping[str, str] | None = None
-    """Sensor -> ``hold`` or ``linear``; of those that are not named, hold."""
+    """Sensor -> ``hold`` or ``linear``; default: hold."""
     max_age_s: Mapping[str, float] | None = None
-    """Sensor -> seconds; of those that are not named, ``ticks.LATE`` periods of the stream or of the ticks."""
+    """Sensor -> seconds; default: ``ticks.LATE`` periods of the stream or of the ticks."""
     max_gap_s: float = 5.0
     max_stale: float = 0.05
     allow_gaps: bool = False
     validation: float = 0.0
     arm: str = ''
-    """The namespace of an arm's topics, and the robot by which it is recorded where it has a machine of its own."""
+    """The namespace of an arm's topics, and the robot name of its recordings if it has a separate machine."""
     labels: bool = False
     """Whether frames have a column with their labels."""
     validation_label: str = ''
     """Episodes with this label in a frame are marked as validation."""
     clock_pairs: tuple[tuple[int, int], ...] = ()
-    """(ns of the robot, ns of the arm) of events of which both told the time, beside those that were recorded."""
+    """(ns of the robot, ns of the arm) of events that both timed, in addition to the recorded ones."""
 
     def __post_init__(self) -> None:
         """Raises SettingError."""
@@ -114,8 +114,8 @@ class ExportOptions:
         if self.fps is not None and self.fps < 1:
             raise SettingError('--fps', self.fps, 'auto, or a whole number of frames a second')
 
-    def told(self) -> dict[str, Any]:
-        """What decides about the bytes of an episode, but for the frames a second and the action, which are settled later."""
+    def as_json(self) -> dict[str, Any]:
+        """The options that determine the bytes of an episode; frames per second and action are chosen later."""
         return {
             'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
             'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
@@ -125,5 +125,5 @@ class ExportOptions:
 
 
 def camera_name(sensor: str) -> str:
-    """What a camera's feature is called by: ``front`` for the default one, else its sensor's name."""
+    """The name of a camera's feature: ``front`` for the default camera, otherwise its sensor's name."""
     return 'front' if sensor == 'camera' else sensor

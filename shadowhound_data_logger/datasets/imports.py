@@ -1,11 +1,11 @@
-"""Brings recordings of an arm that others made into the store, where they are sources like ours: hashed, and in the catalogue.
+"""Imports recordings of an arm by other programs into the store, as sources like our own: hashed, and in the catalog.
 
 LeRobotDataset v2.1 and v3.0 (https://github.com/huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx) and HDF5 as ACT and
 ALOHA write it (https://github.com/tonyzhaozh/aloha, record_episodes.py). Joints and commands become objects of the arm, each
 with the identity of its episode in its key and metadata; pictures stay where they are.
 
-The identity is the SHA-256 of what is imported of an episode (``identity_of``), not of a file: LeRobot v3 has many episodes in
-one file, and writes that again when the data set grows.
+The identity is the SHA-256 of the imported part of an episode (``identity_of``), not of a file: LeRobot v3 has many episodes in
+one file, and rewrites it when the dataset grows.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 AS_RECORDED: Final = 'lerobot/joints'
-"""Positions in whatever they were recorded in: LeRobot writes down no unit."""
+"""Positions in the unit of the recording: LeRobot does not record it."""
 GRID_S: Final = 1e-4
-"""By which lerobot lets a time differ from its frame's (``tolerance_s``)."""
+"""The difference that lerobot allows between a time and its frame's (``tolerance_s``)."""
 DIGITS: Final = 16
 """Digits of an identity in a key."""
 MS: Final = 1_000_000
@@ -67,7 +67,7 @@ class Demonstration:
     commands: NDArray[np.float64] | None
     type: str
     number: int
-    """In its data set."""
+    """Its number in the dataset."""
     identity: str
     """``identity_of`` what was recorded."""
 
@@ -82,22 +82,22 @@ class Demonstration:
 
 @dataclass(slots=True)
 class Imported:
-    """What an import did."""
+    """The result of an import."""
 
     episodes: int = 0
-    """That are new."""
+    """New ones."""
     unchanged: int = 0
     """Episodes that were there already."""
     samples: int = 0
     """Of the new episodes."""
     objects: int = 0
-    """That are new."""
+    """New ones."""
     present: int = 0
     """Objects that were there already."""
     refused: dict[str, str] = field(default_factory=dict)
     """Episode -> why."""
     absent: list[str] = field(default_factory=list)
-    """Episodes of this arm that were imported before and are not in this data set; they stay in the store."""
+    """Episodes of this arm that were imported before and are not in this dataset; they stay in the store."""
 
 
 def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: NDArray[Any], commands: NDArray[Any] | None,
@@ -107,8 +107,8 @@ def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: N
     The numbers are hashed as float64, little endian, row by row, before units are converted. So it does not depend on the file
     that they are in, on the number of the episode, or on the width of a column that holds the same values.
     """
-    told = {'names': list(names), 'unit': unit, 'samples': len(positions), 'has_commands': commands is not None}
-    whole = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    header = {'names': list(names), 'unit': unit, 'samples': len(positions), 'has_commands': commands is not None}
+    whole = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     whole.update(np.ascontiguousarray(stamps_ns - stamps_ns[0], '<i8').tobytes())
     for values in (each for each in (positions, commands) if each is not None):
         numbers = np.ascontiguousarray(values, '<f8') + 0.0  # -0.0 is 0.0
@@ -128,9 +128,9 @@ def times_of(path: Path) -> dict[int, int]:
 
 
 def of_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> Iterator[Demonstration]:
-    """The episodes of a LeRobotDataset v2.1 or v3.0 of which it is known when they began.
+    """The episodes of a LeRobotDataset v2.1 or v3.0 with known start times.
 
-    That is what ``times`` say, else its column ``shadowhound.stamp_ns``. Raises LakeError.
+    Those are ``times``, otherwise the column ``shadowhound.stamp_ns``. Raises LakeError.
     """
     info = _info(folder)
     features = info['features']
@@ -144,11 +144,11 @@ def of_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> I
             table = pq.read_table(path, columns=wanted)
             parts.append({name: matrix(table[name]) for name in wanted})
         except (pa.ArrowException, OSError, ValueError) as error:
-            raise LakeError(f'{path} is no data of a LeRobotDataset: {error}') from error
+            raise LakeError(f'{path} is not a data file of a LeRobotDataset: {error}') from error
         if any(parts[-1][name].dtype.kind not in 'iu' for name in ('episode_index', 'frame_index')):
-            raise LakeError(f'{path} has an episode_index or frame_index that is no whole number')
+            raise LakeError(f'{path} has an episode_index or frame_index that is not an integer')
         if any(parts[-1][name].shape[1] != len(names) for name in ('observation.state', 'action')[: 1 + has_action]):
-            raise LakeError(f'{path} has not the {len(names)} joints that {INFO} says')
+            raise LakeError(f'{path} does not have the {len(names)} joints of {INFO}')
     if not sum(len(part['episode_index']) for part in parts):
         raise LakeError(f'{folder} has no episode', remedy='name the folder of a LeRobotDataset')
     columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
@@ -172,10 +172,10 @@ def _info(folder: Path) -> dict[str, Any]:
         version = str(info['codebase_version'])
         state = info['features']['observation.state']
         if version not in {'v2.1', 'v3.0'} or len(state['shape']) != 1 or not float(info['fps']) > 0:
-            raise LakeError(f'{folder} is a data set of version {version} with {info["fps"]} frames a second',
+            raise LakeError(f'{folder} is a dataset of version {version} with {info["fps"]} frames a second',
                             remedy='v2.1 and v3.0 can be imported')  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise LakeError(f'{folder} is no LeRobotDataset: {error}', remedy=f'it has {INFO} with observation.state') from error
+        raise LakeError(f'{folder} is not a LeRobotDataset: {error}', remedy=f'it has {INFO} with observation.state') from error
     return info
 
 
@@ -196,11 +196,11 @@ def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int
     if number not in times:
         if 'shadowhound.stamp_ns' in columns:
             return columns['shadowhound.stamp_ns'][:, 0].astype(np.int64)
-        raise LakeError(f'nobody knows when episode {number} began: LeRobot counts from 0 in each of them',
+        raise LakeError(f'the start time of episode {number} is unknown: LeRobot counts from 0 in each episode',
                         remedy=f'--times FILE, a CSV with {",".join(COLUMNS)}')  # fmt: skip
     seconds = columns['timestamp'][:, 0].astype(np.float64)
     if not np.isfinite(seconds).all() or np.abs(seconds).max(initial=0) > 1e6:
-        raise LakeError(f'episode {number} has times that make no sense')
+        raise LakeError(f'episode {number} has implausible times')
     frames = columns['frame_index'][:, 0]
     if (np.abs(seconds - frames / fps) <= GRID_S).all():
         seconds = frames / fps
@@ -215,14 +215,14 @@ def of_hdf5(
 
     for number, path in enumerate(paths):
         if number not in times:
-            raise LakeError(f'nobody knows when episode {number} ({path.name}) began',
+            raise LakeError(f'the start time of episode {number} ({path.name}) is unknown',
                             remedy=f'--times FILE, a CSV with {",".join(COLUMNS)}')  # fmt: skip
         try:
             with h5py.File(path, 'r') as file:
                 positions = np.asarray(file['observations/qpos'], np.float64)
                 commands = np.asarray(file['action'], np.float64) if 'action' in file else None
         except (OSError, KeyError, ValueError, TypeError) as error:
-            raise LakeError(f'{path} is no demonstration in the layout of ACT and ALOHA: {error}') from error
+            raise LakeError(f'{path} is not a demonstration in the layout of ACT and ALOHA: {error}') from error
         if positions.ndim != 2 or not len(positions) or (commands is not None and commands.shape != positions.shape):
             raise LakeError(f'{path}: observations/qpos and action are not of one shape, (samples, joints)')
         width = positions.shape[1]
@@ -234,13 +234,13 @@ def of_hdf5(
         yield Demonstration(stamps, names, positions, commands, JOINT_STATE, number, identity)
 
 
-def bring(demonstrations: Iterable[Demonstration], arm: str, store: ObjectStore) -> Imported:
-    """Store the new ones as what the arm recorded, and tell the catalogue; nothing that is in the store is changed.
+def import_episodes(demonstrations: Iterable[Demonstration], arm: str, store: ObjectStore) -> Imported:
+    """Store the new episodes as recordings of the arm, with rows in the catalog; nothing in the store is changed.
 
     An episode is refused if the store has another recording of its time, or its recording with another time. Raises LakeError,
     StoreError.
     """
-    every, found, stored = list(demonstrations), Imported(), _Stored(store, arm)
+    every, found, stored = list(demonstrations), Imported(), _StoredEpisodes(store, arm)
     wanted = {each.begin_ns // MS: each.identity[:DIGITS] for each in every}
     for each in every:
         if why := stored.conflict(each, wanted):
@@ -264,7 +264,7 @@ def bring(demonstrations: Iterable[Demonstration], arm: str, store: ObjectStore)
     return found
 
 
-class _Stored:
+class _StoredEpisodes:
     """The episodes of an arm that were imported, by the keys of their objects. One thread."""
 
     def __init__(self, store: ObjectStore, arm: str) -> None:
@@ -280,23 +280,23 @@ class _Stored:
             name = rf'(\d{{8}}/\d{{6}}_\d{{3}})_{named}_([0-9a-f]{{{DIGITS}}})_(\d+)\.json'
             pattern = re.compile(rf'{re.escape(arm)}/{named}/{name}', re.ASCII)
             for info in store.list(schema.BUCKET, f'{arm}/{named}/'):
-                if (told := pattern.fullmatch(info.key)) is None or (begin_ms := _ms_of(told[1])) is None:
+                if (match := pattern.fullmatch(info.key)) is None or (begin_ms := _ms_of(match[1])) is None:
                     continue  # recorded by the arm's own machine
                 self._keys.add(info.key)
                 if sensor == ARM_JOINTS:
-                    self._add(begin_ms, told[2], info.key, int(told[3]))
+                    self._add(begin_ms, match[2], info.key, int(match[3]))
 
     def has(self, each: Demonstration) -> bool:
         return each.begin_ns // MS in self._begins.get(each.identity[:DIGITS], ())
 
     def add(self, each: Demonstration) -> None:
-        """It is there now."""
+        """Remember a stored episode."""
         if not self.has(each):
             for number, stamp in enumerate(each.stamps_ns[::PART].tolist()):
                 self._add(stamp // MS, each.identity[:DIGITS], self._key(each, ARM_JOINTS, number), number)
 
     def conflict(self, each: Demonstration, wanted: Mapping[int, str]) -> str:
-        """Why it cannot be stored; empty where it can. ``wanted`` are begin, in ms, and identity of all that are imported."""
+        """Why it cannot be stored, or empty. ``wanted`` are start time, in ms, and identity of all imported episodes."""
         if self.has(each):
             return ''
         mine = each.identity[:DIGITS]
@@ -380,7 +380,7 @@ class _Stored:
 
 
 def _ms_of(text: str) -> int | None:
-    """Of ``YYYYMMDD/HHMMSS_mmm`` in a key, ms since 1970; None for what is no time."""
+    """``YYYYMMDD/HHMMSS_mmm`` of a key as ms since 1970; None if it is not a time."""
     seconds, _, ms = text.rpartition('_')
     try:
         return int(datetime.strptime(f'{seconds}+0000', '%Y%m%d/%H%M%S%z').timestamp()) * 1000 + int(ms)

@@ -1,4 +1,4 @@
-"""A data set in LeRobot's format v3.0, as lerobot 0.6.1 reads it, in a folder: whole while it has ``meta/info.json``.
+"""A dataset in LeRobot's format v3.0, as lerobot 0.6.1 reads it, in a folder: complete while it has ``meta/info.json``.
 
 https://github.com/huggingface/lerobot, src/lerobot/datasets: utils.py has the paths, dataset_metadata.py and io_utils.py what is
 read. Each episode has a data file, a video for each camera and an episodes file of its own, which are never written again, except
@@ -64,7 +64,7 @@ STATS, TASKS = 'meta/stats.json', 'meta/tasks.parquet'
 SOURCE_TABLE, GAP_TABLE = DIGEST_FILES[1:]
 REPORT, FILES, DIGESTS = 'meta/shadowhound_report.json', 'meta/shadowhound_files.json', 'meta/shadowhound_digests.json'
 OURS: Final = 'shadowhound/'
-"""What the columns of ``meta/episodes`` that are ours begin with."""
+"""The prefix of our own columns in ``meta/episodes``."""
 QUANTILES: Final = {'q01': 0.01, 'q10': 0.10, 'q50': 0.50, 'q90': 0.90, 'q99': 0.99}
 _COUNTERS: Final = {
     'timestamp': 'float32',
@@ -79,19 +79,19 @@ EpisodeRow = dict[str, Any]
 
 
 class Lerobot:
-    """Reads and writes one data set in LeRobot's layout. One process at a time writes it (``export.py`` holds the lock)."""
+    """Reads and writes one dataset in LeRobot's layout. One process at a time writes it (``export.py`` holds the lock)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.info: dict[str, Any] | None = _json(folder / INFO)
         report = _json(folder / REPORT) or {}
         self.settings: dict[str, Any] | None = report.get('settings') if self.info else None
-        """How its episodes were made."""
+        """The settings of its episodes."""
         self.dropped: list[str] = report.get('dropped', [])
         """SHA-256 of the ids of missions that must not come back."""
         self.rows: list[EpisodeRow] = list(self._rows()) if self.info else []
         self._joined: dict[Path, list[Clip]] = {}
-        """Shared video -> what it is to be made of."""
+        """Shared video -> the clips that it must consist of."""
         self._is_changed = False
         """Whether earlier episodes were."""
 
@@ -144,7 +144,7 @@ class Lerobot:
             yield from (decode.image(body) for number, body in enumerate(self.bodies(row, key)) if number in numbers)
 
     def bodies(self, row: EpisodeRow, key: str) -> Iterator[bytes]:
-        """The pictures of a lossless data set as they were published."""
+        """The images of a lossless dataset, as published."""
         for batch in pq.ParquetFile(self.path(DATA, row, 'data')).iter_batches(batch_size=64, columns=[key]):
             yield from (value.as_py()['bytes'] for value in batch.column(0))
 
@@ -157,47 +157,47 @@ class Lerobot:
 
     # -- adding ----------------------------------------------------------------------------------------------------
 
-    def add(self, told: Mapping[str, Any], made: Path, options: ExportOptions, split: str) -> None:
-        """One episode, whose folder is ``made``, at the end. Its files are there afterwards, ``commit`` makes them count.
+    def add(self, episode: Mapping[str, Any], made: Path, options: ExportOptions, split: str) -> None:
+        """Append one episode from the folder ``made``. It becomes part of the dataset with ``commit``.
 
-        Raises LakeError where it does not fit the episodes before it.
+        Raises LakeError if it does not fit the earlier episodes.
         """
-        features = features_of(told, options)
+        features = features_of(episode, options)
         if self.info is None:
-            self.info = _empty_info(told, features, is_shared=options.layout == SHARED)
-        if (other := different(self.info['features'], features)) or self.info['fps'] != told['fps']:
+            self.info = _empty_info(episode, features, is_shared=options.layout == SHARED)
+        if (other := different(self.info['features'], features)) or self.info['fps'] != episode['fps']:
             raise LakeError(f'its {other or "frames a second"} differ from those of the episodes before it')
         number = int(self.rows[-1]['data/file_index'] + CHUNK * self.rows[-1]['data/chunk_index'] + 1) if self.rows else 0
         begin = int(self.rows[-1]['dataset_to_index']) if self.rows else 0
         place = {'chunk_index': number // CHUNK, 'file_index': number % CHUNK}
         row: EpisodeRow = {
-            'episode_index': len(self.rows), 'tasks': [told['task']], 'length': told['frames'],
+            'episode_index': len(self.rows), 'tasks': [episode['task']], 'length': episode['frames'],
             **{f'data/{name}': value for name, value in place.items()},
-            'dataset_from_index': begin, 'dataset_to_index': begin + told['frames'],
+            'dataset_from_index': begin, 'dataset_to_index': begin + episode['frames'],
         }  # fmt: skip
         is_shared = options.layout == SHARED
         for key, feature in features.items():
             if feature['dtype'] == 'video':
                 row |= {f'videos/{key}/{name}': 0 if is_shared else value for name, value in place.items()}
-                row |= _times(key, begin if is_shared else 0, told['frames'], told['fps'])
+                row |= _times(key, begin if is_shared else 0, episode['frames'], episode['fps'])
         self.rows.append(row)
         target = self.path(DATA, row, 'data')
-        values = _write_data(made / ROWS, target, row, self._tasks().index(told['task']), features)
+        values = _write_data(made / ROWS, target, row, self._tasks().index(episode['task']), features)
         stats = {key: vector_stats(column) for key, column in values.items()}
-        for name, histogram in told['histograms'].items():
-            stats[f'observation.{name}'] = picture_stats(np.array(histogram), told['frames'])
+        for name, histogram in episode['histograms'].items():
+            stats[f'observation.{name}'] = picture_stats(np.array(histogram), episode['frames'])
             row[f'{OURS}histogram/observation.{name}'] = np.array(histogram).ravel().tolist()
             if not options.is_lossless:
                 video = self.path(VIDEO, row, f'videos/observation.{name}', video_key=f'observation.{name}')
                 if is_shared:
                     before = [Clip(video, 0, begin)] if begin else []
-                    self._joined.setdefault(video, before).append(Clip(made / f'{name}.mp4', 0, told['frames']))
+                    self._joined.setdefault(video, before).append(Clip(made / f'{name}.mp4', 0, episode['frames']))
                 else:
                     _take(made / f'{name}.mp4', video)
         row |= {f'stats/{key}/{name}': value for key, each in stats.items() for name, value in each.items()}
         row |= {f'meta/episodes/{name}': value for name, value in place.items()}
-        row |= _ours(told, split)
-        row |= {f'{OURS}labels': json.dumps(told['labels'])} if options.labels else {}
+        row |= _ours(episode, split)
+        row |= {f'{OURS}labels': json.dumps(episode['labels'])} if options.labels else {}
         self._write_row(row)
 
     def _write_row(self, row: EpisodeRow) -> None:
@@ -219,7 +219,7 @@ class Lerobot:
     # -- what speaks of all ----------------------------------------------------------------------------------------
 
     def commit(self, report: Mapping[str, Any], made: Mapping[str, Path]) -> str:
-        """Write what speaks of all episodes, ``info.json`` last; returns the digest. ``made`` are the folders of new ones."""
+        """Write the files about all episodes, ``info.json`` last; returns the digest. ``made``: folders of new episodes."""
         assert self.info is not None
         assert not self._joined, 'join_videos comes first'
         tasks = self._tasks()
@@ -276,11 +276,11 @@ class Lerobot:
                     writer.write_table(table.select(schema.names).cast(schema), row_group_size=max(len(table), 1))
 
     def _note_digest(self, digest: str) -> None:
-        """Which missions a digest stands for: a data set grows, and a model was trained on what it was then."""
-        told = _json(self.folder / DIGESTS) or {'digests': []}
-        if not told['digests'] or told['digests'][-1]['digest'] != digest:
-            told['digests'].append({'digest': digest, 'missions': self.mission_ids})
-        _put_json(self.folder / DIGESTS, told)
+        """Which missions a digest stands for: a dataset grows, and a model was trained on what it was then."""
+        history = _json(self.folder / DIGESTS) or {'digests': []}
+        if not history['digests'] or history['digests'][-1]['digest'] != digest:
+            history['digests'].append({'digest': digest, 'missions': self.mission_ids})
+        _put_json(self.folder / DIGESTS, history)
 
     def _write_files(self, info: bytes, *, is_changed: bool) -> None:
         """Size and SHA-256 of every file but this one; those of earlier episodes are known, unless they were changed."""
@@ -307,10 +307,10 @@ class Lerobot:
     # -- taking away -----------------------------------------------------------------------------------------------
 
     def drop(self, mission_id: str) -> None:
-        """Take an episode out: its files are gone, and those after it are numbered again. ``commit`` is still to be called."""
+        """Delete an episode and renumber the later ones. ``commit`` must be called afterwards."""
         assert self.info is not None
         self._is_changed = True
-        (self.folder / INFO).unlink(missing_ok=True)  # in between it is none
+        (self.folder / INFO).unlink(missing_ok=True)  # it is incomplete until then
         gone = [row for row in self.rows if row[f'{OURS}mission_id'] == mission_id]
         shared = self._cut_videos(mission_id)
         self.rows = [row for row in self.rows if row[f'{OURS}mission_id'] != mission_id]
@@ -343,7 +343,7 @@ class Lerobot:
             {**each, 'missions': [name for name in each['missions'] if name != mission_id]} for each in kept]})  # fmt: skip
 
     def _cut_videos(self, mission_id: str) -> list[str]:
-        """Take the frames of a mission out of the shared videos; the cameras that have one. Again, it changes nothing."""
+        """Remove the frames of a mission from the shared videos; returns their cameras. Idempotent."""
         if self.settings is None or self.settings['layout'] != SHARED:
             return []
         lengths = [row['length'] for row in self.rows]
@@ -365,16 +365,16 @@ class Lerobot:
         yield self.path(EPISODES, row, 'meta/episodes')
 
 
-def features_of(told: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
-    """The features of ``info.json`` for an episode like this."""
-    streams: Mapping[str, Any] = told['streams']
+def features_of(episode: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
+    """The features of ``info.json`` for this episode."""
+    streams: Mapping[str, Any] = episode['streams']
     features: dict[str, Any] = {}
-    for name, size in told['sizes'].items():
+    for name, size in episode['sizes'].items():
         shape, names = [*size, 3], ['height', 'width', 'channels']
         if options.is_lossless:
             features[f'observation.{name}'] = {'dtype': 'image', 'shape': shape, 'names': names}
         else:
-            info = feature_info(options.codec, told['fps'], (size[0], size[1]))
+            info = feature_info(options.codec, episode['fps'], (size[0], size[1]))
             features[f'observation.{name}'] = {'dtype': 'video', 'shape': shape, 'names': names, 'info': info}
     state: list[str] = []
     units: list[str] = []
@@ -423,7 +423,7 @@ def _vector(names: list[str], **info: Any) -> dict[str, Any]:
 
 
 def different(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """Which features are not the same; empty where all are."""
+    """Which features differ, or empty."""
     plain = json.loads(json.dumps(other))
     return ', '.join(sorted(key for key in {*one, *plain} if one.get(key) != plain.get(key)))
 
@@ -433,22 +433,22 @@ def _times(key: str, first: int, frames: int, fps: int) -> EpisodeRow:
     return {f'videos/{key}/from_timestamp': first / fps, f'videos/{key}/to_timestamp': (first + frames) / fps}
 
 
-def _empty_info(told: Mapping[str, Any], features: Mapping[str, Any], *, is_shared: bool) -> dict[str, Any]:
+def _empty_info(episode: Mapping[str, Any], features: Mapping[str, Any], *, is_shared: bool) -> dict[str, Any]:
     has_video = any(feature['dtype'] == 'video' for feature in features.values())
     return {
-        'codebase_version': VERSION, 'fps': told['fps'], 'features': json.loads(json.dumps(features)), 'total_episodes': 0,
+        'codebase_version': VERSION, 'fps': episode['fps'], 'features': json.loads(json.dumps(features)), 'total_episodes': 0,
         'total_frames': 0, 'total_tasks': 0, 'chunks_size': CHUNK, 'data_files_size_in_mb': 100,
         'video_files_size_in_mb': ANY_SIZE_MB if is_shared else 200,
         'data_path': DATA, 'video_path': VIDEO if has_video else None, 'robot_type': 'go2', 'splits': {},
     }  # fmt: skip
 
 
-def _ours(told: Mapping[str, Any], split: str) -> EpisodeRow:
+def _ours(episode: Mapping[str, Any], split: str) -> EpisodeRow:
     named = ('mission_id', 'run_id', 'robot', 'mission_type', 'first_tick_ns', 'last_tick_ns', 'begins_late_s')
-    row: EpisodeRow = {f'{OURS}{name}': told[name] for name in named}
+    row: EpisodeRow = {f'{OURS}{name}': episode[name] for name in named}
     row[f'{OURS}split'] = split
-    row |= {f'{OURS}clock/{name}': value for name, value in told.get('clock', {}).items()}
-    for stream, each in told['streams'].items():
+    row |= {f'{OURS}clock/{name}': value for name, value in episode.get('clock', {}).items()}
+    for stream, each in episode['streams'].items():
         row |= {f'{OURS}{stream}/{name}': each[name] for name in ('from', 'topic', 'stale_share', 'longest_gap_s')}
         row[f'{OURS}{stream}/causes'] = json.dumps(each['causes'])
     return row
@@ -511,11 +511,11 @@ def vector_stats(values: NDArray[Any]) -> dict[str, Any]:
     found = {'min': values.min(axis=0), 'max': values.max(axis=0), 'mean': values.mean(axis=0, dtype=np.float64),
              'std': values.std(axis=0, dtype=np.float64)}  # fmt: skip
     made = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
-    told = {name: np.asarray(each, np.float64).tolist() for name, each in {**found, **made}.items()}
+    lists = {name: np.asarray(each, np.float64).tolist() for name, each in {**found, **made}.items()}
     return {
-        **{name: told[name] for name in ('min', 'max', 'mean', 'std')},
+        **{name: lists[name] for name in ('min', 'max', 'mean', 'std')},
         'count': [len(values)],
-        **{q: told[q] for q in QUANTILES},
+        **{q: lists[q] for q in QUANTILES},
     }
 
 
@@ -536,8 +536,8 @@ def picture_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
         'max': [float(levels[255 - there[colour][::-1].argmax()]) for colour in range(3)],
         'mean': mean.tolist(), 'std': spread.tolist(),
     }  # fmt: skip
-    told = {**found, **{name: quantile(share) for name, share in QUANTILES.items()}}
-    shaped = {name: [[[value]] for value in values] for name, values in told.items()}
+    statistics = {**found, **{name: quantile(share) for name, share in QUANTILES.items()}}
+    shaped = {name: [[[value]] for value in values] for name, values in statistics.items()}
     return {**{name: shaped[name] for name in found}, 'count': [frames], **{name: shaped[name] for name in QUANTILES}}
 
 
@@ -567,7 +567,7 @@ def _write(path: Path, table: pa.Table) -> None:
 
 
 def _take(source: Path, target: Path) -> None:
-    """A second time, where a kill came between: it has been taken already."""
+    """Idempotent: after a kill the file may have been moved already."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if source.is_file():
         sync(source)
@@ -587,11 +587,11 @@ def _put_json(path: Path, value: Any) -> None:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-    """Raises LakeError for what is there and cannot be read."""
+    """None if missing. Raises LakeError if it cannot be read."""
     try:
         found = json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise LakeError(f'{path} cannot be read: {error}', remedy='fetch or export the data set again') from error
+        raise LakeError(f'{path} cannot be read: {error}', remedy='fetch or export the dataset again') from error
     return found if isinstance(found, dict) else None

@@ -53,7 +53,7 @@ MOST_DETECTIONS: Final = 64 << 20
 
 
 def task_of(folder: Path) -> Path | None:
-    """The task's folder that a training set lies in; None for one that lies elsewhere."""
+    """The task's folder that contains a training set; None if it is elsewhere."""
     return folder.parent.parent if (folder.parent.name, folder.name) == tuple(SET.split('/')) else None
 
 
@@ -85,7 +85,7 @@ def write_recordings(task: Path, plan: EpisodePlan, settings: StoreSettings, wor
 
 
 def synchronize(task: Path) -> list[str]:
-    """Write what speaks of all episodes. Returns what is not there, for the screen."""
+    """Write the files about all episodes. Returns what is missing, for the screen."""
     made = Lerobot(task / SET)
     for row in made.rows:
         for key in made.video_keys():
@@ -103,24 +103,24 @@ def synchronize(task: Path) -> list[str]:
         for row in made.rows
     }
     if any(found.values()):
-        told = [{'episode_index': row['episode_index'], 'mission_id': row[f'{OURS}mission_id'],
+        episodes = [{'episode_index': row['episode_index'], 'mission_id': row[f'{OURS}mission_id'],
                  'detections': found[row[f'{OURS}mission_id']]} for row in made.rows]  # fmt: skip
-        _write_json(task / DETECTIONS, {'episodes': told})
+        _write_json(task / DETECTIONS, {'episodes': episodes})
         return []
     (task / DETECTIONS).unlink(missing_ok=True)
     return [f'No detections were logged: there is no {DETECTIONS}.']
 
 
 def forget(task: Path, mission_id: str) -> None:
-    """Remove what was recorded in a mission."""
+    """Remove the recordings of a mission."""
     for part in (GO2, ARM):
         rmtree(_folder(task, part, mission_id), ignore_errors=True)
 
 
 def _folder(task: Path, part: str, mission_id: str) -> Path:
-    """Of a mission. Its id comes from a store: raises LakeError for one that would lead out of the task's folder."""
+    """Of a mission. Raises LakeError for an id (from a store) that would lead out of the task's folder."""
     if not is_name(mission_id):
-        raise LakeError(f'the mission {printable(mission_id)!r} has a name that no folder can have')
+        raise LakeError(f'the mission {printable(mission_id)!r} has a name that is invalid for a folder')
     return task / part / mission_id
 
 
@@ -131,7 +131,7 @@ def _fresh(folder: Path) -> Path:
 
 
 def _write_odometry(path: Path, series: Series) -> None:
-    """Poses and velocities as they were published; the catalogue's objects keep no covariances."""
+    """Poses and velocities as they were published; the catalog's objects contain no covariances."""
     types = get_typestore(Stores.ROS2_HUMBLE)
     definition, hashed = types.generate_msgdef(ODOMETRY, ros_version=2)
     channel = Channel(series.recording.topic, ODOMETRY, 'ros2msg', definition, hashed, '')
@@ -164,18 +164,18 @@ def _detections(plan: EpisodePlan, place: Place) -> Iterator[dict[str, Any]]:
     for track in plan.detections:
         for number in track.within(plan.mission.begin_ns, plan.mission.end_ns):
             wanted = track.object(int(number))
-            for told in decode.records(place.read(wanted.bucket, wanted.key, MOST_DETECTIONS)):
-                stamp = int(told['stamp_ns']) + int(track.offset_ns[number])
+            for record in decode.records(place.read(wanted.bucket, wanted.key, MOST_DETECTIONS)):
+                stamp = int(record['stamp_ns']) + int(track.offset_ns[number])
                 if plan.mission.begin_ns <= stamp <= plan.mission.end_ns:
                     yield {
-                        **told,
+                        **record,
                         'stamp_ns': stamp,
                         'source': {'bucket': wanted.bucket, 'key': wanted.key, 'sha256': wanted.sha256},
                     }
 
 
 def _write_timestamps(made: Lerobot, file: io.TextIOWrapper) -> None:
-    """A row a frame: its tick, and of each stream the newest message that it was made of, by that one's own clock."""
+    """One row per frame: its tick, and for each stream the newest message in it, by the clock of the stream."""
     table = csv.writer(file)
     sources = pq.read_table(made.folder / SOURCE_TABLE, columns=[EPISODE, 'frame', 'stream', 'stamp_ns'])
     streams: Sequence[str] = made.info['features']['shadowhound.stale']['names'] if made.info else []
@@ -187,8 +187,8 @@ def _write_timestamps(made: Lerobot, file: io.TextIOWrapper) -> None:
         columns = [ticks.tolist(), *(_newest(mine, stream, row['length']).tolist() for stream in streams)]
         columns += _clock_columns(row, ticks)
         table.writerows(
-            [row['episode_index'], row[f'{OURS}mission_id'], frame, *told]
-            for frame, told in enumerate(zip(*columns, strict=True))
+            [row['episode_index'], row[f'{OURS}mission_id'], frame, *stamps]
+            for frame, stamps in enumerate(zip(*columns, strict=True))
         )
 
 

@@ -1,4 +1,4 @@
-"""Which missions are asked for, what of each is in the store, and whether it is known what is missing."""
+"""Which missions are selected, what the store has of each, and whether it is known what is missing."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ BEFORE_NS: Final = 10 * SECOND
 LONGEST_BATCH_NS: Final = 3600 * SECOND
 """An object that began so long before may reach into a mission (sensor.batch_s)."""
 RECORDED: Final = ('odom', 'joints')
-"""Sensors whose messages are handed on as they are, beside what frames are made of (mobile.py)."""
+"""Sensors with messages that are exported unchanged, in addition to the frames (mobile.py)."""
 DETECTIONS: Final = frozenset({'vision_msgs/msg/Detection2DArray', 'vision_msgs/msg/Detection3DArray'})
 END_SLACK_NS: Final = 2 * SECOND
 """A topic's last message comes so much before the end of a mission that the robot is switched off with; a slow topic's two
@@ -61,22 +61,22 @@ periods."""
 
 @dataclass(frozen=True, slots=True)
 class ChosenMission:
-    """A mission that is asked for."""
+    """A selected mission."""
 
     robot: str
     mission_id: str
     run_id: str
     mission_type: str
     task: str
-    """In the words of whoever ordered it; else its type."""
+    """The mission's command; otherwise its type."""
     begin_ns: int
     end_ns: int
-    """0 while it goes on, or its end has not reached the store."""
+    """0 while the mission is active, or its end has not reached the store."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPlan:
-    """One column group of a data set in one mission: what it is called by, where it comes from, and what is known of its gaps."""
+    """One column group of a dataset in one mission: its name, its source, and what is known of its gaps."""
 
     name: str
     part: StatePart | None
@@ -85,32 +85,32 @@ class StreamPlan:
     known: Known
     downsampled: tuple[tuple[int, int], ...]
     complete_ns: int
-    """Up to here the robot has said what is missing; 0 where it has said nothing."""
+    """Up to here the robot has reported what is missing; 0 if it has reported nothing."""
     is_final: bool = False
-    """Whether it will say no more than that: it counts only what came, or the topic ended and the node was started again."""
+    """Whether it will report no more: it counts only received messages, or the topic ended and the node was restarted."""
 
-    def is_told(self, end_ns: int) -> bool:
-        """Whether it is known what is missing up to then."""
+    def is_known(self, end_ns: int) -> bool:
+        """Whether it is known what is missing up to that time."""
         period_ns = round(SECOND / self.recording.rate_hz) if self.recording.rate_hz else 0
         return self.complete_ns + max(END_SLACK_NS, 2 * period_ns) >= end_ns
 
-    def said(self, end_ns: int) -> str:
-        """How far the robot has said what is missing, for a sentence."""
+    def known_until(self, end_ns: int) -> str:
+        """Up to when the robot has reported what is missing, as part of a sentence."""
         return f'up to {(end_ns - self.complete_ns) / SECOND:.1f} s before its end' if self.complete_ns else 'nothing'
 
 
 @dataclass(frozen=True, slots=True)
 class ArmPlan:
-    """An arm beside the robot in one mission, and how its times become the robot's."""
+    """An arm in one mission, and how its times are converted to the robot's."""
 
     tracks: Mapping[str, Track]
     topics: Mapping[str, str]
     clock: ClockOffset | None
     why: str = ''
-    """Why its clock is not known."""
+    """Why its clock is unknown."""
 
     def span_ns(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
-        """By both clocks: bags tell when messages came, by the robot's."""
+        """By both clocks: bags have the arrival times, by the robot's."""
         if self.clock is None:
             return begin_ns, end_ns
         begin, end = self.clock.other_ns(np.array([begin_ns, end_ns]))
@@ -119,7 +119,7 @@ class ArmPlan:
 
 @dataclass(frozen=True, slots=True)
 class EpisodePlan:
-    """A mission, and all that has to be known to make an episode of it. Can be sent to another process."""
+    """A mission, and everything needed to make an episode of it. Can be sent to another process."""
 
     mission: ChosenMission
     streams: tuple[StreamPlan, ...]
@@ -127,14 +127,14 @@ class EpisodePlan:
     topics: Mapping[str, str]
     bags: tuple[Manifest, ...]
     gaps: pa.Table
-    """The statements of the gap journal that were believed."""
+    """The statements of the gap journal that were used."""
     missing: tuple[str, ...] = ()
-    """Sensors that are wanted and of which there is nothing."""
+    """Requested sensors without data."""
     arm: ArmPlan | None = None
     detections: tuple[Track, ...] = ()
     """Of topics with detections of objects."""
     labels: tuple[Label, ...] = ()
-    """Those of its time, where they were asked for."""
+    """The labels of its time, if requested."""
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -142,27 +142,27 @@ class EpisodePlan:
 
     @property
     def waits_for(self) -> str:
-        """Why nobody can say yet what is missing; empty where it is known."""
+        """Why it is unknown so far what is missing; empty if it is known."""
         if not self.mission.end_ns:
             return 'it goes on, or its summary has not arrived'
         end = self.mission.end_ns
         for stream in self.streams:
-            if not stream.is_final and not stream.is_told(end):
-                return f'of {stream.recording.topic} the robot has said {stream.said(end)} what is missing'
+            if not stream.is_final and not stream.is_known(end):
+                return f'of {stream.recording.topic} the robot has said {stream.known_until(end)} what is missing'
         return ''
 
     @property
-    def never_told(self) -> str:
-        """Why nobody will ever know what is missing; empty where it is known, or will be."""
+    def never_complete(self) -> str:
+        """Why it will never be known what is missing; empty if it is known, or will be."""
         end = self.mission.end_ns
         for stream in self.streams:
-            if stream.is_final and not stream.is_told(end):
-                return f'of {stream.recording.topic} the robot can say {stream.said(end)} what is missing'
+            if stream.is_final and not stream.is_known(end):
+                return f'of {stream.recording.topic} the robot can say {stream.known_until(end)} what is missing'
         return ''
 
     @property
     def camera_hz(self) -> float:
-        """Of the slowest camera."""
+        """The rate of the slowest camera."""
         return min((each.recording.rate_hz for each in self.streams if each.part is None), default=0.0)
 
 
@@ -203,7 +203,7 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
 
 
 def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
-    """Why it can be no episode, as far as is known before its messages are read; empty where nothing speaks against it.
+    """Why it cannot become an episode, as far as is known before its messages are read; otherwise empty.
 
     With ``fps`` 0, the rate of the frames is not settled yet.
     """
@@ -211,8 +211,8 @@ def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
         return f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it'
     if plan.arm is not None and plan.arm.clock is None:
         return plan.arm.why
-    if plan.never_told and not options.allow_gaps:
-        return f'{plan.never_told}, and no more will come: --allow-gaps takes it'
+    if plan.never_complete and not options.allow_gaps:
+        return f'{plan.never_complete}, and no more will come: --allow-gaps takes it'
     if not fps:
         return ''
     if plan.arm is not None and plan.arm.clock is not None and plan.arm.clock.uncertainty_ns > SECOND // fps // 2:
@@ -226,7 +226,7 @@ def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
 
 
 def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:
-    """``cmd_vel`` or ``odometry``: with ``auto`` the command topic where a mission has one."""
+    """``cmd_vel`` or ``odometry``: with ``auto`` the command topic if a mission has one."""
     if action != 'auto':
         return action
     return 'cmd_vel' if any(stream.part == COMMAND for plan in plans for stream in plan.streams) else 'odometry'
@@ -285,7 +285,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
 def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, options: ExportOptions, *, bags: Sequence[Manifest],  # noqa: PLR0913
                  stated: pa.Table, recorded: Sequence[Manifest], work: Path,
                  findings: Findings) -> tuple[ArmPlan, list[StreamPlan]]:  # fmt: skip
-    """What an arm recorded in the mission's time by its own clock; no streams where that is not known."""
+    """What an arm recorded during the mission, by its own clock; no streams if the clock is unknown."""
     since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
     topics = {sensor: f'/{options.arm}/{name}' for sensor, name in ARM_TOPICS.items()}
 
@@ -296,8 +296,8 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
             source, findings=findings, columns=(*NEEDED, 'topic'), where=mine, since=utc(begin - LONGEST_BATCH_NS),
             until=utc(end + 1000),
         ).to_pylist()  # fmt: skip
-        told = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
-        return {sensor: _track_of(some, begin, end) for sensor, some in told.items() if some}
+        rows_of = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
+        return {sensor: _track_of(some, begin, end) for sensor, some in rows_of.items() if some}
 
     place, wide = Place(source.settings), (since - NEAR_NS, until + NEAR_NS)
     pairs = [np.array(options.clock_pairs, np.int64).reshape(-1, 2)]
@@ -305,8 +305,8 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     with Recordings(place, store, tracks(*wide, ARM_CLOCK), topics, wide, near, work) as recordings:
         if (events := recordings.best(ARM_CLOCK)) is not None:
             series = recordings.series(events, ('time_ref.sec', 'time_ref.nanosec'))
-            told = series.values.astype(np.int64)
-            pairs.append(np.column_stack([series.stamps, told[:, 0] * SECOND + told[:, 1]]))
+            times = series.values.astype(np.int64)
+            pairs.append(np.column_stack([series.stamps, times[:, 0] * SECOND + times[:, 1]]))
     try:
         clock = measured(np.concatenate(pairs), mission.begin_ns, mission.end_ns)
     except LakeError as error:
@@ -324,9 +324,7 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     parts.append((ARM_ACTION, ARM_COMMAND, commands) if commands else (ARM_ACTION, ARM_STATE, joints))
     for name, part, recording in parts:
         track = arm.tracks.get(recording.sensor)
-        if (
-            recording.sink == OBJECTS and track is not None and track.robot != mission.robot
-        ):  # what was brought in is all there is
+        if recording.sink == OBJECTS and track is not None and track.robot != mission.robot:  # what was imported is complete
             known = of_rows(track.robot, OBJECTS, recording.topic, begin, end + SECOND, ())
             streams.append(StreamPlan(name, part, recording, known, (), mission.end_ns))
         else:
@@ -343,7 +341,7 @@ def _track_of(rows: Sequence[Row], begin_ns: int, end_ns: int) -> Track:
 
 
 def _within(rows: Sequence[Row], begin_ns: int, end_ns: int) -> list[Row]:
-    """The objects that have messages of this time."""
+    """The objects with messages of this time."""
     return [row for row in rows if row['t_start_ns'] <= end_ns and (row['t_end_ns'] or row['t_start_ns']) >= begin_ns]
 
 

@@ -1,4 +1,4 @@
-"""``report.png``: each episode of a data set in a row of one picture: some frames, the path, and when which stream was stale."""
+"""``report.png``: one row per episode of a dataset: some frames, the path, and when each stream was stale."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PALE, RED, GREEN = '#9aa7b3', '#d62828', '#4c9f70'
 
 
 def draw(made: Lerobot, target: Path) -> None:
-    """Write the picture of a data set that has at least one episode. Raises LakeError, OSError."""
+    """Write the picture of a dataset that has at least one episode. Raises LakeError, OSError."""
     rows = evenly(made.rows, MOST)
     sheet = Image.new('RGB', (WIDTH, len(rows) * (HEIGHT + GAP) + GAP), 'white')
     for place, row in enumerate(rows):

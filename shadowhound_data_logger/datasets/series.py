@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 KEEP_BYTES: Final = 16 << 20
 THREADS: Final = 8
 LEAST_SPAN_NS: Final = 2 * SECOND
-"""Of a slice from which a rate is told."""
+"""Of a slice from which a rate is computed."""
 AS_MUCH: Final = 0.5
 """A recording competes with the one that covers most of a mission if it covers so much of what that one does."""
 NEARLY_ALL: Final = 0.9
@@ -325,8 +325,8 @@ class Recordings:
         known = self._topics.get(sensor)
         if known is not None:
             return topic == known
-        told = DEFAULT_SENSORS.get(sensor, {})
-        names = zip(told.get('topics', ()), told.get('types', ()), strict=False)
+        defaults = DEFAULT_SENSORS.get(sensor, {})
+        names = zip(defaults.get('topics', ()), defaults.get('types', ()), strict=False)
         return any(kind == wanted and (topic == f'/{name}' or topic.endswith(f'/{name}')) for name, wanted in names)
 
     def _parts(self, topic: str) -> list[_SlicePart]:
@@ -372,9 +372,9 @@ class Recordings:
                         where.append((bodies.tell(), len(content), extension))
                         bodies.write(content)
                     else:
-                        told = types.deserialize(message.channel.type, message.cdr)
-                        names = names or tuple(map(str, getattr(told, 'name', ()) or ()))
-                        rows.append(_values(told, message.channel.type, fields))
+                        decoded = types.deserialize(message.channel.type, message.cdr)
+                        names = names or tuple(map(str, getattr(decoded, 'name', ()) or ()))
+                        rows.append(_values(decoded, message.channel.type, fields))
                 except Rejected:
                     continue
                 stamps.append(stamp)
@@ -487,8 +487,8 @@ def _types_of(channel: Channel, folder: Path) -> MessageTypes:
         definitions = [(named[1], named[2], first)]
         for other in others:
             title, _, body = other.partition('\n')
-            if (told := _MESSAGE_TITLE.match(title)) is not None:
-                definitions.append((told[1], told[2], body))
+            if (found := _MESSAGE_TITLE.match(title)) is not None:
+                definitions.append((found[1], found[2], body))
         for package, name, body in definitions:
             path = folder / 'share' / package / 'msg' / f'{name}.msg'
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What was known at each tick: the latest message at or before it, never a later one, and how old that was.
+"""The known values at each tick: the latest message at or before it, never a later one, and its age.
 
 Times are ns since 1970 (int64). Nothing here looks at a message whose stamp is after the tick.
 """
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 SLACK: Final = 1.02
 """A rate counts as the next whole one from so much below it: 29.97 Hz are 30."""
 LATE: Final = 1.5
-"""A message is stale after so many periods, unless told otherwise."""
+"""By default, a message is stale after so many periods."""
 PHASE: Final = 95
 """Percent of the pictures that arrive before their tick: ticks begin so much after the first picture."""
 NOT_SAMPLED, NOT_PUBLISHED, UNKNOWN = 'not_sampled', 'not_published', 'unknown'
-"""Causes beside those of the gap journal: left out on purpose; not there at all; nobody knows."""
+"""Causes in addition to those of the gap journal: skipped on purpose; not published; unknown."""
 
 
 def whole_fps(rate_hz: float) -> int:
-    """The frames a second that a source can fill; 0 where it cannot even fill one."""
+    """The frames per second that a source can fill; 0 if less than one."""
     return int(rate_hz * SLACK + 1e-9)
 
 
@@ -47,7 +47,7 @@ def phase_of(stamps: NDArray[np.int64], first_ns: int, fps: int) -> int:
 
 
 def latest(stamps: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The number of the last message at or before each tick; -1 where there is none. Of equal stamps, the last one."""
+    """The number of the last message at or before each tick; -1 if there is none. Of equal stamps, the last one."""
     return np.searchsorted(stamps, ticks, 'right').astype(np.int64) - 1
 
 
@@ -132,7 +132,7 @@ def motion(
 
 
 def cause_of(known: Known, thinned: Sequence[tuple[int, int]], message_ns: int, tick_ns: int) -> str:
-    """Why there is no newer message at a tick: that of the gap around it, else of one since the newest message.
+    """Why there is no newer message at a tick: the cause of the gap around it, otherwise of one since the newest message.
 
     ``thinned`` are times in which messages were left out on purpose.
     """

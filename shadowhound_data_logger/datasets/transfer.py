@@ -1,4 +1,4 @@
-"""A data set to a bucket and back: file by file, verified, ``info.json`` last, and after a kill only what is missing."""
+"""Uploads and downloads a dataset: file by file, verified, ``info.json`` last; after a kill, only what is missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shadowhound_data_logger.stores.download import download
 SCHEME: Final = 's3://'
 BUCKET: Final = 'lerobot'
 FOLDER: Final = 'datasets/'
-"""Below which a bucket has data sets."""
+"""The prefix of datasets in a bucket."""
 THREADS: Final = 4
 TRIES: Final = 6
 MOST_DIGEST_BYTES: Final = 1 << 28
@@ -34,7 +34,7 @@ _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*?)/*')
 
 @dataclass(frozen=True, slots=True)
 class DatasetPlace:
-    """Where a data set lies in a store."""
+    """The location of a dataset in a store."""
 
     bucket: str
     prefix: str
@@ -54,7 +54,7 @@ class DatasetPlace:
 
 @dataclass(slots=True)
 class Transferred:
-    """What was moved; files that were right already were not."""
+    """What was transferred; identical files were skipped."""
 
     files: int = 0
     bytes: int = 0
@@ -62,15 +62,15 @@ class Transferred:
 
 
 def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[[str], None] = lambda _: None) -> Transferred:
-    """Make the place have what the folder has. While that goes on it has no ``info.json``: nobody takes it for whole.
+    """Upload the folder. During the upload the place has no ``info.json``, so that it is recognized as incomplete.
 
     First it has the digests, so that ``catch_up`` knows whose upload was cut off.
 
-    Raises StoreError, LakeError for a folder that is not a data set.
+    Raises StoreError, LakeError for a folder that is not a dataset.
     """
     made = Lerobot(folder)
     if made.info is None:
-        raise LakeError(f'{folder} is not a data set: it has no {INFO}', remedy='shadowhound-data export lerobot makes one')
+        raise LakeError(f'{folder} is not a dataset: it has no {INFO}', remedy='shadowhound-data export lerobot makes one')
     paths = sorted(made.paths())
     local = {path.relative_to(folder).as_posix(): path for path in paths}
     last = {name: folder / name for name in (FILES, INFO)}
@@ -106,24 +106,24 @@ def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[
 def fetch_dataset(
     place: DatasetPlace, folder: Path, store: ObjectStore, say: Callable[[str], None] = lambda _: None
 ) -> Transferred:
-    """Make the folder have what the place has, ``info.json`` last; files of it that are gone there are removed.
+    """Download the dataset, ``info.json`` last; files that the place does not have any more are removed.
 
-    Raises StoreError, LakeError where there is no data set.
+    Raises StoreError, LakeError if there is no dataset.
     """
     remote = {info.key[len(place.prefix) :]: info for info in store.list(place.bucket, place.prefix)}
     if INFO not in remote:
-        raise LakeError(f'there is no data set at {place}', remedy='is it being uploaded? It has no meta/info.json')
+        raise LakeError(f'there is no dataset at {place}', remedy='is it being uploaded? It has no meta/info.json')
     moved = Transferred()
     info = store.head(place.bucket, place.prefix + INFO)
     here = folder / INFO
     if here.is_file() and (info is None or fingerprint(here)[1] != info.sha256):
         here.unlink()
 
-    def bring(name: str) -> int:
+    def get(name: str) -> int:
         path = path_below(folder, name)
         held = _ask(lambda: store.head(place.bucket, place.prefix + name))
         if held is None:
-            raise LakeError(f'{place}/{name} is gone', remedy='it was changed meanwhile: fetch it again')
+            raise LakeError(f'{place}/{name} was deleted', remedy='the dataset changed during the download: fetch it again')
         if path.is_file() and path.stat().st_size == held.size and held.sha256 and fingerprint(path)[1] == held.sha256:
             return 0
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,23 +132,23 @@ def fetch_dataset(
 
     with ThreadPoolExecutor(THREADS, 'export-get') as pool:
         names = sorted(set(remote) - {INFO})
-        for number, size in enumerate(pool.map(bring, names)):
+        for number, size in enumerate(pool.map(get, names)):
             say(f'{number + 1} of {len(names)} files')
             moved.files += bool(size)
             moved.bytes += size
     for path in _stray(folder, remote):
         path.unlink()
         moved.removed += 1
-    size = bring(INFO)
+    size = get(INFO)
     moved.files += bool(size)
     moved.bytes += size
     return moved
 
 
 def catch_up(place: DatasetPlace, folder: Path, store: ObjectStore, say: Callable[[str], None] = lambda _: None) -> bool:
-    """Make the copy in a folder what the place has, unless that is what the copy once was; whether there is anything.
+    """Update the copy in a folder from the place, unless the copy is newer; returns whether the place has a dataset.
 
-    Raises StoreError, and LakeError where another machine's upload to it is not at its end.
+    Raises StoreError, and LakeError if another machine's upload to it is unfinished.
     """
     there = {info.key[len(place.prefix) :] for info in store.list(place.bucket, place.prefix)}
     if not there:
@@ -159,7 +159,7 @@ def catch_up(place: DatasetPlace, folder: Path, store: ObjectStore, say: Callabl
     if (folder / INFO).is_file() and last in {'', *_digests((folder / DIGESTS).read_bytes())}:
         return True
     if INFO not in there:
-        raise LakeError(f'another machine began to upload {place} and has not finished',
+        raise LakeError(f'another machine started to upload {place} and has not finished',
                         remedy='wait for it, or run its command there again')  # fmt: skip
     fetch_dataset(place, folder, store, say)
     return True
@@ -170,11 +170,11 @@ def _digests(body: bytes) -> list[str]:
     try:
         return [str(each['digest']) for each in from_json(body)['digests']]
     except (ValueError, LookupError, TypeError) as error:
-        raise LakeError(f'{DIGESTS} of a data set cannot be read: {error}') from error
+        raise LakeError(f'{DIGESTS} of a dataset cannot be read: {error}') from error
 
 
 def datasets_in(store: ObjectStore, bucket: str = BUCKET) -> Iterator[DatasetPlace]:
-    """Those of a bucket that are whole. Raises StoreError."""
+    """The complete datasets in a bucket. Raises StoreError."""
     for info in store.list(bucket, FOLDER):
         if info.key.endswith(f'/{INFO}'):
             yield DatasetPlace(bucket, info.key.removesuffix(INFO))

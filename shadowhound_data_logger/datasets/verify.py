@@ -1,6 +1,6 @@
-"""Proves a data set: its files are whole, its sources are in the store as they were, its pictures are theirs.
+"""Verifies a dataset: its files are complete, its sources are unchanged in the store, its images match their sources.
 
-And the other way round: which data sets, and which models, saw an object.
+And the other way round: which datasets, and which models, saw an object.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 THREADS: Final = 16
 FRAMES: Final = 5
-"""Of each camera in each episode, unless all are asked for."""
+"""Frames of each camera in each episode, by default."""
 ALIKE: Final = 0.8
 """Least similarity (SSIM) of a frame of a video to its source; AV1 at crf 30 keeps more than 0.9 of what cameras see."""
 MOST_TABLE_BYTES: Final = 1 << 30
 
 
 @dataclass(slots=True)
-class Proved:
-    """What was looked at, and what is wrong."""
+class VerifyResult:
+    """What was checked, and what is wrong."""
 
     episodes: int = 0
     files: int = 0
@@ -55,17 +55,17 @@ class Proved:
 
 def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_read: bool = False,
            forgotten: Callable[[], Mapping[tuple[str, str], str]] = dict,
-           say: Callable[[str], None] = lambda _: None) -> Proved:  # fmt: skip
+           say: Callable[[str], None] = lambda _: None) -> VerifyResult:  # fmt: skip
     """``frames`` is how many of each camera and episode are compared, None for all; ``is_read`` reads every source again.
 
     ``forgotten`` is asked where sources are gone: (bucket, key) -> the date on which `lake prune` deleted it.
 
-    Raises LakeError for what is no data set of ours, StoreError.
+    Raises LakeError for a dataset of another program, StoreError.
     """
     made = Lerobot(folder)
     if made.info is None:
-        raise LakeError(f'{folder} is not a data set: it has no {INFO}', remedy='name a folder that export lerobot wrote')
-    found = Proved(episodes=len(made.rows))
+        raise LakeError(f'{folder} is not a dataset: it has no {INFO}', remedy='name a folder that export lerobot wrote')
+    found = VerifyResult(episodes=len(made.rows))
     _files(made, found)
     try:
         table = pq.read_table(folder / SOURCE_TABLE)
@@ -87,20 +87,20 @@ def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_
     return found
 
 
-def _files(made: Lerobot, found: Proved) -> None:
-    told = json.loads((made.folder / FILES).read_text(encoding='utf-8'))['files'] if (made.folder / FILES).is_file() else {}
-    for name in sorted({*told, *(path.relative_to(made.folder).as_posix() for path in made.paths())}):
+def _files(made: Lerobot, found: VerifyResult) -> None:
+    listed = json.loads((made.folder / FILES).read_text(encoding='utf-8'))['files'] if (made.folder / FILES).is_file() else {}
+    for name in sorted({*listed, *(path.relative_to(made.folder).as_posix() for path in made.paths())}):
         path = made.folder / name
         if not is_path(name) or not path.is_file():
             found.wrong.append(f'{name} is missing')
-        elif name not in told:
+        elif name not in listed:
             found.wrong.append(f'{name} is not in {FILES}')
-        elif fingerprint(path) != (told[name]['bytes'], told[name]['sha256']):
+        elif fingerprint(path) != (listed[name]['bytes'], listed[name]['sha256']):
             found.wrong.append(f'{name} is not what was written')
         found.files += 1
 
 
-def _sources(table: pa.Table, store: ObjectStore, found: Proved, forgotten: Callable[[], Mapping[tuple[str, str], str]], *,
+def _sources(table: pa.Table, store: ObjectStore, found: VerifyResult, forgotten: Callable[[], Mapping[tuple[str, str], str]], *,
              is_read: bool) -> None:  # fmt: skip
     gone: list[tuple[str, str]] = []
     rows = table.group_by(['bucket', 'key', 'sha256']).aggregate([]).sort_by('key').to_pylist()
@@ -138,27 +138,27 @@ def _sha256_of(store: ObjectStore, bucket: str, key: str) -> str:
 
 
 def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: ObjectStore, most: int | None,
-            found: Proved) -> None:  # fmt: skip
+            found: VerifyResult) -> None:  # fmt: skip
     stream, length = key.removeprefix('observation.'), int(row['length'])
     wanted = range(length) if most is None else sorted({round(at) for at in np.linspace(0, length - 1, min(most, length))})
     mine = sources.filter(pc.and_(pc.equal(sources['stream'], stream), pc.is_in(sources['frame'], pa.array(wanted, pa.int64()))))
-    told = {each['frame']: each for each in mine.to_pylist()}
-    if sorted(told) != list(wanted):
+    by_frame = {each['frame']: each for each in mine.to_pylist()}
+    if sorted(by_frame) != list(wanted):
         found.wrong.append(f'episode {row["episode_index"]}: frames of {key} have no source')
         return
     with TemporaryDirectory() as work:
-        asked = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in told.values()}
+        asked = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in by_frame.values()}
         pictures = pictures_of(store, asked, row[f'{OURS}{stream}/topic'], Path(work))
     count = 0
     shown: Iterator[Any] = made.pictures(row, key) if key in made.video_keys() else made.bodies(row, key)
     for number, content in enumerate(shown):
         count += 1
-        if number not in told:
+        if number not in by_frame:
             continue
-        body = pictures.get((told[number]['key'], told[number]['stamp_ns']))
+        body = pictures.get((by_frame[number]['key'], by_frame[number]['stamp_ns']))
         if body is None:
             found.wrong.append(
-                f'episode {row["episode_index"]}, frame {number}: its source {told[number]["key"]} has no such picture'
+                f'episode {row["episode_index"]}, frame {number}: its source {by_frame[number]["key"]} has no such picture'
             )
             continue
         found.frames += 1
@@ -176,39 +176,39 @@ def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: 
         found.wrong.append(f'episode {row["episode_index"]}: {key} has {count} frames, the episode {length}')
 
 
-# -- which data sets saw an object ---------------------------------------------------------------------------------------------
+# -- which datasets saw an object ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """A data set with values of an object."""
+class DatasetUse:
+    """A dataset with values of an object."""
 
     where: str
     missions: tuple[str, ...]
     frames: int
     digests: tuple[str, ...]
-    """Of all its states in which it had them."""
+    """The digests of all its states with these values."""
 
 
-def seen_in_folder(folder: Path, key: str) -> Seen | None:
-    """Raises LakeError for a folder that is none of ours."""
+def use_in_folder(folder: Path, key: str) -> DatasetUse | None:
+    """Raises LakeError for a folder of another program."""
     try:
-        return _seen(str(folder), pq.read_table(folder / SOURCE_TABLE), from_json((folder / DIGESTS).read_bytes()), key)
+        return _use(str(folder), pq.read_table(folder / SOURCE_TABLE), from_json((folder / DIGESTS).read_bytes()), key)
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise LakeError(f'{folder} is no data set of this program: {error}') from error
+        raise LakeError(f'{folder} is not a dataset of this program: {error}') from error
 
 
-def seen_in_store(source: Bucket, place: DatasetPlace, key: str) -> Seen | None:
+def use_in_store(source: Bucket, place: DatasetPlace, key: str) -> DatasetUse | None:
     """Raises StoreError, LakeError."""
     try:
         body = source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES)
-        told = from_json(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
-        return _seen(str(place), pq.read_table(io.BytesIO(body)), told, key)
+        digests = from_json(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
+        return _use(str(place), pq.read_table(io.BytesIO(body)), digests, key)
     except (ValueError, pa.ArrowException) as error:
-        raise LakeError(f'{place} is no data set of this program: {error}') from error
+        raise LakeError(f'{place} is not a dataset of this program: {error}') from error
 
 
-def _seen(where: str, table: pa.Table, told: Any, key: str) -> Seen | None:
+def _use(where: str, table: pa.Table, digests: Any, key: str) -> DatasetUse | None:
     bucket, _, rest = key.partition('/')
     mine = table.filter(
         pc.or_(pc.equal(table['key'], key), pc.and_(pc.equal(table['bucket'], bucket), pc.equal(table['key'], rest)))
@@ -217,27 +217,27 @@ def _seen(where: str, table: pa.Table, told: Any, key: str) -> Seen | None:
         return None
     missions = tuple(sorted(set(mine[EPISODE].to_pylist())))
     frames = len(mine.group_by([EPISODE, 'frame']).aggregate([]))
-    digests = tuple(each['digest'] for each in told['digests'] if {*missions} & {*each['missions']})
-    return Seen(where, missions, frames, digests)
+    digests = tuple(each['digest'] for each in digests['digests'] if {*missions} & {*each['missions']})
+    return DatasetUse(where, missions, frames, digests)
 
 
 def sources_in_folder(folder: Path) -> set[tuple[str, str]]:
-    """(bucket, key) of all objects that a data set has values of, or an export to it has begun to read. Raises LakeError."""
+    """(bucket, key) of all objects with values in a dataset, or that a running export to it reads. Raises LakeError."""
     found: set[tuple[str, str]] = set()
     try:
         for path in (folder / SOURCE_TABLE, *folder.glob(f'.shadowhound/*/{SOURCES}')):
             found |= _named(pq.read_table(path))
     except (OSError, ValueError, pa.ArrowException, LookupError) as error:
-        raise LakeError(f'the data set {folder} cannot be read: {error}', remedy='mend it, or move it away') from error
+        raise LakeError(f'the dataset {folder} cannot be read: {error}', remedy='repair it, or move it away') from error
     return found
 
 
 def sources_in_store(source: Bucket, place: DatasetPlace) -> set[tuple[str, str]]:
-    """The same, of a data set in a store. Raises StoreError, LakeError."""
+    """The same for a dataset in a store. Raises StoreError, LakeError."""
     try:
         return _named(pq.read_table(io.BytesIO(source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES))))
     except (ObjectRefused, ValueError, pa.ArrowException, LookupError) as error:
-        raise LakeError(f'the data set {place} cannot be read: {error}', remedy='mend it, or delete it') from error
+        raise LakeError(f'the dataset {place} cannot be read: {error}', remedy='repair it, or delete it') from error
 
 
 def _named(table: pa.Table) -> set[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Pictures to an mp4 and back, with PyAV: the settings that LeRobot itself uses, and the same bytes whoever runs it.
+"""Encodes images to an mp4 and decodes them, with PyAV: LeRobot's own settings, and the same bytes on every machine.
 
 SVT-AV1 writes the same for any number of threads; x264 does not, so it has one. A frame's time is its number divided by the
 frames a second, exactly: the stream's time base is that or a fraction of it.
@@ -39,7 +39,7 @@ BLOCK: Final = 8
 
 
 class VideoWriter:
-    """Frames of one size, one after the other. Enter once; a file that an error leaves behind is not whole."""
+    """Frames of one size, one after the other. Enter once; a file that an error leaves behind is incomplete."""
 
     def __init__(self, path: Path, fps: int, size: tuple[int, int], codec: str) -> None:
         """``size`` is (height, width), both even. Raises LakeError otherwise."""
@@ -52,7 +52,7 @@ class VideoWriter:
         self._stream: Any = None
 
     def __enter__(self) -> Self:
-        os.environ.setdefault('SVT_LOG', '1')  # errors alone
+        os.environ.setdefault('SVT_LOG', '1')  # only errors
         self._file = av.open(str(self._path), 'w', format='mp4')
         self._stream = self._file.add_stream(self._encoder, rate=self._fps, options=dict(self._options))
         self._stream.height, self._stream.width = self._size
@@ -103,7 +103,7 @@ class Clip:
 
 
 def frames_of(clip: Clip, fps: int) -> Iterator[NDArray[np.uint8]]:
-    """Pixels RGB of each of its frames. Raises LakeError for what is no video."""
+    """The RGB pixels of each of its frames. Raises LakeError for what is not a video."""
     try:
         with av.open(str(clip.path)) as file:
             stream = file.streams.video[0]
@@ -117,7 +117,7 @@ def frames_of(clip: Clip, fps: int) -> Iterator[NDArray[np.uint8]]:
 
 
 def count_frames(path: Path) -> int:
-    """By the index of the file. Raises LakeError for what is no video."""
+    """By the index of the file. Raises LakeError for what is not a video."""
     try:
         with av.open(str(path)) as file:
             return int(file.streams.video[0].frames)
@@ -180,7 +180,7 @@ def frames_at(path: Path, fps: int, numbers: Sequence[int]) -> Iterator[NDArray[
 
 
 def feature_info(codec: str, fps: int, size: tuple[int, int]) -> dict[str, Any]:
-    """What lerobot writes of a video into ``info.json`` (video_utils.get_video_info)."""
+    """What lerobot writes about a video to ``info.json`` (video_utils.get_video_info)."""
     _, options = CODECS[codec]
     return {
         'video.height': size[0], 'video.width': size[1], 'video.codec': _NAMES[codec], 'video.pix_fmt': PIXELS, 'video.fps': fps,

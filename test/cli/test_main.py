@@ -197,7 +197,7 @@ def test_a_remedy_of_its_own_comes_first() -> None:
     (['bag', 'list', '--robot', '../x'], ExitCode.USAGE, 'the robot name', 'letters'),
     (['bag', 'info', './none'], ExitCode.USAGE, 'there is no folder ./none', f'{PROGRAM} bag list'),
     (['bag', 'info', 'none'], ExitCode.USAGE, 'none', '--robot'),
-    (['missions', 'show', 'x'], ExitCode.USAGE, "no mission here has the id 'x'", f'{PROGRAM} missions list'),
+    (['missions', 'show', 'x'], ExitCode.USAGE, "there is no mission or run with the id 'x'", f'{PROGRAM} missions list'),
     (['ledger', '--topic', '/imu'], ExitCode.USAGE, 'choose among gaps', '--gaps'),
     (['ledger', '--since', 'now', '--gaps', '--until', 'x'], ExitCode.USAGE, "--until = 'x' is refused", 'allowed is now'),
     (['status', '--interval', '0'], ExitCode.USAGE, 'Invalid value', f'{PROGRAM} status --help'),

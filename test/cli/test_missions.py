@@ -84,7 +84,7 @@ def test_what_somebody_sends_already_needs_no_resume(tmp_path: Path) -> None:
     fly(tmp_path)
     with flock(tmp_path / MISSIONS / LOCK):
         text = run(tmp_path, 'list').output
-    assert '1 not sent whole: being sent' in text
+    assert '1 not completely sent: being sent' in text
     assert 'resume' not in text
 
 

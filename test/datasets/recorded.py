@@ -1,4 +1,4 @@
-"""A robot's missions for the tests of data sets: objects made by the node's own encoders, every value a formula of its stamp."""
+"""A robot's missions for the tests of datasets: objects made by the node's own encoders, every value a formula of its stamp."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_the_offset_is_what_it_was(exported: Exported) -> None:
 
 def test_an_episode_whose_offset_nobody_knows_is_refused(exported: Exported) -> None:
     """With the reason."""
-    assert exported.refused == {LAST: "the offset of the arm's clock is not known: no event of which both machines told the time"}
+    assert exported.refused == {LAST: "the offset of the arm's clock is not known: no event was timed by both machines"}
     assert exported.waiting == {}
 
 
@@ -179,5 +179,5 @@ def test_a_clock_that_was_set_is_no_clock() -> None:
     """A step in the middle of an episode is not a drift."""
     times = NOON_NS + np.arange(30) * SECOND
     stepped = np.column_stack([times, times + np.where(np.arange(30) < 15, 0, SECOND // 2)])
-    with pytest.raises(LakeError, match='was set meanwhile'):
+    with pytest.raises(LakeError, match='was set during that time'):
         measured(stepped, NOON_NS, NOON_NS + 30 * SECOND)

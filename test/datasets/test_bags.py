@@ -1,4 +1,4 @@
-"""Where a bag has more of a sensor than the objects have, the data set is made of the bag, and says so."""
+"""Where a bag has more of a sensor than the objects have, the dataset is made of the bag, and says so."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
 
 
 def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:
-    """The store has the manifest of the bag alone: the data set is made of the objects."""
+    """The store has the manifest of the bag alone: the dataset is made of the objects."""
     house = House(tmp_path)
     house.record(Mission('bagged', seconds=2, camera_hz=5.0, odom_hz=5.0, sensors=('camera', 'odom')))
     record_bag(house, tmp_path, is_there=False)

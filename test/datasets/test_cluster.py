@@ -94,7 +94,7 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
 
 @pytest.fixture(scope='module')
 def wanted(house: House) -> dict[str, bytes]:
-    """The files of the data set that this machine makes alone, one episode after the other."""
+    """The files of the dataset that this machine makes alone, one episode after the other."""
     finished(start(house.folder, '--to', 'alone'))
     found = contents(house.folder / 'alone')
     assert len(Lerobot(house.folder / 'alone').mission_ids) == 3

@@ -1,4 +1,4 @@
-"""A data set has what each mission recorded, as it was known at each tick, and says what is missing and where it came from."""
+"""A dataset has what each mission recorded, as it was known at each tick, and says what is missing and where it came from."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from shadowhound_data_logger.datasets.export import Exported, drop, export, resu
 from shadowhound_data_logger.datasets.features import AV1, H264, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import DATA, OURS, SOURCE_TABLE, Lerobot, matrix
 from shadowhound_data_logger.datasets.transfer import DatasetPlace, datasets_in, fetch_dataset, upload
-from shadowhound_data_logger.datasets.verify import seen_in_folder, seen_in_store, verify
+from shadowhound_data_logger.datasets.verify import use_in_folder, use_in_store, verify
 from shadowhound_data_logger.datasets.video import VideoWriter, frames_at
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -421,8 +421,8 @@ def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
 
 
 def test_other_settings_are_another_data_set(house: House, exported: Exported, tmp_path: Path) -> None:
-    """What it was begun with holds for all of it; what no source has is refused, and what is there is told."""
-    with pytest.raises(LakeError, match='was begun with codec av1'):
+    """What it was started with holds for all of it; what no source has is refused, and what is there is told."""
+    with pytest.raises(LakeError, match='was started with codec av1'):
         export(exported.folder, house.source, PATROLS, ExportOptions(state=('pose', 'imu', 'joints'), codec='h264'))
     found = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions(fps=30))
     assert found.refused == {'whole': '/camera has 10 Hz in the objects, less than 30 frames a second'}
@@ -432,11 +432,11 @@ def test_other_settings_are_another_data_set(house: House, exported: Exported, t
 
 @pytest.mark.long('a second of CPU or more')
 def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Path) -> None:
-    """Everywhere in the data set, for good; the others have the numbers that they would have had without it."""
+    """Everywhere in the dataset, for good; the others have the numbers that they would have had without it."""
     options = ExportOptions(max_stale=0.3)
     export(tmp_path / 'set', house.source, PATROLS, options)
     key = pq.read_table(tmp_path / 'set' / SOURCE_TABLE)['key'][0].as_py()
-    seen = seen_in_folder(tmp_path / 'set', key)
+    seen = use_in_folder(tmp_path / 'set', key)
     assert seen is not None
     assert seen.missions == ('whole',)
     drop(tmp_path / 'set', 'whole')
@@ -447,7 +447,7 @@ def test_an_episode_is_taken_out(house: House, exported: Exported, tmp_path: Pat
     table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
     assert table['index'].to_pylist() == list(range(len(table)))
     assert set(table['episode_index'].to_pylist()) == {0}
-    assert seen_in_folder(tmp_path / 'set', key) is None
+    assert use_in_folder(tmp_path / 'set', key) is None
     assert export(tmp_path / 'set', house.source, PATROLS, options).added == []
     store = DirectoryStore(house.settings.directory)
     store.open()
@@ -469,11 +469,11 @@ def test_a_data_set_goes_to_the_store_and_back(house: House, exported: Exported,
     assert fetch_dataset(place, tmp_path / 'back', store).removed == 1
     sources = pq.read_table(exported.folder / 'meta/shadowhound_sources.parquet')
     key = sources['key'][0].as_py()
-    seen = seen_in_store(Bucket(house.settings, 'lerobot'), place, f'sensor-data/{key}')
+    seen = use_in_store(Bucket(house.settings, 'lerobot'), place, f'sensor-data/{key}')
     assert seen is not None
     assert seen.missions == ('whole',)
     assert seen.digests == (exported.digest,)
-    assert seen_in_folder(exported.folder, 'thor/nothing.jpg') is None
+    assert use_in_folder(exported.folder, 'thor/nothing.jpg') is None
 
 
 def test_lerobot_doctor_finds_nothing_wrong(exported: Exported) -> None:

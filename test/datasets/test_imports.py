@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
-from shadowhound_data_logger.datasets.imports import Imported, bring, identity_of, of_hdf5, of_lerobot, times_of
+from shadowhound_data_logger.datasets.imports import Imported, identity_of, import_episodes, of_hdf5, of_lerobot, times_of
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.stores import open_store
@@ -112,8 +112,8 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
     """As it is, joints in degrees: stored once, in the catalogue, and each value traced to the object and the file."""
     arm, source = f'arm{version[1]}', lerobot_set(tmp_path / 'theirs', version)
     store = open_store(house.settings, UploadSettings())
-    assert bring(of_lerobot(source, times_of(times), is_degrees=True), arm, store).objects == 4
-    again = bring(of_lerobot(source, times_of(times), is_degrees=True), arm, store)
+    assert import_episodes(of_lerobot(source, times_of(times), is_degrees=True), arm, store).objects == 4
+    again = import_episodes(of_lerobot(source, times_of(times), is_degrees=True), arm, store)
     assert (again.objects, again.present) == (0, 4)
     made = exported(house, tmp_path / 'set', arm)
     assert_is_as_recorded(made)
@@ -127,7 +127,7 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
 def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) -> None:
     """The numbers stay as they are, and no unit is claimed."""
     store = open_store(house.settings, UploadSettings())
-    bring(of_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), times_of(times), is_degrees=False), 'bare', store)
+    import_episodes(of_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), times_of(times), is_degrees=False), 'bare', store)
     made = exported(house, tmp_path / 'set', 'bare')
     assert made.info is not None
     assert made.info['features']['observation.state']['info']['units'][:6] == ['as recorded'] * 6
@@ -145,7 +145,7 @@ def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> No
             file['observations/qpos'] = positions(number).astype(np.float32)
             file['action'] = positions(number).astype(np.float32)
     store = open_store(house.settings, UploadSettings())
-    bring(of_hdf5(paths, times_of(times), fps=FPS, joints=so_arm.JOINTS), 'aloha', store)
+    import_episodes(of_hdf5(paths, times_of(times), fps=FPS, joints=so_arm.JOINTS), 'aloha', store)
     assert_is_as_recorded(exported(house, tmp_path / 'set', 'aloha'))
     with pytest.raises(LakeError, match='has 6 joints, not 2'):
         list(of_hdf5(paths, times_of(times), fps=FPS, joints=('a', 'b')))
@@ -153,13 +153,13 @@ def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> No
 
 def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
     """With what is wrong and what to do; nobody guesses when an episode began."""
-    with pytest.raises(LakeError, match='no LeRobotDataset'):
+    with pytest.raises(LakeError, match='not a LeRobotDataset'):
         list(of_lerobot(tmp_path, {}, is_degrees=False))
     source = lerobot_set(tmp_path / 'theirs', 'v3.0')
-    with pytest.raises(LakeError, match='when episode 0 began'):
+    with pytest.raises(LakeError, match='the start time of episode 0'):
         list(of_lerobot(source, {}, is_degrees=False))
     (source / 'data/chunk-000/file-000.parquet').write_bytes(b'PAR1 and more')
-    with pytest.raises(LakeError, match='is no data of a LeRobotDataset'):
+    with pytest.raises(LakeError, match='is not a data file of a LeRobotDataset'):
         list(of_lerobot(source, times_of(times), is_degrees=False))
     (tmp_path / 'odd.hdf5').write_bytes(b'\x89HDF\r\n\x1a\nand more')
     pytest.importorskip('h5py')
@@ -174,7 +174,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
 
 
 class Shelf:
-    """A store, and the data sets of an arm that are imported into it one after the other."""
+    """A store, and the datasets of an arm that are imported into it one after the other."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -190,7 +190,7 @@ class Shelf:
     def bring(self, folder: Path, begins: Sequence[int] | None = None, *, is_degrees: bool = True) -> Imported:
         """``begins`` are the recordings with whose begins its episodes are imported."""
         times = {episode: begin_ns(number) for episode, number in enumerate(range(9) if begins is None else begins)}
-        return bring(of_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
+        return import_episodes(of_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
 
     def contents(self) -> dict[str, bytes]:
         root = self.settings.directory / 'sensor-data/arm'
@@ -300,14 +300,14 @@ def test_a_data_set_of_two(shelf: Shelf) -> None:
 
 @pytest.mark.parametrize('shift_s', [-1.5, 1.5, 3.9])
 def test_two_recordings_of_one_time(shelf: Shelf, shift_s: float) -> None:
-    """An arm has one at a time: another one is refused, also in the same data set, and one after it is taken."""
+    """An arm has one at a time: another one is refused, also in the same dataset, and one after it is taken."""
     shelf.bring(shelf.set(numbers=(0,)))
     other = shelf.set(numbers=(3, 4))
     times = {0: begin_ns(0) + round(shift_s * SECOND), 1: begin_ns(0) + 4 * SECOND}
-    found = bring(of_lerobot(other, times, is_degrees=True), 'arm', shelf.store)
+    found = import_episodes(of_lerobot(other, times, is_degrees=True), 'arm', shelf.store)
     assert list(found.refused) == [f'episode 0 ({iso(times[0])})']
     assert found.episodes == 1
-    double = bring(of_lerobot(other, {0: begin_ns(7), 1: begin_ns(7)}, is_degrees=True), 'other', shelf.store)
+    double = import_episodes(of_lerobot(other, {0: begin_ns(7), 1: begin_ns(7)}, is_degrees=True), 'other', shelf.store)
     assert counts(double) == (1, 0, 1, 0)
 
 
@@ -378,7 +378,7 @@ def test_numbers_of_frames_that_are_none(shelf: Shelf, column: str) -> None:
     values = table[column].to_numpy().astype(np.float64)
     values[5] = np.nan
     pq.write_table(table.set_column(table.column_names.index(column), column, pa.array(values)), path)
-    with pytest.raises(LakeError, match='that is no whole number'):
+    with pytest.raises(LakeError, match='that is not an integer'):
         shelf.bring(folder)
 
 

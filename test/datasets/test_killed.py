@@ -80,7 +80,7 @@ def dying(patch: pytest.MonkeyPatch, at: int) -> None:
 
 
 def test_an_export_that_was_killed_goes_on(house: House, tmp_path: Path) -> None:
-    """At every file that it writes: of an episode, of the data set, the last one."""
+    """At every file that it writes: of an episode, of the dataset, the last one."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     wanted = contents(tmp_path / 'whole')
     for at in range(1, 100):
@@ -99,7 +99,7 @@ def test_an_export_that_was_killed_goes_on(house: House, tmp_path: Path) -> None
 
 
 def test_a_process_that_was_killed_is_followed_by_another(house: House, tmp_path: Path) -> None:
-    """With SIGKILL, in an episode and while the data set is written: another process goes on."""
+    """With SIGKILL, in an episode and while the dataset is written: another process goes on."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     wanted = contents(tmp_path / 'whole')
     for at in (1, 4, 12):
@@ -124,7 +124,7 @@ def test_a_worker_that_was_killed_is_told(house: House, tmp_path: Path) -> None:
 
 
 def test_a_drop_that_was_killed_comes_to_its_end(house: House, tmp_path: Path) -> None:
-    """Whoever looks at the data set next finishes it: nothing of the mission is left."""
+    """Whoever looks at the dataset next finishes it: nothing of the mission is left."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     drop(tmp_path / 'whole', 'm0')
     wanted = contents(tmp_path / 'whole')

@@ -60,7 +60,7 @@ def plain(house: House) -> Lerobot:
 
 @pytest.mark.parametrize('codec', [AV1, pytest.param(H264, marks=pytest.mark.long('the same with another codec'))])
 def test_one_video_has_the_frames_of_all_episodes(house: House, tmp_path: Path, codec: str) -> None:
-    """As they were encoded: a frame's place in the file is its number in the data set, which is what lerobot streams by."""
+    """As they were encoded: a frame's place in the file is its number in the dataset, which is what lerobot streams by."""
     made = exported(house, tmp_path / 'set', codec=codec)
     own = exported(house, tmp_path / 'own', layout='episode', codec=codec)
     assert [path.name for path in sorted((tmp_path / 'set').rglob('*.mp4'))] == ['file-000.mp4']
@@ -103,17 +103,17 @@ def test_an_episode_that_is_dropped(house: House, tmp_path: Path, plain: Lerobot
 
 def test_a_set_keeps_its_layout(house: House, tmp_path: Path) -> None:
     exported(house, tmp_path / 'set', 'm0')
-    with pytest.raises(LakeError, match='was begun with layout shared'):
+    with pytest.raises(LakeError, match='was started with layout shared'):
         exported(house, tmp_path / 'set', 'm1', layout='episode')
     exported(house, tmp_path / 'own', 'm0', layout='episode')
-    with pytest.raises(LakeError, match='was begun with layout episode'):
+    with pytest.raises(LakeError, match='was started with layout episode'):
         exported(house, tmp_path / 'own', 'm1')
 
 
 def test_a_setting_that_a_set_was_begun_without(house: House, tmp_path: Path) -> None:
     """One that is given later only differs as well as one that is given no more."""
     exported(house, tmp_path / 'set', 'm0')
-    with pytest.raises(LakeError, match='was begun with labels none'):
+    with pytest.raises(LakeError, match='was started with labels none'):
         export(tmp_path / 'set', house.source, {'mission': 'm1'}, ExportOptions(layout=SHARED, labels=True))
 
 
@@ -193,7 +193,7 @@ def test_a_set_that_was_killed_while_it_grew_goes_on(house: House, tmp_path: Pat
 @pytest.mark.long('a drop for each file that it writes')
 @pytest.mark.parametrize('mission', ['m0', 'm1'])
 def test_a_drop_from_a_shared_set_that_was_killed(house: House, tmp_path: Path, mission: str) -> None:
-    """Whoever looks at the data set next finishes it: the file has the frames of the others, once."""
+    """Whoever looks at the dataset next finishes it: the file has the frames of the others, once."""
     exported(house, tmp_path / 'whole')
     drop(tmp_path / 'whole', mission)
     wanted = contents(tmp_path / 'whole')

@@ -116,6 +116,6 @@ def test_a_mission_leads_nowhere_else(tmp_path: Path) -> None:
     kept = tmp_path / 'kept'
     kept.mkdir()
     for name in ('../../kept', '..', '', str(kept)):
-        with pytest.raises(LakeError, match='a name that no folder can have'):
+        with pytest.raises(LakeError, match='a name that is invalid for a folder'):
             forget(tmp_path / 'fetch', name)
     assert kept.is_dir()

@@ -1,4 +1,4 @@
-"""A data set on its way to a SeaweedFS and back, killed and begun again: whole or not there, and nothing is sent twice."""
+"""A dataset on its way to a SeaweedFS and back, killed and begun again: whole or not there, and nothing is sent twice."""
 
 from __future__ import annotations
 

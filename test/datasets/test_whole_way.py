@@ -69,7 +69,7 @@ def test_a_model_is_found_by_what_it_was_trained_on(tmp_path: Path, tower: Tower
 @pytest.mark.long('starts an MLflow server')
 @pytest.mark.timeout(600)
 def test_a_run_is_found_while_the_mission_was_in_its_data(tmp_path: Path, tower: Tower) -> None:
-    """By each digest that the data set had then: one that was trained before the mission came is not among them."""
+    """By each digest that the dataset had then: one that was trained before the mission came is not among them."""
     house = House(tmp_path)
     environ = {**os.environ, **tower.tracking('spark'), 'SHADOWHOUND_HOME': str(tmp_path), 'AWS_ENDPOINT_URL': '',
                'PYTHONPATH': str(ROOT)}  # fmt: skip

@@ -1,8 +1,8 @@
-"""Run by lerobot's own Python: reads data sets offline, with no socket, and writes what lerobot makes of them.
+"""Run by lerobot's own Python: reads datasets offline, with no socket, and writes what lerobot makes of them.
 
 ``load OUT.npz FOLDER`` has every frame of it; ``merge OUT FOLDER FOLDER`` merges two; ``read OUT.json FOLDER`` reads it in every
 way and says how many frames differ from those by index; ``tools OUT FOLDER`` makes a set by each of lerobot's tools; ``view OUT
-FOLDER`` writes what lerobot-dataset-viz shows; ``arm OUT`` makes data sets of an arm as lerobot records and edits them.
+FOLDER`` writes what lerobot-dataset-viz shows; ``arm OUT`` makes datasets of an arm as lerobot records and edits them.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def is_same(name: str, value: Any, index: int, frames: list[Mapping[str, Any]], 
 
 
 def edited(out: str, folder: str) -> None:
-    """A data set of each tool, below ``out``, and how its frames differ from those of the set that it was made of."""
+    """A dataset of each tool, below ``out``, and how its frames differ from those of the set that it was made of."""
     made, plain = Path(out), opened(folder)
     tools.delete_episodes(plain, [0], made / 'deleted', 'local/deleted')
     tools.split_dataset(plain, {'first': [0], 'others': [1, 2]}, made / 'split')
