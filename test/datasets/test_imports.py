@@ -163,7 +163,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
         list(of_lerobot(source, times_of(times), is_degrees=False))
     (tmp_path / 'odd.hdf5').write_bytes(b'\x89HDF\r\n\x1a\nand more')
     pytest.importorskip('h5py')
-    with pytest.raises(LakeError, match='no demonstration in the layout'):
+    with pytest.raises(LakeError, match='not a demonstration in the layout'):
         list(of_hdf5([tmp_path / 'odd.hdf5'], times_of(times), fps=50))
     times.write_text('episode,begin_ns\n0,soon\n')
     with pytest.raises(SettingError, match='--times'):
