@@ -35,7 +35,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import newest, watermarks
 from shadowhound_data_logger.lake.names import misspelled
 from shadowhound_data_logger.lake.select import Wanted, date_of, wanted
-from shadowhound_data_logger.lake.tables import TABLES, among, answer, batches, engine, literal, quoted
+from shadowhound_data_logger.lake.tables import among, answer, batches, engine, literal, narrow, quoted
 from shadowhound_data_logger.lake.views import rows_of, views
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, parse_manifest, split_id
 from shadowhound_data_logger.policies.registry import BUCKET as POLICIES
@@ -354,7 +354,7 @@ def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
     since_ns, until_ns = asked.since_ns or 0, (1 << 63) - 1 if asked.until_ns is None else asked.until_ns
     rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
     names = [name for name in LABELS.columns if name not in _UNSEEN_OF_LABELS]
-    return pa.Table.from_pylist(rows, schema=pa.schema([TABLES[LABELS.folder].schema.field(name) for name in names]))
+    return pa.Table.from_pylist(rows, schema=narrow(names, LABELS))
 
 
 def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:

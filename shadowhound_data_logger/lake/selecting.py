@@ -22,7 +22,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.pull import bring
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
-from shadowhound_data_logger.lake.tables import OBJECT_ROWS, among
+from shadowhound_data_logger.lake.tables import among, narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
 
 log = logging.getLogger(__name__)
@@ -115,8 +115,7 @@ def _near(track: Track, anchors: list[Track], reach: int) -> Track:
 def _rows(batches: Iterable[pa.Table]) -> pa.Table:
     """Packed batch by batch: unpacked, a million rows take 0.5 GB."""
     found = [packed(batch.filter(pc.is_valid(batch['t_start']))) for batch in batches]
-    empty = pa.schema([OBJECT_ROWS.schema.field(name) for name in NEEDED]).empty_table()
-    return pa.concat_tables([packed(empty), *found])
+    return pa.concat_tables([packed(narrow(NEEDED).empty_table()), *found])
 
 
 def _possible(rows: pa.Table, findings: Findings) -> pa.Table:

@@ -90,6 +90,12 @@ SCHEMAS: Final[Mapping[str, TableSchema]] = {
 }  # fmt: skip
 
 
+def narrow(columns: Iterable[str], of: TableSchema = OBJECTS) -> pa.Schema:
+    """The schema of these columns of a table."""
+    schema = TABLES[of.folder].schema
+    return pa.schema([schema.field(name) for name in columns])
+
+
 class Conflict(Exception):
     """Another process added rows since the table was opened: open it again and look which rows are still missing."""
 

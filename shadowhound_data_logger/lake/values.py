@@ -10,6 +10,7 @@ opened, and what they say counts: the answer is that of a loop over all messages
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from deltalake import QueryBuilder
 from numpy.typing import NDArray
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
@@ -30,6 +32,7 @@ from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
 from shadowhound_data_logger.formats.image import of_jpeg
 from shadowhound_data_logger.formats.pointcloud import of_points
 from shadowhound_data_logger.formats.records import AT_ONCE
+from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import (
     ALL,
@@ -46,9 +49,9 @@ from shadowhound_data_logger.lake.decode import cloud_points, extension_of, reco
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
 from shadowhound_data_logger.lake.live_files import robots
-from shadowhound_data_logger.lake.reading import Only, narrow, tables
-from shadowhound_data_logger.lake.scan import catalogue_rows, folders, planned
-from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, wanted
+from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, date_of, wanted
+from shadowhound_data_logger.lake.tables import among, answer, literal, narrow, quoted
+from shadowhound_data_logger.lake.views import views
 
 MIN_JOIN_S: Final = 1.0
 """What is no further apart is one range, unless the sensor is slower."""
@@ -67,7 +70,9 @@ _SEEN: Final = ('sensor', 'topic', 't_start_ns', 't_end_ns')
 _OBJECT: Final = (*_SEEN, 'count', 'bucket', 'key')
 _STATISTIC: Final = ('t_start_ns', 'field', *NUMBERS)
 _BY_QUERY: Final = ('near', 'mission', 'mission_type', 'success', 'policy', 'where')
-"""Flags for which Daft is needed."""
+"""Flags that `query` understands."""
+MAX_NAMED_TIMES: Final = 5000
+"""In a query in SQL; of more, all rows between the first and the last are read."""
 Mask = NDArray[np.bool_]
 
 
@@ -183,9 +188,15 @@ class _Question:
         self._robot = robot
         self._expression = expression
         self._findings = findings
-        self._parts = [entry for day in folders(source, asked, findings, STATISTICS) for entry in day.entries]
+        self._ready: QueryBuilder
 
     def answer(self, *, scan: bool, join_ns: int | None, pad_ns: int) -> ValueAnswer:
+        asked = self._asked
+        has_date = asked.has_date if asked.since_ns is not None or asked.until_ns is not None else None
+        with views(self._source, [OBJECT_ROWS, STATISTICS], self._findings, robot=self._robot, has_date=has_date) as self._ready:
+            return self._answered(scan=scan, join_ns=join_ns, pad_ns=pad_ns)
+
+    def _answered(self, *, scan: bool, join_ns: int | None, pad_ns: int) -> ValueAnswer:
         rows, told, seen = self._candidates()
         may, must, is_known = told.judged(self._expression)
         to_open = np.flatnonzero(may & ~must & (is_known | scan))
@@ -243,79 +254,70 @@ class _Question:
     def _rows(self, chosen: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[pa.Table, _Sieve]:
         """The rows of the catalogue at the chosen times, and those that are not known."""
         sieve = _Sieve(self._asked, chosen, known)
-        found = [narrow(_OBJECT).empty_table()]
-        if any(self._flags.get(name) is not None for name in _BY_QUERY):
-            from shadowhound_data_logger.lake import query  # noqa: PLC0415 - the extra lake
+        if self._asked.chosen or any(self._flags.get(name) is not None for name in _BY_QUERY):
+            from shadowhound_data_logger.lake import query  # noqa: PLC0415 - which asks for labels, too
 
             table = query.objects(self._source, findings=self._findings, columns=_OBJECT, **self._flags)
-            table = table.cast(narrow(_OBJECT)).combine_chunks()
-            found.append(table.filter(pa.array(sieve(table))))
-        else:
-            for parts in planned(self._source, self._asked, self._findings):
-                only = None if parts.once or parts.gone or self._asked.chosen else Only(_SEEN, sieve)
-                some = catalogue_rows(self._source, parts, _OBJECT, self._asked, self._findings, only)
-                found += some if only else (table.filter(pa.array(sieve(table))) for table in some)
-        return pa.concat_tables(found).sort_by('t_start_ns').combine_chunks(), sieve
+            return table.filter(pa.array(sieve(table))).sort_by('t_start_ns').combine_chunks(), sieve
+        where = self._where() if self._asked.topic is None else f'{self._where()} AND topic = {literal(self._asked.topic)}'
+        seen = self._select(_SEEN, 'objects', where)
+        stamps = np.unique(_stamps(seen)[sieve(seen)])
+        if not len(stamps):
+            return narrow(_OBJECT).empty_table(), sieve
+        table = self._select(_OBJECT, 'objects', f'{where} AND {_at(stamps)}')
+        return table.filter(pa.array(_is_among(_stamps(table), stamps))).sort_by('t_start_ns').combine_chunks(), sieve
 
     def _wholes(self) -> pa.Table:
         """The rows of the objects as a whole."""
         columns = ('t_start_ns', 'field', 'count', 'nan_count')
-        found = [_filtered(table, kept & _are(table['field'], ALL)) for table, kept in self._read((ALL, ALL), columns)]
-        table = pa.concat_tables([narrow(columns, STATISTICS).empty_table(), *found]).combine_chunks()
+        table = self._fields([ALL], columns).combine_chunks()
         nothing = pa.nulls(len(table), pa.float64())
         given = [table[name] if name in columns else nothing for name in _STATISTIC]
         return pa.table(given, schema=narrow(_STATISTIC, STATISTICS))
 
     def _lead(self, lead: Comparison, *, with_exact: bool) -> tuple[pa.Table, NDArray[np.int64]]:
         """The statistics by which a comparison may hold, and, if asked for, the times of all objects with this very field."""
-        first = tuple(dict.fromkeys(('field', 'min', 'max', 'count', 'nan_count', lead.function or 'min')))
-
-        def may_hold(table: pa.Table) -> Mask:
-            values = {name: _numbers(table, name) for name in table.column_names if name in NUMBERS}
-            return _by_statistics(lead, values)[0] | _contradictory(values)
-
-        def is_worth_reading(table: pa.Table) -> Mask:
-            return _named(table, [lead.path]) & (may_hold(table) | np.isnan(_numbers(table, 'min')))
-
-        found = [narrow(_STATISTIC, STATISTICS).empty_table()]
-        exact = [np.zeros(0, np.int64)]
-        for table, kept in self._of_fields([lead.path], _STATISTIC, None if with_exact else Only(first, is_worth_reading)):
-            found.append(_filtered(table, kept & may_hold(table)))
-            if with_exact:
-                exact.append(_stamps(table)[kept & _are(table['field'], lead.path)])
-        return pa.concat_tables(found), np.concatenate(exact)
+        table = self._fields([lead.path], _STATISTIC, 'true' if with_exact else _may_hold(lead))
+        values = {name: _numbers(table, name) for name in NUMBERS}
+        kept = _by_statistics(lead, values)[0] | _contradictory(values)
+        exact = _stamps(table)[_are(table['field'], lead.path)] if with_exact else np.zeros(0, np.int64)
+        return _filtered(table, kept), exact
 
     def _statistics(self, of: Sequence[Comparison], stamps: NDArray[np.int64], key: Sequence[str] = ()) -> pa.Table:
         """The rows at these times of the fields that are asked for, and with a ``key`` those of the objects as a whole, too."""
         columns = tuple(dict.fromkeys((*key, *_STATISTIC)))
-        only = Only(('t_start_ns',), lambda table: _is_among(_stamps(table), stamps))
         names = [*([ALL] if key else []), *sorted({each.path for each in of})]
-        found = (_filtered(table, kept) for table, kept in self._of_fields(names, columns, only))
-        return pa.concat_tables([narrow(columns, STATISTICS).empty_table(), *found]).combine_chunks()
+        if not len(stamps):
+            return narrow(columns, STATISTICS).empty_table()
+        table = self._fields(names, columns, _at(stamps))
+        return _filtered(table, _is_among(_stamps(table), stamps)).combine_chunks()
 
-    def _of_fields(self, names: Sequence[str], columns: Sequence[str], only: Only | None = None
-                   ) -> Iterator[tuple[pa.Table, Mask]]:  # fmt: skip
-        """Rows, and which of them are of fields that are among the names, or begin with one of them."""
-        for table, kept in self._read((names[0], f'{names[-1]}.\U0010ffff'), columns, only):
-            yield table, kept & _named(table, names)
+    def _fields(self, names: Sequence[str], columns: Sequence[str], condition: str = 'true') -> pa.Table:
+        """Statistics of the sensor and the time that is asked for, of fields among the names or below one of them."""
+        below = [f'starts_with(field, {literal(f"{name}.")})' for name in names if name != ALL]
+        fields = ' OR '.join([among('field', names), *below])
+        return self._select(columns, 'statistics', f'{self._where()} AND ({fields}) AND {condition}')
 
-    def _read(self, names: tuple[str, str], columns: Sequence[str], only: Only | None = None
-              ) -> Iterator[tuple[pa.Table, Mask]]:  # fmt: skip
-        """Rows, and which are of the sensor and the time that is asked for; of fields whose names lie between two, and others."""
+    def _where(self) -> str:
+        """The robot, the sensor and the time."""
         asked = self._asked
-        narrowed = Wanted(robot=asked.robot, sensor=asked.sensor, since_ns=asked.since_ns, until_ns=asked.until_ns,
-                          bounds=(('field', *names),))  # fmt: skip
-        for table in tables(self._source, self._parts, ('sensor', *columns), self._findings, narrowed, STATISTICS, only):
-            stamps = _stamps(table)
-            kept = _are(table['sensor'], asked.sensor) & (stamps >= max(asked.since_ns or 0, 0))
-            yield table.select(columns), kept if asked.until_ns is None else kept & (stamps < asked.until_ns)
+        found = [f'robot = {literal(self._robot)}', f'sensor = {literal(asked.sensor or "")}']
+        found.append(f't_start_ns >= {max(asked.since_ns or 0, 0)}')
+        if asked.since_ns is not None:
+            found.append(f'date >= {literal(date_of(asked.since_ns))}')
+        if asked.until_ns is not None:
+            found.append(f't_start_ns < {asked.until_ns} AND date <= {literal(date_of(asked.until_ns - 1))}')
+        return ' AND '.join(found)
+
+    def _select(self, columns: Sequence[str], table: str, where: str) -> pa.Table:
+        return answer(self._ready, f'SELECT {", ".join(map(quoted, columns))} FROM all_{table} WHERE {where}')  # noqa: S608
 
     def _fields_instead(self, seen: _Sieve) -> Iterator[str]:
         """The fields of the newest objects, where one that is asked for is not among them."""
         found: set[str] = set()
-        for table, kept in self._read((ALL, '\U0010ffff'), ('t_start_ns', 'field')):
-            is_new = kept & (_stamps(table) >= seen.newest_ns - LONGEST_BATCH_NS)
-            found.update(pc.unique(_filtered(table, is_new)['field']).to_pylist())
+        where = f'{self._where()} AND t_start_ns >= {max(seen.newest_ns - LONGEST_BATCH_NS, 0)}'
+        fields = answer(self._ready, f'SELECT DISTINCT field FROM all_statistics WHERE {where}')  # noqa: S608
+        found.update(fields['field'].to_pylist())
         found -= {ALL}
         if not all(any(covers(leaf.path, name) for name in found) for leaf in comparisons(self._expression)):
             yield from found
@@ -394,6 +396,29 @@ def _leads(expression: Expression) -> list[Comparison]:
     return min(found, key=len) if expression.word == 'and' else [lead for part in found for lead in part]
 
 
+def _at(stamps: NDArray[np.int64]) -> str:
+    """A condition in SQL for rows at these times, at least one; of many times it names the first and the last."""
+    if len(stamps) <= MAX_NAMED_TIMES:
+        return f't_start_ns IN ({", ".join(map(str, stamps.tolist()))})'
+    return f't_start_ns BETWEEN {stamps.min()} AND {stamps.max()}'
+
+
+def _may_hold(lead: Comparison) -> str:
+    """A condition in SQL that all statistics meet by which a comparison may hold, and those that cannot be true."""
+    number = repr(float(lead.value))
+    low, high = (lead.function, lead.function) if lead.function and lead.function != 'mean' else ('min', 'max')
+    by_sign = {
+        '>': f'"{high}" > {number}', '>=': f'"{high}" >= {number}', '<': f'"{low}" < {number}', '<=': f'"{low}" <= {number}',
+        '==': f'("{low}" <= {number} AND "{high}" >= {number})',
+    }  # fmt: skip
+    if lead.function == 'mean' or lead.sign not in by_sign:
+        return 'true'
+    huge = repr(sys.float_info.max)
+    ends = ' OR '.join(f'"{name}" IS NULL OR isnan("{name}") OR abs("{name}") > {huge}' for name in dict.fromkeys((low, high)))
+    counts = ' OR '.join(f'"{name}" NOT BETWEEN 0 AND {MOST_OBJECT_BYTES}' for name in ('count', 'nan_count'))
+    return f'({by_sign[lead.sign]} OR "min" > "max" OR {ends} OR {counts})'
+
+
 def _stamps(table: pa.Table) -> NDArray[np.int64]:
     """No sane row has -1."""
     return np.asarray(pc.fill_null(table['t_start_ns'], -1).to_numpy())
@@ -409,15 +434,6 @@ def _is_among(stamps: NDArray[np.int64], of: NDArray[np.int64]) -> Mask:
 
 def _are(column: pa.ChunkedArray, value: str | None) -> Mask:
     return np.asarray(pc.fill_null(pc.equal(column, value), fill_value=False).to_numpy())
-
-
-def _named(table: pa.Table, names: Sequence[str]) -> Mask:
-    """Which rows are of fields that are among the names, or begin with one of them."""
-    found = np.zeros(len(table), bool)
-    for name in names:
-        begins = pc.fill_null(pc.starts_with(table['field'], f'{name}.'), fill_value=False)
-        found |= _are(table['field'], name) | begins.to_numpy()
-    return found
 
 
 def _filtered(table: pa.Table, kept: Mask) -> pa.Table:
