@@ -10,11 +10,12 @@ from typing import Any, Final, NamedTuple
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.untrusted import from_json
+from shadowhound_data_logger.formats.rows.schema import OBJECTS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.lake.scan import folders
 from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.tables import literal
+from shadowhound_data_logger.lake.views import rows_of
 
 LINK: Final = '_wifi'
 MOST_LINK_BYTES: Final = 1 << 20
@@ -37,12 +38,10 @@ class LinkSample(NamedTuple):
 def samples(source: Bucket, robot: str, since_ns: int, until_ns: int, findings: Findings,
             newest: int | None = None) -> list[LinkSample]:  # fmt: skip
     """Of a robot, from ``since_ns`` until before ``until_ns``, or of the ``newest`` objects of that time. Raises StoreError."""
-    wanted = Wanted(robot=robot, sensor=LINK, since_ns=since_ns, until_ns=until_ns)
-    entries = [entry for day in folders(source, wanted, findings) for entry in day.entries]
-    columns = 'key', 'sensor', 't_start_ns'
-    rows = [row for table in tables(source, entries, columns, findings, wanted) for row in table.to_pylist()]
-    rows = sorted((row for row in rows if row['sensor'] == LINK and since_ns <= (row['t_start_ns'] or 0) < until_ns),
-                  key=lambda row: row['t_start_ns'])  # fmt: skip
+    wanted = Wanted(since_ns=since_ns, until_ns=until_ns)
+    where = f'sensor = {literal(LINK)} AND t_start_ns >= {since_ns} AND t_start_ns < {until_ns}'
+    rows = rows_of(source, OBJECTS, findings, robot=robot, has_date=wanted.has_date, where=where, columns=('key',),
+                   order='t_start_ns').to_pylist()  # fmt: skip
     found: list[LinkSample] = []
     for row in rows if newest is None else rows[-newest:]:
         try:

@@ -43,13 +43,14 @@ from shadowhound_data_logger.core.model import ON_ROBOT, SpooledObject
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.core.untrusted import from_json, visible
-from shadowhound_data_logger.formats.rows.schema import KEPT
+from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days, robots
-from shadowhound_data_logger.lake.reading import arrow_schema, tables
-from shadowhound_data_logger.lake.scan import KEY, folders, superseding
+from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.scan import superseding
 from shadowhound_data_logger.lake.select import Wanted, wanted
+from shadowhound_data_logger.lake.tables import answer, literal, quoted
+from shadowhound_data_logger.lake.views import views
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -95,15 +96,12 @@ def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa
 def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
     """The same, and rows of what it has lost. Raises StoreError."""
     early = Wanted(robot=robot, since_ns=None if want.since_ns is None else want.since_ns - _DAY_NS, until_ns=want.until_ns)
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = days(source, [robot], early.dates(time.time_ns()), pool, findings, early.has_date, KEPT)
-    entries = [entry for day in found for entry in day.entries]
-    if not entries:
-        return arrow_schema(KEPT).empty_table()
-    rows = pa.concat_tables([arrow_schema(KEPT).empty_table(), *tables(source, entries, tuple(KEPT.columns), findings, of=KEPT)])
-    stored = [entry for day in folders(source, early, findings) for entry in day.entries]
-    keys = pa.concat_tables([arrow_schema().empty_table().select(KEY), *tables(source, stored, KEY, findings)])
-    rows = superseding(rows, keys)
+    has_date = early.has_date if early.since_ns is not None or early.until_ns is not None else None
+    columns = ', '.join(f'k.{quoted(name)}' for name in KEPT.columns)
+    stored = 'SELECT 1 FROM all_objects o WHERE o.robot = k.robot AND o.bucket = k.bucket AND o.key = k.key'
+    with views(source, [KEPT, OBJECTS], findings, robot=robot, has_date=has_date) as ready:
+        rows = answer(ready, f'SELECT {columns} FROM all_kept k WHERE robot = {literal(robot)} AND NOT EXISTS ({stored})')  # noqa: S608
+    rows = superseding(rows)
     return rows.filter(pa.array([takes(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
-import pyarrow.compute as pc
-
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import ObjectInfo
@@ -25,9 +23,9 @@ from shadowhound_data_logger.formats.statistics import ALL
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.live_files import backfilled_key
-from shadowhound_data_logger.lake.reading import tables
-from shadowhound_data_logger.lake.scan import KEY, folders
-from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.scan import KEY
+from shadowhound_data_logger.lake.tables import literal
+from shadowhound_data_logger.lake.views import rows_of
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BUCKETS: Final = (BUCKET, 'trajectories')
@@ -91,10 +89,8 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
 
     check_name(robot, 'the robot name')
     findings, found = Findings() if findings is None else findings, Reindexed()
-    entries = [entry for day in folders(source, Wanted(robot=robot), findings, STATISTICS) for entry in day.entries]
-    every = tables(source, entries, (*KEY, 'field'), findings, of=STATISTICS)
-    told_of = (rows.filter(pc.equal(rows['field'], ALL)) for rows in every)
-    known = {pair for rows in told_of for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
+    told_of = rows_of(source, STATISTICS, findings, robot=robot, where=f'field = {literal(ALL)}', columns=KEY)
+    known = set(zip(*(told_of[name].to_pylist() for name in KEY), strict=True))
     columns = ('robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns')
     asked = query.objects(source, findings=findings, robot=robot, columns=columns)
     rows = [row for row in asked.to_pylist() if row['topic'] is not None and (row['bucket'], row['key']) not in known]
@@ -123,9 +119,8 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
 
 
 def _keys(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJECTS) -> set[tuple[str, str]]:
-    entries = [entry for day in folders(source, Wanted(robot=robot), findings, of) for entry in day.entries]
-    found = tables(source, entries, KEY, findings, of=of)
-    return {pair for rows in found for pair in zip(*(rows[name].to_pylist() for name in KEY), strict=True)}
+    rows = rows_of(source, of, findings, robot=robot, columns=KEY)
+    return set(zip(*(rows[name].to_pylist() for name in KEY), strict=True))
 
 
 def _rows(place: Bucket, entries: list[ObjectInfo]) -> Iterator[Row]:

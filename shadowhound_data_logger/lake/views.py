@@ -56,15 +56,17 @@ def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robo
         yield ready
 
 
-def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str | None = None,
+def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str | None = None,  # noqa: PLR0913 - parts of a query
             has_date: Callable[[str], bool] | None = None, where: str = 'true',
-            columns: Sequence[str] = ()) -> pa.Table:  # fmt: skip
+            columns: Sequence[str] = (), order: str = '', limit: int | None = None) -> pa.Table:  # fmt: skip
     """The rows of one table for which a condition holds, with the columns of its schema. Raises StoreError, LakeError."""
     table = TABLES[of.folder]
     names = ', '.join(f'"{name}"' for name in columns or of.columns)
     of_robot = 'true' if robot is None else f'robot = {literal(robot)}'
     with views(source, [of], findings, robot=robot, has_date=has_date) as ready:
-        return answer(ready, f'SELECT {names} FROM all_{table.name} WHERE {of_robot} AND ({where})')  # noqa: S608 - our own words
+        query = f'SELECT {names} FROM all_{table.name} WHERE {of_robot} AND ({where})'  # noqa: S608 - our own words
+        query += f' ORDER BY {order}' * bool(order) + ('' if limit is None else f' LIMIT {limit}')
+        return answer(ready, query)
 
 
 def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> None:

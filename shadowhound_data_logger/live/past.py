@@ -13,7 +13,6 @@ import sqlite3
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
@@ -323,25 +322,12 @@ class StorePast:
         import pyarrow.compute as pc  # noqa: PLC0415
 
         from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
-        from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without  # noqa: PLC0415
-        from shadowhound_data_logger.lake.live_files import days  # noqa: PLC0415
-        from shadowhound_data_logger.lake.reading import narrow, tables  # noqa: PLC0415
+        from shadowhound_data_logger.lake.views import rows_of  # noqa: PLC0415
 
         findings = Findings(lambda _: None)
-        with ThreadPoolExecutor(4, 'past') as pool:
-            found = days(self._source, [robot], [date], pool, findings)
-        entries = [entry for day in found for entry in day.entries]
-        gone = forgotten_entries(self._source, found, findings)
-        names = forgotten_names(self._source, gone.get((robot, date), ()), findings)
-        read: list[Any] = []
-        rows = 0
-        for table in tables(self._source, entries, _COLUMNS, findings):
-            read.append(without(table, names).slice(0, MOST_ROWS - rows))
-            rows += len(read[-1])
-            if rows >= MOST_ROWS:
-                break
-        table = pa.concat_tables([narrow(_COLUMNS).empty_table(), *read])
-        table = table.filter(pc.is_valid(table['t_start_ns'])).sort_by('t_start_ns')
+        where = f"date = '{date}' AND t_start_ns IS NOT NULL"
+        table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=date.__eq__, where=where,
+                        columns=_COLUMNS, order='t_start_ns, key', limit=MOST_ROWS)  # fmt: skip
         begins = table['t_start_ns'].to_numpy()
         ends = np.maximum(begins, pc.fill_null(table['t_end_ns'], 0).to_numpy())
         names = pc.dictionary_encode(pc.coalesce(table['topic'], table['sensor'], pa.scalar(''))).combine_chunks()
@@ -349,7 +335,7 @@ class StorePast:
         left = [f'{one.key}: {one.why}' for one in findings][:3]
         problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''
         return PastDay(begins, ends, [str(name) for name in names.dictionary.to_pylist()], codes, table,
-                       problem or ('this is not all of the day' if rows >= MOST_ROWS else ''))  # fmt: skip
+                       problem or ('this is not all of the day' if len(table) >= MOST_ROWS else ''))  # fmt: skip
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
         """Raises StoreError."""
