@@ -27,6 +27,13 @@ BATTERY: Final = 'battery_pct'
 # Its time, by both clocks, and how well it is known.
 T_START_NS: Final = 't_start_ns'
 T_END_NS: Final = 't_end_ns'
+RECEIVED_START_NS: Final = 'received_start_ns'
+RECEIVED_END_NS: Final = 'received_end_ns'
+STAMP_START_NS: Final = 'stamp_start_ns'
+STAMP_END_NS: Final = 'stamp_end_ns'
+"""Of messages whose stamps were not trusted: what these were."""
+BY_ARRIVAL: Final = 'by_arrival'
+"""How many of its messages are dated by their arrival."""
 BOOT_ID: Final = 'boot_id'
 BOOT_START_NS: Final = 'boot_start_ns'
 BOOT_END_NS: Final = 'boot_end_ns'

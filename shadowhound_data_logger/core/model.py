@@ -30,6 +30,8 @@ class Sample(NamedTuple):
     """When it arrived, as of ``Taken``."""
     publisher: str | None = None
     """Who sent it, as of ``Taken``."""
+    untrusted_ns: int = 0
+    """Its own stamp if it is dated by its arrival instead, as of ``Taken``."""
 
 
 class Taken(NamedTuple):
@@ -46,6 +48,8 @@ class Taken(NamedTuple):
     """The time of the message by ``stamps.StampTrack``; 0 before its stream has decided that."""
     clock: str | None = None
     """The publisher, if its stamps are trusted and more than a second from their arrival: they follow another clock."""
+    untrusted_ns: int = 0
+    """Its own stamp if it is dated by its arrival instead; 0 otherwise."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import NameRefused, Rejected
 from shadowhound_data_logger.core.keys import KeyTemplate, dated
-from shadowhound_data_logger.core.model import Batch, DataObject
+from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.formats.archive import archive, pack_tar, pack_zip
 from shadowhound_data_logger.formats.image import encode_jpeg, encode_png
 from shadowhound_data_logger.formats.payload import (
@@ -102,6 +103,7 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         words.COUNT: str(len(payload.kept)),
         words.T_START_NS: str(start_ns),
         words.T_END_NS: str(end_ns),
+        **_other_times(payload.kept),
     }
     return DataObject(
         bucket=sensor.bucket,
@@ -120,6 +122,20 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
         key_pattern=pattern,
         statistics=payload.statistics,
     )
+
+
+def _other_times(samples: Sequence[Sample]) -> dict[str, str]:
+    """When the messages arrived, if that is known, and the stamps of those that are dated by their arrival."""
+    found: dict[str, str] = {}
+    received = [sample.received_ns for sample in samples if sample.received_ns >= EARLIEST_SANE_NS]
+    if len(received) == len(samples):
+        found |= {words.RECEIVED_START_NS: str(min(received)), words.RECEIVED_END_NS: str(max(received))}
+    if untrusted := [sample.untrusted_ns for sample in samples if sample.untrusted_ns]:
+        found |= {
+            words.STAMP_START_NS: str(min(untrusted)), words.STAMP_END_NS: str(max(untrusted)),
+            words.BY_ARRIVAL: str(len(untrusted)),
+        }  # fmt: skip
+    return found
 
 
 def _text(fact: Fact) -> str:

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.rows.schema import row_of
 from shadowhound_data_logger.formats.statistics import ALL, FieldStatistics
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.lake import decode
@@ -324,3 +325,19 @@ def test_several_messages_are_never_cut_down_to_one(ros: Any, batch_s: float) ->
     """Whatever the settings say, a batch of several messages is written as a batch."""
     encoding = ros.encode(ODOMETRY, ros.cdr(ODOMETRY), ros.cdr(ODOMETRY), batch_s=batch_s)
     assert document(encoding)['count'] == encoding.object.samples == 2
+
+
+def test_an_object_has_both_times_of_its_messages() -> None:
+    """When they were measured, when they arrived, and of those that are dated by their arrival what their stamps were."""
+    cdr, second = b'\0\1\0\0' + bytes(8), 10**9
+    samples = (Sample(STAMP_NS, cdr, STAMP_NS + second), Sample(STAMP_NS + 2 * second, cdr, STAMP_NS + 2 * second, None, 77))
+    batch = Batch('talk', '/talk', 'std_msgs/msg/Int64', samples, 24)
+    made = encode(batch, SensorSettings(name='talk', batch_s=5.0, format='json'), 'thor', MessageTypes()).object
+    assert made is not None
+    assert {name: int(made.metadata[name]) for name in made.metadata if name.endswith('_ns')} == {
+        't_start_ns': STAMP_NS, 't_end_ns': STAMP_NS + 2 * second, 'received_start_ns': STAMP_NS + second,
+        'received_end_ns': STAMP_NS + 2 * second, 'stamp_start_ns': 77, 'stamp_end_ns': 77,
+    }  # fmt: skip
+    assert made.metadata['by_arrival'] == '1'
+    row = row_of('sensor-data', made.key, 24, made.content_type, made.metadata)
+    assert (row['received_start_ns'], row['received_end_ns'], row['by_arrival']) == (STAMP_NS + second, STAMP_NS + 2 * second, 1)

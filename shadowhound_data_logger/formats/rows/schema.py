@@ -48,6 +48,9 @@ COLUMNS: Final[Mapping[str, str]] = {
     'clock_offset_ns': INT64,
     'content_type': STRING,
     'format_version': INT32,
+    'received_start_ns': INT64,
+    'received_end_ns': INT64,
+    'by_arrival': INT64,
 }
 """Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are always there; all else is null where it is not known.
 
@@ -55,7 +58,8 @@ Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact on
 ``x y yaw`` are meters and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
 message, the middle of a batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date:
 ``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the part lies under ``date=1970-01-01``.
-``clock_offset_ns`` is to be added to the times in the content, with ``set_later``.
+``clock_offset_ns`` is to be added to the times in the content, with ``set_later``. ``received_*`` is when its messages arrived;
+``by_arrival`` of them are dated by that, because their stamps were not trusted.
 """
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
 UNDATED: Final = '1970-01-01'
@@ -184,6 +188,9 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
         'clock_offset_ns': _int(metadata, words.CLOCK_OFFSET_NS),
         'content_type': content_type or None,
         'format_version': FORMAT_VERSION,
+        'received_start_ns': _int(metadata, words.RECEIVED_START_NS),
+        'received_end_ns': _int(metadata, words.RECEIVED_END_NS),
+        'by_arrival': _int(metadata, words.BY_ARRIVAL),
     }
 
 

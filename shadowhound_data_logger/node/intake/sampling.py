@@ -197,9 +197,9 @@ class Sampler(Consumer):
         sampled.follow(self._sensors[drained.sensor])
         kept: list[_Chosen] = []
         if not (drained.paused or self.idle):
-            for cdr, _, publisher, _, received_ns, stamp_ns, clock in drained.messages:
+            for cdr, _, publisher, _, received_ns, stamp_ns, clock, untrusted_ns in drained.messages:
                 if sampled.of(clock).rule.keep(stamp_ns, cdr):
-                    kept.append((clock, Sample(stamp_ns, cdr, received_ns, publisher)))
+                    kept.append((clock, Sample(stamp_ns, cdr, received_ns, publisher, untrusted_ns)))
         return kept
 
     def take(self, drained: Drained) -> None:

@@ -134,7 +134,8 @@ class MessageTimes:
         track = self._tracks.of(publisher)
         dated = track.date(stamp_ns, source_ns, received_ns)
         clock = publisher or '' if track.is_apart and not dated.refused else None
-        known = message._replace(publisher=publisher, stamp_ns=dated.ns, clock=clock)
+        untrusted_ns = stamp_ns or source_ns if dated.refused else 0
+        known = message._replace(publisher=publisher, stamp_ns=dated.ns, clock=clock, untrusted_ns=untrusted_ns)
         sent = self._sent(0, source_ns, received_ns)
         if not sent.refused:
             return known, (dated.refused,) if dated.refused else ()

@@ -36,7 +36,7 @@ def test_a_row_has_all_that_the_object_says() -> None:
         't_end': (NOON_NS + SECOND) // 1000, 't_start_ns': NOON_NS + 7, 't_end_ns': NOON_NS + SECOND, 'count': 1,
         'mission_id': 'patrol_1', 'run_id': 'r1', 'mission_type': 'patrol', 'x': 1.5, 'y': -2.0, 'yaw': 0.7854,
         'pose_frame': 'odom', 'battery_pct': 78.0, 'clock': 'set_later', 'clock_offset_ns': -5, 'content_type': 'image/jpeg',
-        'format_version': 1,
+        'format_version': 1, 'received_start_ns': None, 'received_end_ns': None, 'by_arrival': None,
     }  # fmt: skip
 
 
