@@ -32,6 +32,8 @@ from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, S
 from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.stores.credentials import with_keys
+from shadowhound_data_logger.stores.s3_obstore import proxy_options
 
 BUCKET: Final = 'lake'
 """Of the shared tables; robots cannot write it."""
@@ -195,8 +197,9 @@ def storage_options(settings: StoreSettings) -> dict[str, str]:
     options = {
         'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': 'true',
         'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
-        'connect_timeout': '5s', 'timeout': '60s', 'retry_timeout': '60s',
+        'connect_timeout': '5s', 'timeout': '60s', 'retry_timeout': '60s', **proxy_options(settings.endpoint_url or ''),
     }  # fmt: skip
+    settings = with_keys(settings)
     if settings.access_key_id and settings.secret_access_key:
         options |= {'AWS_ACCESS_KEY_ID': settings.access_key_id, 'AWS_SECRET_ACCESS_KEY': settings.secret_access_key}
     if settings.session_token:

@@ -13,6 +13,7 @@ import ssl
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -125,6 +126,14 @@ def no_profile(error: ProfileNotFound) -> SettingError:
         'a profile in ~/.aws/credentials or ~/.aws/config, or in the files of AWS_SHARED_CREDENTIALS_FILE and AWS_CONFIG_FILE'
     )
     return SettingError('AWS_PROFILE', error.kwargs['profile'], allowed)
+
+
+def with_keys(settings: StoreSettings) -> StoreSettings:
+    """The settings, with the keys of a profile if they have none. Raises SettingError for a profile that is missing."""
+    if settings.access_key_id or not has_keys(settings):
+        return settings
+    found = Keys(settings).get_frozen_credentials()
+    return replace(settings, access_key_id=found.access_key, secret_access_key=found.secret_key, session_token=found.token)
 
 
 class _Provider:

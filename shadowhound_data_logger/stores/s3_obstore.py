@@ -267,7 +267,7 @@ def _client(settings: StoreSettings, bucket: str) -> Client:
     if not (settings.access_key_id and settings.secret_access_key):
         given = {'credential_provider': _provider(settings)}
     options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE,
-                    **_proxy(settings.endpoint_url or '')}  # fmt: skip
+                    **proxy_options(settings.endpoint_url or '')}  # fmt: skip
     if (authorities := _authorities(settings)) is not None:
         options['root_certificate'] = authorities
     return Client(
@@ -290,8 +290,10 @@ def _provider(settings: StoreSettings) -> Any:
     return Boto3CredentialProvider()
 
 
-def _proxy(endpoint: str) -> dict[str, str]:
-    """The options for the proxy that botocore would use. On its own, obstore reads ALL_PROXY and NO_PROXY by other rules."""
+def proxy_options(endpoint: str) -> dict[str, str]:
+    """Options of obstore and delta-rs for the proxy that botocore would use. By default they read ALL_PROXY and NO_PROXY by other
+    rules.
+    """
     url, proxies = urlsplit(endpoint), getproxies()
     if not proxies:
         return {}
@@ -348,4 +350,4 @@ def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> S
         return s3_errors.refused('InvalidAccessKeyId', 401, message, request)
     if isinstance(error, (refused.InvalidPathError, ValueError)):
         return ObjectRefused(f'the key {bucket}/{key:.80} is not a path', reason='name', bucket=bucket, key=key)
-    return s3_errors.away(str(error), request, is_proxied=_proxy(endpoint).keys() == {'proxy_url'})
+    return s3_errors.away(str(error), request, is_proxied=proxy_options(endpoint).keys() == {'proxy_url'})

@@ -21,6 +21,7 @@ from stores.spooled import Spool
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import CredentialsRejected, ObjectRefused, SettingError
 from shadowhound_data_logger.core.model import Put
+from shadowhound_data_logger.lake.tables import storage_options
 from shadowhound_data_logger.stores.credentials import REREAD_S, Keys
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES
@@ -107,6 +108,17 @@ def test_every_client_signs_with_the_same_profile(
             else:
                 assert str(raised.value).startswith("AWS_PROFILE = 'not-there' is refused")
     assert len(signed) == 1
+
+
+def test_the_tables_of_the_lake_are_read_with_the_same_profile(file: File, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By delta-rs, which gets the keys in hand."""
+    file.write('KEY', SECRET, 'robot', aws_session_token='token')
+    monkeypatch.setenv('AWS_PROFILE', 'robot')
+    found = storage_options(OWN)
+    assert [found[f'AWS_{name}'] for name in ('ACCESS_KEY_ID', 'SECRET_ACCESS_KEY', 'SESSION_TOKEN')] == ['KEY', SECRET, 'token']
+    monkeypatch.setenv('AWS_PROFILE', 'not-there')
+    with pytest.raises(SettingError, match="AWS_PROFILE = 'not-there' is refused"):
+        storage_options(OWN)
 
 
 def test_keys_in_the_settings_come_first_and_stay(file: File) -> None:

@@ -8,10 +8,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
 import pytest
+from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError
 from stores.fake_s3 import FakeS3, served
 
 from shadowhound_data_logger.core.errors import ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.lake.tables import storage_options
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 
@@ -97,3 +100,65 @@ def test_a_proxy_that_is_unreachable_is_named(
     with pytest.raises(StoreUnavailable, match=f'the proxy to {tower.url} cannot be reached') as raised:
         get(client, tower.url)
     assert 'NO_PROXY' in raised.value.remedy
+
+
+class Recorder(ThreadingHTTPServer):
+    """A server without any object, or a proxy to one; it counts requests."""
+
+    def __init__(self) -> None:
+        super().__init__(('127.0.0.1', 0), Nothing)
+        self.requests = 0
+
+    @property
+    def url(self) -> str:
+        return f'http://127.0.0.1:{self.server_port}'
+
+
+class Nothing(BaseHTTPRequestHandler):
+    """Answers 404."""
+
+    server: Recorder
+
+    def do_GET(self) -> None:
+        self.server.requests += 1
+        self.send_response(404)
+        self.send_header('Content-Length', '0')
+        self.end_headers()
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def log_message(self, *_: object) -> None:
+        """Quiet."""
+
+
+@pytest.fixture
+def recorders() -> Iterator[tuple[Recorder, Recorder]]:
+    """A proxy and a server."""
+    made = Recorder(), Recorder()
+    threads = [Thread(target=each.serve_forever, kwargs={'poll_interval': 0.01}) for each in made]
+    for thread in threads:
+        thread.start()
+    yield made
+    for server, thread in zip(made, threads, strict=True):
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@pytest.mark.parametrize(('variables', 'is_proxied'), [
+    ({'HTTP_PROXY': 'PROXY'}, True), ({'ALL_PROXY': 'PROXY'}, False),
+    ({'HTTP_PROXY': 'PROXY', 'NO_PROXY': '127.0.0.1:PORT'}, False),
+    ({'HTTP_PROXY': 'PROXY', 'NO_PROXY': '127.0.0.0/8'}, True), ({'HTTP_PROXY': 'PROXY', 'NO_PROXY': '*'}, False),
+])  # fmt: skip
+def test_the_tables_of_the_lake_use_the_same_proxy(
+    recorders: tuple[Recorder, Recorder], environ: pytest.MonkeyPatch, variables: dict[str, str], *, is_proxied: bool
+) -> None:
+    """They are read by delta-rs, which has its own S3 client."""
+    proxy, server = recorders
+    for name, text in variables.items():
+        environ.setenv(name, text.replace('PROXY', proxy.url).replace('PORT', str(server.server_port)))
+    settings = StoreSettings(endpoint_url=server.url, access_key_id='KEY', secret_access_key='secret')
+    with pytest.raises((OSError, DeltaError)):
+        DeltaTable('s3://lake/objects', storage_options=storage_options(settings))
+    assert (proxy.requests > 0, server.requests > 0) == (is_proxied, not is_proxied)
