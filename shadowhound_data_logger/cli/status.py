@@ -39,6 +39,9 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
+from shadowhound_data_logger.core.errors import PolicyError
+from shadowhound_data_logger.policies.folder import PolicyFolder
+from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX
 from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 from shadowhound_data_logger.spool.gaps import EXACT
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, robots
@@ -46,6 +49,7 @@ from shadowhound_data_logger.spool.status import read as read_status
 
 LOSSES: Final = ('dropped', 'rejected')
 """Columns that appear once there is something in them."""
+_ISOLATIONS: Final = {SANDBOX: 'a sandbox', LIMITS: 'resource limits alone, without a sandbox'}
 HEADS: Final = {'running': ('running', 'green'), 'not_answering': ('NOT ANSWERING', 'red'), 'not_running': ('not running', 'red')}
 
 
@@ -88,9 +92,15 @@ def _look(spool: Path, robot: str | None, clock: Clock) -> dict[str, Any]:
     names = [robot] if robot else robots(spool) or ['thor']
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each['running']), found[0])
-    policies = the_home() / 'policies'
-    if follows_signers(policies) and (stale := why_stale(policies, clock.wall_ns())):
+    folder = PolicyFolder(the_home())
+    if follows_signers(folder.path) and (stale := why_stale(folder.path, clock.wall_ns())):
         chosen['findings'].append(f'No new version of a policy is taken: {stale}.')
+    if active := folder.current():
+        chosen['policy'] = {'active': active, 'isolation': None}
+        try:
+            chosen['policy']['isolation'] = folder.state().verified.get(active)
+        except PolicyError as error:
+            chosen['findings'].append(str(error))
     return {**chosen, 'others': [each['robot'] for each in found if each['running'] and each is not chosen]}
 
 
@@ -124,6 +134,9 @@ def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
         parts += [*_topics(found['topics'], found['middleware']['unheard'] or {}), '']
     if live or found['spool']:
         parts += [_way(found, console, live=live), '']
+    if found.get('policy'):
+        tested = found['policy']['isolation'] or 'an unknown isolation'
+        parts += [plain(f'Active policy: {found["policy"]["active"]}, tested in {_ISOLATIONS.get(tested, tested)}'), '']
     if not live and found['spool']:
         parts.append(Text('What became of every message: shadowhound-data ledger', 'dim'))
     parts += [plain(line, 'yellow') for line in found['findings'] if live or line != NOT_RUNNING_TEXT]

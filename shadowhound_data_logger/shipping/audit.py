@@ -27,12 +27,14 @@ SIZE: Final = 'size'
 CHECKSUM: Final = 'checksum'
 FOREIGN: Final = 'foreign'
 DENIED: Final = 'denied'
+UNREADABLE: Final = 'unreadable'
 KINDS: Final = {
     MISSING: 'not in the store',
     SIZE: 'of another size',
     CHECKSUM: 'of other content',
     FOREIGN: 'without a checksum, so written by somebody else; --deep compares the content',
     DENIED: 'denied by the store: it may be there or not',
+    UNREADABLE: 'refused by the store, such as an object that a client encrypted with its own key (SSE-C)',
 }
 """What can be found, in words."""
 
@@ -143,7 +145,8 @@ def _judge(store: ObjectStore, expected: ObjectInfo, *, deep: bool, pause: Calla
             if content != expected.sha256:
                 return make(CHECKSUM, detail=f'SHA-256 {content}, {expected.sha256} was delivered')
     except (BucketMissing, ObjectRefused) as error:
-        return make(MISSING, detail=str(error))
+        is_missing = isinstance(error, BucketMissing) or error.data.get('reason') == 'missing'
+        return make(MISSING if is_missing else UNREADABLE, detail=str(error))
     except AccessDenied as error:
         return make(DENIED, detail=str(error))
     if expected.sha256 in {None, held.sha256} or (deep and held.sha256 is None):

@@ -21,6 +21,7 @@ from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.cli.status import status, view
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.spool.status import file
 
 ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, and the WiFi up? it is tried again until it works)'
@@ -143,6 +144,28 @@ def test_it_says_which_mission_is_active() -> None:
     assert f'MLflow run {"a" * 32}' in text
     assert 'patrol, begun before the clock was set' in text
     assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
+
+
+@pytest.mark.parametrize(('isolation', 'text'), [
+    ('sandbox', 'tested in a sandbox'), ('limits', 'tested in resource limits alone, without a sandbox'),
+    (None, 'tested in an unknown isolation'),
+])  # fmt: skip
+def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolation: str | None, text: str) -> None:
+    """With and without --json; a damaged state file of policies is a finding, and the rest of the status is still shown."""
+    name = f'go2_patrol@1#{"a" * 16}'
+    folder = PolicyFolder(tmp_path)
+    folder.make()
+    (folder.versions / name).mkdir()
+    (folder.path / 'current').symlink_to(Path('versions') / name)
+    with folder.changing() as state:
+        state.verified |= {name: isolation} if isolation else {}
+    home = {'SHADOWHOUND_HOME': str(tmp_path)}
+    assert json.loads(run(tmp_path, '--json', **home).stdout)['policy'] == {'active': name, 'isolation': isolation}
+    assert f'Active policy: {name}, {text}' in ' '.join(run(tmp_path, **home).stdout.split())
+    (folder.path / 'state.json').write_text('{')
+    found = json.loads(run(tmp_path, '--json', **home).stdout)
+    assert found['policy'] == {'active': name, 'isolation': None}
+    assert any('state.json is damaged' in finding for finding in found['findings'])
 
 
 def test_it_says_when_what_is_asked_for_will_have_arrived() -> None:

@@ -10,6 +10,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import create_autospec
 
 import boto3
 import pytest
@@ -24,13 +25,16 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import AccessDenied, ForeignObject, LakeError
 from shadowhound_data_logger.core.mailbox import KeptFilter, decode_inbox, inbox_key
-from shadowhound_data_logger.core.model import Put, SpooledObject
+from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.doctor.model import Severity
 from shadowhound_data_logger.doctor.s3 import RACED, race_mailboxes
 from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.lake import prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.verify import Unfinished
+from shadowhound_data_logger.shipping.audit import audit
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs
@@ -310,12 +314,12 @@ YEAR_S = 52 * 7 * 86_400
     ('thor', 's3', YEAR_S, 'get_object', 403), ('thor', 's3', YEAR_S, 'put_object', 403), ('thor', 's3', 60, 'get_object', 403),
     ('thor', 's3v4', 60, 'get_object', 403), ('thor', 's3v4', 60, 'put_object', 403), ('thor', 's3v4', YEAR_S, 'get_object', 400),
     ('spark', 's3', YEAR_S, 'get_object', 403), ('spark', 's3v4', YEAR_S, 'get_object', 400),
-    ('spark', 's3v4', 60, 'get_object', 200),
+    ('spark', 's3v4', 60, 'get_object', 200), ('tower', 's3', YEAR_S, 'get_object', 200),
 ])  # fmt: skip
 def test_no_url_outlives_a_robots_keys(
     server: Tower, as_user: Connect, user: str, version: str, seconds: int, method: str, status: int
 ) -> None:
-    """A robot signs no URL at all, and Spark none for longer than a week."""
+    """A robot signs no URL, and Spark none for longer than a week; nothing restricts the Tower's own user."""
     as_user('thor').put_object(Bucket='sensor-data', Key='thor/camera/url.txt', Body=b'mine')
     url = _presigned(server, user, version, seconds, method)
     body = b'theirs' if method == 'put_object' else None
@@ -339,6 +343,28 @@ def test_a_robot_hides_no_object_behind_a_key_of_its_own(as_user: Connect, how: 
     assert spark.get_object(Bucket='sensor-data', Key='thor/camera/plain.txt')['Body'].read() == b'plain'
     with pytest.raises(ClientError, match='404'):
         spark.head_object(**where)
+
+
+def test_an_object_that_was_hidden_is_found_by_verify(server: Tower, as_user: Connect, tmp_path: Path) -> None:
+    """An object encrypted with the client's own key (SSE-C) is a finding and does not stop the audit; HEAD answers only 400."""
+    bodies = {'thor/camera/sse-a.txt': b'one', 'thor/camera/sse-b.txt': b'hidden', 'thor/camera/sse-c.txt': b'three'}
+    admin = as_user('tower')
+    own = {'SSECustomerAlgorithm': 'AES256', 'SSECustomerKey': b'k' * 32}
+    expected = []
+    for number, (key, body) in enumerate(bodies.items()):
+        sha256 = hashlib.sha256(body).hexdigest()
+        admin.put_object(Bucket='sensor-data', Key=key, Body=body, Metadata={'sha256': sha256}, **(own if number == 1 else {}))
+        expected.append((number, ObjectInfo('sensor-data', key, len(body), sha256)))
+    delivered = create_autospec(Unfinished, instance=True)
+    delivered.pages.return_value = [expected]
+    with closing(open_store(server.store_settings('spark'), UploadSettings())) as store:
+        store.open()
+        found = audit(delivered, store, pause=lambda _: pytest.fail('a wait'))
+    assert found.away is None
+    assert found.counts == {'unreadable': 1}, found
+    (finding,) = found.first['unreadable']
+    assert finding.key == 'thor/camera/sse-b.txt'
+    delivered.note.assert_called_once_with([0, 2])
 
 
 def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch,
