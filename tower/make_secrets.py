@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow', 'lake')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 MAILBOXES = 'sensor-data/_requests'
 """What is asked of robots: a robot reads its own."""

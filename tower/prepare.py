@@ -23,7 +23,7 @@ import boto3
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
-BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
+BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow', 'lake')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
 ACCOUNT = '000000000000'

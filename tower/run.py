@@ -75,6 +75,7 @@ class Runner:
             self._knock()
             uri = self._start_postgres(running)
             self._start_mlflow(running, uri, robots)
+            self._start_ingest(running)
             self._running = running.pop_all()
 
     def look(self) -> None:
@@ -148,6 +149,19 @@ class Runner:
         told = [word for robot in robots for word in ('--robot', robot)]
         if subprocess.run([sys.executable, str(HERE / 'prepare.py'), *told], env=environ, check=False).returncode:
             raise ServerFailed('the S3 server could not be prepared', remedy='the lines above say why')
+
+    def _start_ingest(self, running: ExitStack) -> None:
+        """What makes tables of the rows of robots, where the extra ``lake`` is installed."""
+        if find_spec('deltalake') is None:
+            print("the tables of the lake are not kept up to date: pip install 'shadowhound_data_logger[lake]'")
+            return
+        environ = self._environ(
+            AWS_ENDPOINT_URL=self.store_url, AWS_ACCESS_KEY_ID=self._settings['TOWER_ACCESS_KEY_ID'],
+            AWS_SECRET_ACCESS_KEY=self._settings['TOWER_SECRET_ACCESS_KEY'],
+        )  # fmt: skip
+        self._launch(
+            running, 'ingest', [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'lake', 'ingest', '--follow'], environ
+        )
 
     def _knock(self) -> None:
         """A SeaweedFS that does not know what it was given serves everybody and says nothing: then the Tower ends."""

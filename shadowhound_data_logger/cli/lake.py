@@ -33,12 +33,14 @@ from shadowhound_data_logger.cli.export import all_datasets
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
+from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.shipping.audit import KINDS, Audit, audit
 from shadowhound_data_logger.stores import open_reader
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Coverage
+    from shadowhound_data_logger.lake.ingest import Ingested
     from shadowhound_data_logger.lake.prune import PrunePlan
     from shadowhound_data_logger.lake.verify import Rows
 
@@ -83,6 +85,57 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
                       *map(number, counts[2:]))  # fmt: skip
     print_page(table if found else plain(f'There is no catalog yet in {source.describe()}.{store_hint()}'))
     return report_skipped(left_out)
+
+
+@lake.command('ingest', epilog=examples('lake ingest', 'lake ingest --follow'))
+@click.option('--follow', is_flag=True, help='Continue until interrupted, as the service of a Tower does.')
+@click.option(
+    '--every', type=click.FloatRange(1.0), default=30.0, show_default=True, metavar='S', help='Seconds between two rounds.'
+)
+@click.option('--expire', type=click.FloatRange(0.0), metavar='MIN',
+              help='Delete row files this many minutes after they were ingested  [default: keep them]')  # fmt: skip
+@as_json
+def lake_ingest(*, follow: bool, every: float, expire: float | None, as_json: bool) -> ExitCode:
+    """Make tables of the rows that robots wrote.
+
+    On a server with a bucket `lake` the tables are in that bucket and shared by all readers, otherwise in this user's home.
+    Each row is added once, wherever this is killed and however many run at a time. Small files are merged and ordered by time.
+
+    Exit code 1 when rows or files are rejected: each file is named.
+    """
+    with asking():
+        from shadowhound_data_logger.lake import ingest as library  # noqa: PLC0415
+        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
+        from shadowhound_data_logger.lake.tables import Tables  # noqa: PLC0415
+
+    source, left_out = default_source(the_store_settings()), quietly()
+    grace = None if expire is None else timedelta(minutes=expire)
+    with asking():
+        tables = Tables.for_ingest(source)
+    while True:
+        try:
+            with asking():
+                done = library.ingest(source, tables, left_out)
+                tended = library.tend(source, tables, left_out, grace=grace)
+        except StoreUnavailable as error:
+            if not follow:
+                raise
+            click.echo(str(error), err=True)
+        else:
+            if as_json:
+                print_json({**asdict(done), **asdict(tended), 'tables': tables.root})
+            elif not follow or done.files:
+                click.echo(_about_ingest(done, tables.root))
+        if not follow:
+            return report_skipped(left_out)
+        time.sleep(every)
+
+
+def _about_ingest(done: Ingested, root: str) -> str:
+    if not done.files:
+        return f'All row files are in the tables ({root}).'
+    text = f'{number(done.rows)} rows of {number(done.files)} files added to {root}'
+    return text + f'; {number(done.rejected)} rows rejected' * (done.rejected > 0) + '.'
 
 
 @lake.command(

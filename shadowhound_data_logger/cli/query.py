@@ -73,7 +73,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
               help='The pictures that are most like this one, by vectors that `lake embed` made.')  # fmt: skip
 @click.option('--like-text', metavar='TEXT', help='The pictures that are most like these words; needs --model.')
 @model_option
-@click.option('--as-of', metavar='TIME', help='Answer from the tables of the lake as they were at this time.')
+@click.option('--as-of', metavar='TIME', help='Answer from the tables as they were at this time, to the second.')
 @click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels of each object.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')

@@ -275,11 +275,15 @@ class Tended:
     """Files of tables deleted that no version still kept has."""
 
 
-def tend(source: Bucket, tables: Tables, findings: Findings, *, grace: timedelta = GRACE, now: datetime | None = None) -> Tended:
+def tend(
+    source: Bucket, tables: Tables, findings: Findings, *, grace: timedelta | None = GRACE, now: datetime | None = None
+) -> Tended:
     """Merge and order the files of tables, expire row files, delete files of old versions. Raises StoreError, LakeError."""
     now = now or datetime.now(timezone.utc)
     merged = sum(_merge(tables, table, f'{utc(time.time_ns()):%Y-%m-%d}') for table in (*TABLES.values(), INGESTED))
-    expired, denied = _expire(source, tables, findings, now - grace) if tables.is_shared else (0, 0)
+    expired, denied = (0, 0)
+    if tables.is_shared and grace is not None:
+        expired, denied = _expire(source, tables, findings, now - grace)
     vacuumed = sum(len(tables.open(table).vacuum(dry_run=False)) for table in (*TABLES.values(), INGESTED))
     return Tended(merged, expired, denied, vacuumed)
 

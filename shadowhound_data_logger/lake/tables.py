@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -37,6 +38,10 @@ from shadowhound_data_logger.stores.s3_obstore import proxy_options
 
 BUCKET: Final = 'lake'
 """Of the shared tables; robots cannot write it."""
+NO_BUCKET: Final = 'NoSuchBucket'
+"""S3's own word, in what a put to a bucket that does not exist is answered with."""
+_COLORS: Final = re.compile(r'\x1b\[\d*m|\u21b3')
+"""In the library's messages, which are made for terminals."""
 LOG: Final = '_delta_log'
 """The folder that makes a folder a table."""
 DATE, ROBOT, PART = 'date', 'robot', 'part'
@@ -126,6 +131,22 @@ class Tables:
             if shared.exists(INGESTED):
                 return shared
         return cls.local(source)
+
+    @classmethod
+    def for_ingest(cls, source: Bucket) -> Tables:
+        """Those that rows of this bucket are ingested into, created where they do not exist yet. Raises StoreError, LakeError."""
+        if source.settings.endpoint_url:
+            found = cls.shared(source.settings)
+            try:
+                found.create()
+            except LakeError as error:
+                if NO_BUCKET not in str(error):
+                    raise
+            else:
+                return found
+        found = cls.local(source)
+        found.create()
+        return found
 
     @classmethod
     def shared(cls, settings: StoreSettings) -> Tables:
@@ -306,4 +327,4 @@ def translated() -> Iterator[None]:
 
 
 def _text(error: Exception) -> str:
-    return ' '.join(str(error).split())[:400]
+    return ' '.join(_COLORS.sub('', str(error)).split())[:400]

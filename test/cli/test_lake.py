@@ -45,6 +45,17 @@ def test_status_compact_status(home: Path) -> None:
     assert (after['files'], after['compacted'], after['open_days'], after['covered']) == (2, 2, 0, 0)
 
 
+def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None:
+    """A second run finds nothing new; a file that is not one is named."""
+    first = json.loads(run(home, 'ingest', '--json').output)
+    assert (first['files'], first['rows'], first['repeated'], first['rejected']) == (24, 192, 0, 0)
+    assert 'All row files are in the tables' in run(home, 'ingest').output
+    (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.parquet').write_bytes(b'hello')
+    bad = run(home, 'ingest')
+    assert '1 rows rejected' in bad.stdout
+    assert 'bad.parquet is left out' in bad.stderr
+
+
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
     """There is nothing to say and nothing to do."""
     assert 'no catalog yet in the bucket sensor-data' in run(tmp_path, 'status').output

@@ -128,7 +128,9 @@ def test_spark_reads_everything_and_changes_nothing_of_a_robot(as_user: Connect)
     assert _is_denied(spark.put_object, Bucket='sensor-data', Key='thor/x', Body=b'two')
     assert _is_denied(spark.delete_object, Bucket='sensor-data', Key='thor/for-spark')
     assert _is_denied(spark.put_object, Bucket='mlflow', Key='1/x', Body=b'two')
-    assert {bucket['Name'] for bucket in spark.list_buckets()['Buckets']} == {'sensor-data', 'trajectories', 'lerobot', 'mlflow'}
+    assert {bucket['Name'] for bucket in spark.list_buckets()['Buckets']} == {
+        'sensor-data', 'trajectories', 'lerobot', 'mlflow', 'lake',
+    }  # fmt: skip
 
 
 def test_training_sets_are_sparks(as_user: Connect) -> None:

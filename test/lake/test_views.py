@@ -1,0 +1,94 @@
+"""A query of a shared lake sees every row once: from the tables, and from row files that are not in them yet."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import boto3
+import pytest
+from lake.making import NOON_NS, add_part, fill, keys, row
+from shadowhound_tower.embedded import Tower
+
+from shadowhound_data_logger import lake
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.tables import Tables
+from shadowhound_data_logger.stores import open_store
+
+pytestmark = pytest.mark.seaweedfs
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Tower]:
+    """With a reader who may not write."""
+    with Tower(tmp_path / 'tower', users={'spark': ('Read', 'List')}) as started:
+        yield started
+
+
+def with_bucket(server: Tower) -> None:
+    settings = server.store_settings()
+    client = boto3.client('s3', endpoint_url=settings.endpoint_url, aws_access_key_id=settings.access_key_id,
+                          aws_secret_access_key=settings.secret_access_key, region_name=settings.region)  # fmt: skip
+    client.create_bucket(Bucket='lake')
+    client.close()
+
+
+def of(server: Tower, user: str) -> Bucket:
+    return Bucket(server.store_settings(user), schema.BUCKET)
+
+
+def found(source: Bucket, **flags: object) -> list[str]:
+    return sorted(lake.objects(source, **flags)['key'].to_pylist())
+
+
+def test_before_during_and_after_ingestion_a_reader_sees_each_row_once(server: Tower, tmp_path: Path) -> None:
+    """Without the bucket from its own tables; then from row files; then from both; then from the tables alone."""
+    rows = fill(server.store_settings(), tmp_path / 'tmp')
+    reader, owner = of(server, 'spark'), of(server, 'tower')
+    assert not Tables.for_ingest(owner).is_shared
+    assert found(reader) == keys(rows)
+    with_bucket(server)
+    with pytest.raises(LakeError, match='privileges'):
+        Tables.for_ingest(reader)
+    tables = Tables.for_ingest(owner)
+    assert tables.is_shared
+    assert found(reader) == keys(rows)
+    assert ingest(owner, tables, Findings()).rows == len(rows)
+    late = [row('odom', NOON_NS + 3 * SECOND + number) for number in range(2)]
+    with closing(open_store(server.store_settings(), UploadSettings())) as store:
+        add_part(store, late, 'late', tmp_path / 'tmp')
+    assert found(reader) == keys([*rows, *late])
+    ingest(owner, tables, Findings())
+    later = datetime.now(timezone.utc) + timedelta(hours=2)
+    assert tend(owner, tables, Findings(), now=later).expired == 49
+    assert reader.list('thor/_catalog/') == []
+    assert found(reader) == keys([*rows, *late])
+
+
+def test_a_query_as_of_a_time_sees_what_the_tables_had_then(server: Tower, tmp_path: Path) -> None:
+    """Not what was ingested later, and nothing of row files."""
+    rows = fill(server.store_settings(), tmp_path / 'tmp', days=(0,))
+    with_bucket(server)
+    owner = of(server, 'tower')
+    tables = Tables.for_ingest(owner)
+    ingest(owner, tables, Findings())
+    then = datetime.now(timezone.utc)
+    while datetime.now(timezone.utc) < then.replace(microsecond=0) + timedelta(seconds=1):  # what SeaweedFS dates commits by
+        time.sleep(0.05)
+    more = [row('odom', NOON_NS + 3 * SECOND + number) for number in range(2)]
+    with closing(open_store(server.store_settings(), UploadSettings())) as store:
+        add_part(store, more, 'more', tmp_path / 'tmp')
+    assert found(owner, as_of=then) == keys(rows)
+    ingest(owner, tables, Findings())
+    assert found(owner, as_of=then) == keys(rows)
+    assert found(owner) == keys([*rows, *more])
+    assert lake.sql('SELECT count(*) AS n FROM objects', owner, as_of=then).to_pylist() == [{'n': len(rows)}]
