@@ -28,7 +28,7 @@ from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import AccessDenied, LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.formats.rows.schema import TableSchema
+from shadowhound_data_logger.formats.rows.schema import UNDATED, TableSchema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -218,7 +218,8 @@ def _contents(source: Bucket, file: RowFile) -> tuple[_Read, Findings]:
     rows = pa.concat_tables([reading.narrow(columns, file.of).empty_table(), *found])
     robot = pc.fill_null(rows[ROBOT], file.robot)
     rows = rows.set_column(rows.column_names.index(ROBOT), ROBOT, robot)
-    rows = rows.add_column(0, DATE, pa.array([file.date] * len(rows), pa.string())).cast(table.schema)
+    dates = pc.fill_null(rows[table.dated].cast(pa.date32()).cast(pa.string()), UNDATED)
+    rows = rows.add_column(0, DATE, dates).cast(table.schema)
     rejected = sum(each.rows or 0 for each in left_out) or len(left_out)
     return _Read(file, rows, rejected, next((each.why for each in left_out), None)), left_out
 

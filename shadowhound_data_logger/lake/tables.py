@@ -65,12 +65,14 @@ class Table:
     """Columns; a row in which all of them are equal is the same row."""
     time: str
     """The column by which its files are ordered."""
+    dated: str
+    """The time whose UTC date is the row's partition; a row without it belongs to 1970-01-01."""
     partitions: tuple[str, ...] = PARTITIONS
 
 
-def _table(name: str, of: TableSchema, identity: Sequence[str], time: str) -> Table:
+def _table(name: str, of: TableSchema, identity: Sequence[str], time: str, dated: str = 't_start') -> Table:
     fields = [pa.field(DATE, pa.string()), *(pa.field(column, _KINDS[kind]) for column, kind in of.columns.items())]
-    return Table(name, pa.schema(fields), tuple(identity), time)
+    return Table(name, pa.schema(fields), tuple(identity), time, dated)
 
 
 OBJECT_ROWS: Final = _table('objects', OBJECTS, ('bucket', 'key', 't_start_ns'), 't_start_ns')
@@ -80,16 +82,16 @@ INGESTED: Final = Table(
         (DATE, pa.string()), (ROBOT, pa.string()), (PART, pa.string()), ('etag', pa.string()),
         ('ingested', _KINDS[TIME]), ('rows', pa.int64()), ('rejected', pa.int64()), ('why', pa.string()),
     ]),
-    (PART, 'etag'), 'ingested', (DATE,),
+    (PART, 'etag'), 'ingested', 'ingested', (DATE,),
 )  # fmt: skip
 """Which row files the other tables contain: a row here is committed after all rows of its file."""
 TABLES: Final[Mapping[str, Table]] = {
     OBJECTS.folder: OBJECT_ROWS,
     KEPT.folder: _table('kept', KEPT, ('bucket', 'key', 'where', 'bytes'), 't_start_ns'),
     FORGOTTEN.folder: _table('forgotten', FORGOTTEN, ('bucket', 'key'), 't_start_ns'),
-    GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what', 'from_ns', 'to_ns'), 'to_ns'),
+    GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what', 'from_ns', 'to_ns'), 'to_ns', 't_to'),
     STATISTICS.folder: _table('statistics', STATISTICS, ('bucket', 'key', 't_start_ns', 'field'), 't_start_ns'),
-    LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns'),
+    LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns', 'made'),
 }
 """By the folder of the row files in the store."""
 SCHEMAS: Final[Mapping[str, TableSchema]] = {

@@ -78,6 +78,20 @@ def test_a_row_in_two_files_is_added_once(tmp_path: Path, tables: Tables) -> Non
     assert table_keys(tables) == keys(rows)
 
 
+def test_a_row_is_dated_by_its_own_time(tmp_path: Path, tables: Tables) -> None:
+    """Whatever folder its file is in: in the file of another date it is still the same row."""
+    midnight_ns = NOON_NS + 12 * 3600 * SECOND
+    rows = [row('camera', midnight_ns + second * SECOND) for second in (-1, 0, 1)]
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        add_part(store, rows, 'a', tmp_path / 'tmp')
+        add_part(store, rows[1:], 'b', tmp_path / 'tmp')
+    done = ingest(bucket(tmp_path), tables, Findings())
+    assert (done.rows, done.repeated) == (3, 2)
+    with engine({'objects': tables.open(OBJECT_ROWS)}) as ready:
+        dates = answer(ready, 'SELECT date FROM objects ORDER BY t_start_ns')['date'].to_pylist()
+    assert dates == ['2026-10-28', '2026-10-29', '2026-10-29']
+
+
 def test_a_kill_between_the_rows_and_the_record_of_their_file_repeats_nothing(
     tmp_path: Path, tables: Tables, monkeypatch: pytest.MonkeyPatch
 ) -> None:
