@@ -58,9 +58,10 @@ class MissionDataset:
         ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. With ``causal``
         no aligned message counts that is later than its frame, as a robot would not have had it yet; ``pose`` and
         ``battery_pct`` are the catalogue's all the same, for which later messages count. ``flags`` are those of ``lake.objects``,
-        for the anchor's objects. ``drop_incomplete`` leaves out objects about whose time the catalogue knows nothing of an
-        aligned sensor; a stream leaves out single messages as well. Objects without a date are not in it. With ``pull`` robots
-        are asked for what they keep of these sensors, and it waits until that has come; the log says how far it is.
+        for the anchor's objects; with ``as_of``, a time, the dataset is made of the tables as of then. ``drop_incomplete``
+        leaves out objects about whose time the tables have nothing of an aligned sensor; a stream leaves out single messages as
+        well. Objects without a date are not in it. With ``pull`` robots are asked for what they keep of these sensors, and it
+        waits until that has come; the log says how far it is.
 
         Raises SettingError, StoreError, LakeError.
         """

@@ -143,9 +143,9 @@ def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLU
 
 
 def object_batches(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLUMNS), findings: Findings | None = None,
-                   **flags: Any) -> Iterator[pa.Table]:  # fmt: skip
+                   as_of: str | datetime | None = None, **flags: Any) -> Iterator[pa.Table]:  # fmt: skip
     """The rows of ``objects`` piece by piece, for more of them than memory should hold."""
-    lake = _Asked.of(source, findings)
+    lake = _Asked.of(source, findings, as_of)
     asked, condition = _understood(lake, wanted(time.time_ns(), **flags))
     with _opened(lake, asked) as ready:
         shape = Shape(columns) if not asked.chosen else Shape([*dict.fromkeys((*columns, *_TIMES))])

@@ -97,6 +97,8 @@ def test_a_robot_cannot_delete(as_user: Connect) -> None:
 def test_what_a_robot_replaces_is_kept(as_user: Connect) -> None:
     """The server cannot refuse a PUT without a condition, but the first version stays, and the robot cannot remove it."""
     thor, tower = as_user('thor'), as_user('tower')
+    assert _is_denied(thor.put_object, Bucket='lake', Key='objects/_delta_log/00000000000000000000.json', Body=b'{}')
+    assert _is_denied(as_user('spark').put_object, Bucket='lake', Key='objects/x', Body=b'{}')
     thor.put_object(Bucket='trajectories', Key='thor/path.csv', Body=b'one')
     thor.put_object(Bucket='trajectories', Key='thor/path.csv', Body=b'two')
     versions = tower.list_object_versions(Bucket='trajectories', Prefix='thor/path.csv')['Versions']
