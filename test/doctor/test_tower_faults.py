@@ -23,6 +23,7 @@ from open_seaweed import open_seaweed
 from shadowhound_tower.embedded import Tower
 from shared_tower import BUCKETS
 from stores.fake_s3 import FakeS3, hung, refused, served
+from tower_scripts import make_secrets
 
 from shadowhound_data_logger.core import mlflow_rest
 from shadowhound_data_logger.core.config import UploadSettings
@@ -113,7 +114,8 @@ def test_a_seaweedfs_without_keys_is_named(robot: Scene, tmp_path: Path) -> None
         found = robot.findings('network.s3', 'seaweedfs')
         expect(found, 'seaweedfs.open', 'make tower-secrets', 'docs/tower.md')
         assert set(found[0].data['ports']) >= {ports[name] + 10_000 for name in ('s3', 'filer', 'master', 'volume')}
-    with open_seaweed(tmp_path / 'signed', WEED_JWT_FILER_SIGNING_KEY='a-key') as ports:
+    (tmp_path / 'security.toml').write_text(make_secrets.signing_keys())
+    with open_seaweed(tmp_path / 'signed', tmp_path) as ports:
         robot.environ['AWS_ENDPOINT_URL'] = f'http://127.0.0.1:{ports["s3"]}'
         (found_again,) = robot.findings('network.s3', 'seaweedfs')
         assert ports['s3'] + 10_000 not in found_again.data['ports']

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -9,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -81,14 +83,61 @@ def test_they_listen_where_they_are_told(services: dict[str, Any], tmp_path: Pat
 
 
 def test_every_variable_is_in_the_file_that_is_made(tmp_path: Path) -> None:
-    """make_secrets.py writes all that compose.yaml asks for, and no secret stands in it."""
+    """make_secrets.py writes every variable and every file that compose.yaml refers to."""
     text = (TOWER / 'compose.yaml').read_text(encoding='utf-8')
     make_secrets.make(tmp_path, None, ['thor'])
-    assert set(re.findall(r'\$\{(\w+)', text)) <= set(make_secrets.read_env(tmp_path / '.env'))
+    assert set(re.findall(r'\$\{(\w+)', text)) == {'TOWER_HOST'}
     named = re.findall(r'\./(secrets/[\w.]+)', text)
     assert 'secrets/seaweedfs.env' in named
     assert all((tmp_path / name).is_file() for name in named)
-    assert all(value.startswith('${') for value in re.findall(r'(?:SECRET\w*|PASSWORD): (\S+)', text))
+
+
+def test_no_container_has_a_secret_in_its_environment(services: dict[str, Any], secured: dict[str, Any], tmp_path: Path) -> None:
+    """Neither in a variable, nor in a file of variables, nor in a command; each secret that a container names is declared."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    settings = make_secrets.read_env(tmp_path / '.env')
+    given = {name for name in settings if not name.startswith(('TOWER_HOST', 'TOWER_OFFSET', 'TOWER_SCHEME'))}
+    assert len(given) == 6
+    text = (tmp_path / 'secrets' / 'seaweedfs.env').read_text() + json.dumps([services, secured])
+    assert [name for name in given if settings[name] in text or f'${{{name}' in text] == []
+    signing = re.findall('key = "([0-9a-f]{64})"', (tmp_path / 'secrets' / 'security.toml').read_text())
+    assert len(signing) == 4
+    assert [key for key in signing if key in text] == []
+    declared = yaml.safe_load((TOWER / 'compose.yaml').read_text(encoding='utf-8'))['secrets']
+    assert {name for service in services.values() for name in service.get('secrets', ())} == set(declared)
+    for name, source in declared.items():
+        assert source == {'file': f'./secrets/{name}'}
+        assert (tmp_path / 'secrets' / name).stat().st_mode & 0o777 == 0o600
+    for service in services.values():
+        for value in service.get('environment', {}).values():
+            if value.startswith('/run/secrets/'):
+                assert value.rpartition('/')[2] in service['secrets']
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='root alone may change the user')
+def test_the_servers_user_reads_copies_of_the_secrets(services: dict[str, Any], tmp_path: Path) -> None:
+    """The entry point of MLflow's container, with another user and other folders: it ends as that user, which reads each file."""
+    make_secrets.make(tmp_path, None, ['thor'])
+    tmp_path.chmod(0o755)
+    given, home = tmp_path / 'given', Path(tempfile.mkdtemp(prefix='shadowhound-'))
+    given.mkdir(mode=0o700)
+    for name in services['mlflow']['secrets']:
+        shutil.copy(tmp_path / 'secrets' / name, given)
+    try:
+        shutil.chown(home, 'nobody')
+        places = {'/run/secrets': str(given), '/var/lib/mlflow': str(home), '$$': '$', '-g mlflow': '-g nogroup',
+                  'regid=mlflow': 'regid=nogroup', '-o mlflow': '-o nobody', 'reuid=mlflow': 'reuid=nobody'}  # fmt: skip
+        script = services['mlflow']['entrypoint'][2]
+        for theirs, ours in places.items():
+            assert theirs in script
+            script = script.replace(theirs, ours)
+        ask = f'id -un; cd {home}; stat -c "%U %a %n" *; cat *'
+        ran = subprocess.run(['sh', '-ec', script, 'sh', 'sh', '-ec', ask], capture_output=True, text=True, check=True)
+    finally:
+        shutil.rmtree(home)
+    user, *files = ran.stdout.splitlines()[:4]
+    assert (user, files) == ('nobody', [f'nobody 400 {name}' for name in sorted(services['mlflow']['secrets'])])
+    assert make_secrets.read_env(tmp_path / '.env')['MLFLOW_SECRET_ACCESS_KEY'] in ran.stdout
 
 
 def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any]) -> None:
@@ -97,6 +146,7 @@ def test_a_running_server_sees_the_keys_that_are_changed(services: dict[str, Any
     assert mounts == [['./secrets', '/secrets', 'ro']]
     assert '-s3.config=/secrets/s3.json' in services['s3']['command']
     assert services['s3']['working_dir'] == '/secrets', 'seaweedfs.env names files there'
+    assert services['s3']['entrypoint'] == ['/usr/bin/weed', '-config_dir=/secrets'], 'security.toml is there'
 
 
 def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, Any], secured: dict[str, Any]) -> None:
@@ -110,11 +160,13 @@ def test_mlflow_asks_for_passwords_and_never_runs_as_root(services: dict[str, An
         assert mounts[str(told.users.parent)] == './mlflow'
         assert told.command[:2] == ['mlflow', 'server']
         assert told.command[told.command.index('--port') + 1] == '5000'
-        assert mlflow_access.ADMIN_LOGIN in service['environment']
+        assert (told.password.parent, told.password.name in services['mlflow']['secrets']) == (told.folder, True)
     assert 'USER mlflow' in (TOWER / 'Dockerfile.mlflow').read_text()
     assert f'install -d -o mlflow -g mlflow -m 0700 {told.folder}' in (TOWER / 'Dockerfile.mlflow').read_text()
-    assert 'user' not in services['mlflow']
-    assert 'exec setpriv --reuid=mlflow' in secured['mlflow']['entrypoint'][2]
+    assert 'exec setpriv --reuid=mlflow' in services['mlflow']['entrypoint'][2]
+    assert not {'user', 'entrypoint'} & set(secured['mlflow'])
+    assert secured['mlflow']['secrets'] == ['tower.key']
+    assert '--ssl-keyfile=/var/lib/mlflow/tower.key' in secured['mlflow']['command']
 
 
 @pytest.mark.slow
@@ -127,7 +179,8 @@ def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -
         ports = Ports('127.0.0.1')
         stack.callback(ports.release)
         port = str(ports.take())
-        places = {'/tower/': f'{tmp_path}/', '/users/': f'{tmp_path}/mlflow/', '/var/lib/mlflow': f'{tmp_path}',
+        places = {'/tower/': f'{tmp_path}/', '/users/': f'{tmp_path}/mlflow/',
+                  '/var/lib/mlflow/mlflow.password': f'{tmp_path}/secrets/mlflow.password', '/var/lib/mlflow': f'{tmp_path}',
                   '0.0.0.0': '127.0.0.1', 's3://mlflow': f'{tmp_path}/artifacts',
                   '${TOWER_HOST:?run make tower-secrets first}': '127.0.0.1',
                   '--port 5000': f'--port {port}', '--workers 2': '--workers 1'}  # fmt: skip
@@ -137,7 +190,6 @@ def test_mlflow_starts_from_one_file(services: dict[str, Any], tmp_path: Path) -
             command = command.replace(theirs, ours)
         environ = {name: value for name, value in os.environ.items() if not name.startswith(('MLFLOW_', 'PYTHONPATH', 'AWS_'))}
         environ['MLFLOW_BACKEND_STORE_URI'] = f'sqlite:///{tmp_path}/mlflow.db'
-        environ[mlflow_access.ADMIN_LOGIN] = make_secrets.read_env(tmp_path / '.env')[mlflow_access.ADMIN_LOGIN]
         program, *words = shlex.split(command)
         assert program == 'python'
         server = stack.enter_context(subprocess.Popen([sys.executable, *words], env=environ, cwd='/'))

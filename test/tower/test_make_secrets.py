@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import stat
 import subprocess
 import sys
@@ -67,20 +68,18 @@ def test_the_files_of_users_name_the_ports_of_their_tower(tmp_path: Path) -> Non
 def test_an_older_folder_gets_what_it_lacks(tmp_path: Path) -> None:
     """The signing keys and the certificate of SeaweedFS are added, once, beside keys and passwords that stay."""
     make_secrets.make(tmp_path, '192.168.1.10', ['thor'])
-    for path in (tmp_path / 'secrets').glob('seaweedfs.*'):
+    for path in (tmp_path / 'secrets').glob('se*.*'):
         path.unlink()
     before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
     make_secrets.make(tmp_path, None, [])
-    added = {path: path.read_bytes() for path in (tmp_path / 'secrets').glob('seaweedfs.*')}
-    assert {path.name for path in added} == {'seaweedfs.env', 'seaweedfs.crt', 'seaweedfs.key'}
+    added = {path: path.read_bytes() for path in (tmp_path / 'secrets').glob('se*.*')}
+    assert {path.name for path in added} == {'security.toml', 'seaweedfs.env', 'seaweedfs.crt', 'seaweedfs.key'}
     make_secrets.make(tmp_path, None, ['thor'])
     assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == {**before, **added}
     assert _modes(tmp_path) == {'0o600'}
     told = make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
-    signing = [value for name, value in told.items() if name.startswith('WEED_JWT_')]
-    assert len(set(signing)) == 4
-    assert all(len(value) == 64 for value in signing)
-    assert all((tmp_path / 'secrets' / value).is_file() for name, value in told.items() if name.startswith('WEED_GRPC_'))
+    assert len(set(re.findall('key = "([0-9a-f]{64})"', (tmp_path / 'secrets' / 'security.toml').read_text()))) == 4
+    assert all((tmp_path / 'secrets' / value).is_file() for value in told.values())
 
 
 def test_a_machine_without_openssl_is_told_so(
@@ -99,8 +98,9 @@ def test_nothing_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     """What the script prints holds no key and no password."""
     assert make_secrets.main(['--folder', str(tmp_path)]) == 0
     printed = ''.join(capsys.readouterr())
-    settings = make_secrets.read_env(tmp_path / '.env') | make_secrets.read_env(tmp_path / 'secrets' / 'seaweedfs.env')
-    secret = {value for name, value in settings.items() if 'SECRET' in name or 'PASSWORD' in name or 'JWT' in name}
+    settings = make_secrets.read_env(tmp_path / '.env')
+    secret = {value for name, value in settings.items() if 'SECRET' in name or 'PASSWORD' in name}
+    secret |= set(re.findall('key = "([0-9a-f]{64})"', (tmp_path / 'secrets' / 'security.toml').read_text()))
     assert len(secret) == 8
     assert not [value for value in secret if value in printed]
 

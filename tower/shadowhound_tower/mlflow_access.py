@@ -48,8 +48,6 @@ ADMIN: Final = 'tower'
 READER: Final = 'spark'
 USERS: Final = 'SHADOWHOUND_MLFLOW_USERS'
 """The variable of the server that names the file of its users: JSON, user -> SHA-256 of each password, in hex."""
-ADMIN_LOGIN: Final = 'TOWER_MLFLOW_PASSWORD'
-"""The variable with the password of ``tower``, for ``main``."""
 APP: Final = ('--app-name', 'basic-auth')
 """What ``mlflow server`` has to be told besides."""
 SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^\r\n]*\Z'
@@ -399,6 +397,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line; what follows ``--`` is the command of ``mlflow server``."""
     made = argparse.ArgumentParser(description='Run mlflow server with the users of a Tower.')
     made.add_argument('--users', type=Path, required=True, help='the file of users and digests, from make_secrets.py')
+    made.add_argument('--password', type=Path, required=True, metavar='FILE', help='the file with the password of tower')
     made.add_argument('--folder', type=Path, required=True, help="where the server's settings go, readable by this user alone")
     made.add_argument('command', nargs='+', help='mlflow server ...')
     return made
@@ -407,7 +406,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a server and prepare it."""
     options = parser().parse_args(arguments)
-    password = os.environ.pop(ADMIN_LOGIN)
+    password = options.password.read_text(encoding='utf-8').strip()
     settings = environment(options.folder, options.users, os.environ['MLFLOW_BACKEND_STORE_URI'])
     is_tls = any('--ssl-certfile' in word for word in options.command)
     url = f'{"https" if is_tls else "http"}://127.0.0.1:{options.command[options.command.index("--port") + 1]}'
