@@ -248,7 +248,7 @@ class Runner:
             raise ServerFailed('MLflow is not installed', remedy='pip install mlflow flask-wtf')
         if not self._is_root:
             return [sys.executable]
-        places = os.pathsep.join((str(Path(found.origin).parents[1]), str(HERE.parent)))
+        places = os.pathsep.join((str(Path(found.origin).parents[1]), str(HERE)))
         ask = 'import sys; from importlib.util import find_spec; sys.exit(not (find_spec("mlflow") and find_spec(sys.argv[1])))'
         usual = f'/usr/bin/python{sys.version_info.major}.{sys.version_info.minor}'
         for command in ([sys.executable], ['env', f'PYTHONPATH={places}', usual]):

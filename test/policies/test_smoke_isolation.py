@@ -119,7 +119,8 @@ def attacked(home: Path, isolation: str) -> dict[str, Any]:
     """What the attacks came to, of an ordinary user: nobody where this is root."""
     python, become = sys.executable, []
     if os.getuid() == 0:
-        become = ['setpriv', '--reuid=65534', '--regid=65534', '--clear-groups']
+        become = ['setpriv', '--reuid=65534', '--regid=65534', '--clear-groups',
+                  '--no-new-privs', '--bounding-set=-all']  # fmt: skip  # as shadowhound-policy.service does
         python = f'/usr/bin/python3.{sys.version_info.minor}'  # root's own Python may be in root's home
         if not Path(python).exists():
             pytest.skip(f'needs {python}, which an ordinary user may run')
