@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from shadowhound_data_logger.core.errors import AccessDenied
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.formats.rows.gaps import GAPS
-from shadowhound_data_logger.formats.rows.parquet import INT32, STRING
-from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.schema import INT32, KEPT, OBJECTS, STRING, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings

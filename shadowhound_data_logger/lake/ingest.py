@@ -28,7 +28,7 @@ from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import AccessDenied, LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.formats.rows.schema import UNDATED, TableSchema
+from shadowhound_data_logger.formats.rows.schema import SUFFIX, UNDATED, TableSchema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -184,7 +184,7 @@ def _listed(source: Bucket, of: TableSchema, robot: str, scope: Scope, findings:
     found = []
     for entry in listed:
         folder = _FOLDER.fullmatch(entry.key.removeprefix(of.prefix(robot)).partition('/')[0])
-        if folder and entry.key.endswith('.parquet'):
+        if folder and entry.key.endswith(('.parquet', SUFFIX)):
             found.append(RowFile(of, robot, folder[1], entry))
     return found
 

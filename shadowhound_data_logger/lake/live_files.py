@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.untrusted import from_json
-from shadowhound_data_logger.formats.rows.schema import OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.schema import OBJECTS, SUFFIX, TableSchema
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 
@@ -33,7 +33,7 @@ MOST_SOURCES_BYTES: Final = 8 << 20
 UNLISTED: Final = 'it cannot be listed: it contains an invalid name'
 _FOLDER: Final = re.compile(r'date=\d{4}-\d\d-\d\d', re.ASCII)
 _COMPACTED: Final = re.compile(r'_compacted_[0-9a-f]{16}(_mended)?\.parquet$')
-_BACKFILLED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.parquet$')
+_BACKFILLED: Final = re.compile(r'_mended(_[0-9a-f]{16})?\.(parquet|jsonl\.zst)$')
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,8 @@ def name_of(key: str) -> str:
 def compacted_key(robot: str, date: str, sources: Iterable[str], *, is_backfilled: bool, of: TableSchema = OBJECTS) -> str:
     """The key of the part that is made from these sources: the same whoever makes it."""
     digest = hashlib.sha256('\n'.join(sorted(sources)).encode()).hexdigest()[:16]
-    return of.part_key(robot, date, f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_backfilled}')
+    name = f'{date.replace("-", "")}_compacted_{digest}{"_mended" * is_backfilled}'
+    return of.part_key(robot, date, name).removesuffix(SUFFIX) + '.parquet'
 
 
 def backfilled_key(robot: str, date: str, keys: Iterable[str], of: TableSchema = OBJECTS) -> str:
@@ -117,7 +118,7 @@ def _day(source: Bucket, robot: str, date: str, findings: Findings, of: TableSch
     """A part whose list of sources is invalid or contradicts another is left out: neither live nor superseded."""
     try:
         listed = source.list(folder_of(robot, date, of), lambda _, key: findings.add(key, 'its key is not a path'))
-        entries = [entry for entry in listed if entry.key.endswith('.parquet')]
+        entries = [entry for entry in listed if entry.key.endswith(('.parquet', SUFFIX))]
     except ObjectRefused as error:
         findings.add(folder_of(robot, date, of), f'{UNLISTED}: {error}')
         entries = []

@@ -37,7 +37,7 @@ from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES
 from shadowhound_data_logger.formats.rows import gaps as journal
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, SUFFIX, Row
 from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -512,7 +512,7 @@ def _begun(source: Bucket, robot: str) -> tuple[list[ObjectInfo], list[ObjectInf
     """The parts that name what is forgotten, and those of them of which not all is known to be deleted."""
     listed = source.list(FORGOTTEN.prefix(robot))
     marks = {entry.key for entry in listed if entry.key.endswith(DELETED)}
-    entries = [entry for entry in listed if entry.key.endswith('.parquet')]
+    entries = [entry for entry in listed if entry.key.endswith(SUFFIX)]
     return entries, [entry for entry in entries if entry.key + DELETED not in marks]
 
 

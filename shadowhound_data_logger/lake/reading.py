@@ -30,8 +30,19 @@ from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.untrusted import check_size, is_path
 from shadowhound_data_logger.formats.rows.gaps import GAPS, STATEMENT_KINDS
 from shadowhound_data_logger.formats.rows.labels import LABEL_KINDS, LABELS
-from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.parts import MAX_FILE_BYTES, read_rows
+from shadowhound_data_logger.formats.rows.schema import (
+    DOUBLE,
+    FORGOTTEN,
+    INT32,
+    INT64,
+    KEPT,
+    OBJECTS,
+    STRING,
+    SUFFIX,
+    TIME,
+    TableSchema,
+)
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import NUMBERS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
@@ -186,6 +197,9 @@ class _Choice(NamedTuple):
 def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
               of: TableSchema, choice: _Choice) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
     """The rows of one part, as far as it is one, and how many bytes they take."""
+    if entry.key.endswith(SUFFIX):
+        yield from _row_file(source, entry, body, schema, findings, of, choice)
+        return
     done, part = 0, None
     try:
         if isinstance(body, ObjectRefused) or not is_path(entry.key):
@@ -196,6 +210,34 @@ def _contents(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | N
             done += len(table)
     except UNREADABLE as error:
         findings.add(entry.key, _why(error), part.count - done if part is not None and done else None)
+
+
+def _row_file(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | None, schema: pa.Schema, findings: Findings,
+              of: TableSchema, choice: _Choice) -> Iterator[tuple[pa.Table, int]]:  # fmt: skip
+    """The rows of a row file that are of this table."""
+    try:
+        if not is_path(entry.key):
+            raise ValueError('its name is not a path')
+        check_size(entry.size, MAX_FILE_BYTES)
+        found = read_rows(source.get(entry.key, MAX_FILE_BYTES) if body is None else _content(body), of.robot_of(entry.key))
+    except UNREADABLE as error:
+        findings.add(entry.key, _why(error))
+        return
+    if found.findings:
+        count = sum(each.lines for each in found.rejected)
+        findings.add(entry.key, found.findings, None if found.ended else count)
+    rows = found.rows.get(of.folder, [])
+    if rows:
+        table = pa.Table.from_pylist(rows, schema=schema)
+        if choice.only is not None:
+            table = table.filter(pa.array(choice.only.holds(table.select(choice.only.columns))))
+        yield table, table.nbytes
+
+
+def _content(body: bytes | ObjectRefused) -> bytes:
+    if isinstance(body, ObjectRefused):
+        raise ValueError('it is larger than its listing says')  # noqa: TRY004 - of the file, not of a type
+    return body
 
 
 def _why(error: BaseException) -> str:

@@ -29,8 +29,7 @@ from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, Lak
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
-from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, KEPT, OBJECTS, TableSchema
+from shadowhound_data_logger.formats.rows.schema import DOUBLE, FORGOTTEN, INT32, INT64, KEPT, OBJECTS, STRING, TIME, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores.credentials import with_keys

@@ -103,7 +103,7 @@ def test_the_catalog_of_another_store_counts_as_well(home: Path, tmp_path: Path)
     old = tmp_path / 'old'
     shutil.copytree(file(home, 'thor/_catalog'), old / 'thor' / '_catalog')
     assert as_json(home, '--catalog', str(old))['ok']
-    for part in file(home, 'thor/_catalog').rglob('*_camera.parquet'):
+    for part in file(home, 'thor/_catalog').rglob('*_camera.jsonl.zst'):
         part.unlink()
     cameras = [key for key in KEYS if '/camera/' in key]
     file(home, cameras[0]).unlink()

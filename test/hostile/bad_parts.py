@@ -18,18 +18,20 @@ import pyarrow.parquet as pq
 from pyarrow.parquet import encryption
 
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows import parquet, parts, schema
+from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.live_files import SOURCES, compacted_key
 
 DATE: Final = '2026-10-28'
+MAGIC: Final = b'PAR1'
+ZSTD: Final = b'\x28\xb5\x2f\xfd'
 LONG: Final = 'thor/camera/' + 42_000 * 'a'
 
 
 def put(settings: StoreSettings, body: bytes, name: str = 'thor_bad', robot: str = 'thor',
         of: schema.TableSchema = schema.OBJECTS) -> str:  # fmt: skip
     """As a robot that may write below its own prefix puts it; its key."""
-    key = f'{of.prefix(robot)}date={DATE}/{name}.parquet'
+    key = f'{of.prefix(robot)}date={DATE}/{name}{schema.SUFFIX if body.startswith(ZSTD) else ".parquet"}'
     path = settings.directory / schema.BUCKET / key
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(body)
@@ -75,19 +77,6 @@ def zeros_bomb(rows: Sequence[schema.Row], size: int = 1 << 26) -> bytes:
     return written(table.set_column(place, 'topic', pa.array(['\0' * size] * len(table))), use_dictionary=False)
 
 
-def lying_page(rows: Sequence[schema.Row], claim: int = (1 << 31) - 1) -> bytes:
-    """Our own file, but the header of its first page claims another size."""
-    body = parts.encode(rows)
-    place = len(parquet.MAGIC)
-    head = body[place : place + 3]
-    assert head == b'\x15\x00\x15'
-    end = place + 3
-    while body[end] & 0x80:
-        end += 1
-    said = parquet._varint(claim << 1)
-    return body[: place + 3] + said + body[end + 1 :]  # the columns after it lie elsewhere now, which is a lie as well
-
-
 def source_list_bomb(rows: Sequence[schema.Row]) -> tuple[str, bytes]:
     """The name and content of a compacted part whose list of sources is a gigabyte of JSON in a megabyte."""
     piece, pieces = b'a' * (1 << 20), 1024
@@ -125,7 +114,7 @@ def listed_sizes(rows: Sequence[schema.Row]) -> bytes:
     sizes = re.compile(rb'\x3c\x16[\x80-\xff]*[\x00-\x7f]\x19\x06\x19\x26\x00.\x00', re.DOTALL)
     footer, count = sizes.subn(b'\x39\x0c', body[begin:end])
     assert count == 1
-    return body[:begin] + footer + struct.pack('<I', len(footer)) + parquet.MAGIC
+    return body[:begin] + footer + struct.pack('<I', len(footer)) + MAGIC
 
 
 def encrypted(rows: Sequence[schema.Row]) -> bytes:
@@ -168,7 +157,7 @@ def mutated(body: bytes, rng: random.Random) -> bytes:
         else:
             found[place:place] = rng.randbytes(rng.randrange(1, 9))
     if rng.random() < 0.8 and len(found) > 12:  # with a footer that is found
-        found[-4:] = parquet.MAGIC
+        found[-4:] = MAGIC
         if len(found) != len(body):
             found[-8:-4] = struct.pack('<I', max(0, end - begin + len(found) - len(body)))
     return bytes(found)

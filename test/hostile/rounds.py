@@ -271,7 +271,7 @@ def catalogue_parts(shop: Shop) -> Round:
 
     whole = pa.Table.from_pylist(rows, schema=arrow)
     bases = [
-        parts.encode(rows), bad_parts.written(whole), bad_parts.written(whole, group=8),
+        bad_parts.written(whole), bad_parts.written(whole, group=8),
         bad_parts.compacted(rows, ['a', 'b'])[1], bad_parts.written(whole, use_dictionary=False),
         bad_parts.dictionary_bomb(rows[0]),
     ]  # fmt: skip

@@ -61,7 +61,6 @@ BAD: dict[str, Callable[[], bytes]] = {
     'size statistics that are a list': lambda: bad_parts.listed_sizes(ROWS),
     'an encrypted column': lambda: bad_parts.encrypted(ROWS),
     'a bomb of zeros': lambda: bad_parts.zeros_bomb(ROWS, 1 << 23),
-    'a page that claims 2 GB': lambda: bad_parts.lying_page(ROWS),
     'brotli': lambda: bad_parts.written(pa.Table.from_pylist(ROWS, schema=reading.arrow_schema()), compression='brotli'),
     'delta encoding': lambda: bad_parts.written(
         pa.Table.from_pylist(ROWS, schema=reading.arrow_schema()), use_dictionary=False,
@@ -160,7 +159,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
     found = lake.objects(source, findings=findings)['key'].to_pylist()
     assert sorted(found) == sorted([*before, *(str(each['key']) for each in mine)])
     assert [(one.key, one.rows) for one in findings] == [(key, 3)]
-    assert '3 of its 5 rows are not of its robot' in str(next(iter(findings)))
+    assert '3 rows are rejected: of another robot (first in line 3)' in str(next(iter(findings)))
 
 
 def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
@@ -185,20 +184,20 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
         '-x/_catalog/date=2026-10-28',
     ):
         (root / folder).mkdir(parents=True)
-        (root / folder / 'x.parquet').write_bytes(parts.encode(ROWS))
+        (root / folder / f'x{schema.SUFFIX}').write_bytes(parts.encode(ROWS))
     assert good(home) == before
-    (root / 'thor/_catalog/date=2026-10-28/\x1b[31m.parquet').write_bytes(parts.encode(ROWS))
+    (root / 'thor/_catalog/date=2026-10-28/\x1b[31m.jsonl.zst').write_bytes(parts.encode(ROWS))
     findings = Findings(lambda _: None)
     lake.objects(Bucket(folder_store(home), schema.BUCKET), findings=findings)
     named = {(one.key.rpartition('/')[2], '\x1b' in str(one)) for one in findings}
-    assert named == {('\x1b[31m.parquet', False), ('x.parquet', False)}
+    assert named == {('\x1b[31m.jsonl.zst', False), ('x.jsonl.zst', False)}
 
 
 @pytest.mark.long('commands in little memory')
 def test_a_bomb_is_left_out_in_2_gb(home: Path) -> None:
     """With no more memory than that, ``query`` and ``lake compact`` end by themselves and say of each bomb that it is one."""
     bombs = {'thor_bad': bad_parts.dictionary_bomb(ROWS[0]), 'thor_zeros': bad_parts.zeros_bomb(ROWS),
-             'thor_liar': bad_parts.lying_page(ROWS), **dict([bad_parts.source_list_bomb(ROWS)])}  # fmt: skip
+             **dict([bad_parts.source_list_bomb(ROWS)])}  # fmt: skip
     keys = [bad_parts.put(folder_store(home), body, name) for name, body in bombs.items()]
     for arguments in (('query', '--format', 'keys'), ('lake', 'compact', '--before', '2026-10-29')):
         ran = in_2_gb(home, *arguments)
@@ -252,23 +251,6 @@ def test_columns_as_pyarrow_writes_them_are_known_by_a_pattern(how: dict[str, An
     monkeypatch.setattr(reading, '_USUAL', re.compile(b'(?!)'))
     assert _sizes(by_pattern[0]) == _sizes(reading._picked(body, begin, reading._FOOTER)[0])
     assert (shorter < (len(walked) - shorter) / 2) == (not {'write_statistics', 'write_page_index'} & set(how))
-
-
-def test_a_part_of_a_robot_is_known_by_patterns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They find of its footer what a walk through all fields finds, and spare that walk."""
-    body = parts.encode([row('camera', NOON_NS + number * 10**9) for number in range(10)])
-    begin, _ = bad_parts.footer_of(body)
-    calls: list[int] = []
-    for name in ('_picked', '_skipped'):
-        walk = getattr(reading, name)
-        monkeypatch.setattr(reading, name, lambda *given, walk=walk: calls.append(1) or walk(*given))
-    by_pattern, end = reading._picked(body, begin, reading._FOOTER)
-    shorter = len(calls)
-    for name in ('_USUAL', '_STRUCT'):
-        monkeypatch.setattr(reading, name, re.compile(b'(?!)'))
-    walked, its_end = reading._picked(body, begin, reading._FOOTER)
-    assert (_sizes(by_pattern), end) == (_sizes(walked), its_end)
-    assert 20 * shorter < len(calls) - shorter
 
 
 def _structs(depth: int) -> st.SearchStrategy[bytes]:

@@ -204,7 +204,7 @@ def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
 def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path: Path) -> None:
     """Nobody knows then what it refers to."""
     with closing(open_store(settings, UploadSettings())) as store:
-        add(store, tmp_path / 'tmp', 'thor/_labels/date=2026-11-01/thor_x.parquet', b'no parquet')
+        add(store, tmp_path / 'tmp', 'thor/_labels/date=2026-11-01/thor_x.jsonl.zst', b'no parquet')
     with pytest.raises(LakeError, match='labels'):
         _plan(settings)
 
@@ -277,7 +277,7 @@ def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [forged], 'forged', tmp_path / 'tmp')
         body = encode([said], schema.FORGOTTEN)
-        add(store, tmp_path / 'tmp', f'thor/_forgotten/date={utc(NOW_NS):%Y-%m-%d}/thor_x.parquet', body, {'robot': 'thor'})
+        add(store, tmp_path / 'tmp', f'thor/_forgotten/date={utc(NOW_NS):%Y-%m-%d}/thor_x.jsonl.zst', body, {'robot': 'thor'})
     assert _run(settings).objects == 12
     assert young['key'] in _stored(settings)
     assert young['key'] in _answer(settings)

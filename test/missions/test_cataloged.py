@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
-import pyarrow.parquet
 import pytest
 from missions.fakes import journalling
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.missions.folder import Run, missions
 from shadowhound_data_logger.missions.journal import read
 from shadowhound_data_logger.missions.objects import Spooler, objects_of
@@ -35,8 +34,8 @@ def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
         assert spooler.pending() == 0
     finally:
         spooler.close()
-    (part,) = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.parquet')
-    (row,) = pyarrow.parquet.read_table(io.BytesIO(part.read_bytes())).to_pylist()
+    (part,) = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.jsonl.zst')
+    (row,) = read_rows(part.read_bytes(), 'thor').rows['_catalog']
     assert row['key'] == 'thor/missions/abc/camera/frame_000007.jpg'
     assert (row['robot'], row['sensor'], row['mission_id'], row['run_id'], row['mission_type']) == (
         'thor', 'missions', folder.mission_id, 'abc', 'patrol',
@@ -59,8 +58,8 @@ def test_the_sender_stays_until_the_last_row_is_written(tmp_path: Path, is_haste
     spooler = Spooler(settings, SystemClock('boot'), monotonic=lambda: now[0])
 
     def rows() -> int:
-        parts = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.parquet')
-        return sum(pyarrow.parquet.read_table(io.BytesIO(part.read_bytes())).num_rows for part in parts)
+        parts = (tmp_path / 'store').rglob('thor/_catalog/date=*/*.jsonl.zst')
+        return sum(len(read_rows(part.read_bytes(), 'thor').rows['_catalog']) for part in parts)
 
     try:
         for frame in frames:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet
 import pytest
 from click.testing import CliRunner
 from missions.fakes import FakeSpooler, FakeTracking, journalling
@@ -22,6 +20,7 @@ from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import Settings, UploadSettings
 from shadowhound_data_logger.core.keys import check_key
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.missions import recorder
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
@@ -83,7 +82,7 @@ def test_every_object_and_row_has_the_agent_s_spelling(
             found[check_key(entry.key)] = info.metadata['mission_type']
         assert sorted(found.values()) == sorted(TYPES)
         parts = [store.get('sensor-data', entry.key) for entry in store.list('sensor-data', f'{ROBOT}/_catalog/')]
-    rows = [row for part in parts if part.startswith(b'PAR1') for row in pyarrow.parquet.read_table(io.BytesIO(part)).to_pylist()]
+    rows = [row for part in parts for row in read_rows(part, ROBOT).rows['_catalog']]
     types = {folder.mission_id: first(folder)['type'] for folder in flown}
     assert {(row['mission_id'], row['mission_type']) for row in rows if row['mission_id']} == set(types.items())
 

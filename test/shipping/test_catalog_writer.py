@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet
+import orjson
 import pytest
 from spool.making import NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows
 
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.core.zstd import ZstdDecompressor
 from shadowhound_data_logger.formats.statistics import FieldStatistics, packed
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
@@ -70,11 +70,15 @@ def delivered(spool: Spool, *keys: str, **fields: Any) -> None:
     deliver(spool, put(spool, *(of(key, **fields) for key in keys)))
 
 
+def lines(body: bytes) -> list[dict[str, Any]]:
+    """The rows in a part."""
+    return [orjson.loads(line) for line in ZstdDecompressor().decompress(body).splitlines()]
+
+
 def keys(part: DataObject) -> list[str]:
     """Of the rows in a part."""
     assert isinstance(part.body, bytes)
-    found: list[str] = pyarrow.parquet.read_table(io.BytesIO(part.body)).column('key').to_pylist()
-    return found
+    return [row['key'] for row in lines(part.body)]
 
 
 def test_what_is_delivered_has_a_row_once(spool: Spool, root: Path, catalog: CatalogWriter) -> None:
@@ -97,8 +101,8 @@ def test_a_part_is_named_and_kept_like_bookkeeping(spool: Spool, catalog: Catalo
     """Its key has date, time and boot; it is Parquet, protected, and says how many rows it has."""
     delivered(spool, 'a', 'b')
     (part,) = catalog.parts()
-    assert check_key(part.key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.parquet'
-    assert (part.bucket, part.content_type, part.protected) == ('sensor-data', 'application/vnd.apache.parquet', True)
+    assert check_key(part.key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.jsonl.zst'
+    assert (part.bucket, part.content_type, part.protected) == ('sensor-data', 'application/zstd', True)
     assert part.metadata == {'robot': 'thor', 'count': '2'}
     assert part.topic is None
     assert (part.t_start_ns, part.t_end_ns) == (NOON_NS, NOON_NS)
@@ -161,8 +165,8 @@ def test_rows_on_their_way_are_not_handed_out_again(spool: Spool, root: Path, ca
     assert [keys(part) for part in (*first, *second)] == [['a'], ['b']]
     spool.commit([*first, *second])
     assert [row['key'] for row in rows(root) if row['sensor'] == '_catalog'] == [
-        'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.parquet',
-        'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567_1.parquet',
+        'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567.jsonl.zst',
+        'thor/_catalog/date=2025-10-18/thor_20251018T120000_01234567_1.jsonl.zst',
     ]
 
 
@@ -210,7 +214,7 @@ def test_a_repeat_has_a_row_of_its_own(spool: Spool, root: Path, catalog: Catalo
     assert keys(part) == [first.key, first.key]
     assert len(set(part.catalogs)) == 2
     assert isinstance(part.body, bytes)
-    times = pyarrow.parquet.read_table(io.BytesIO(part.body)).column('t_start_ns').to_pylist()
+    times = [row['t_start_ns'] for row in lines(part.body)]
     assert times == [NOON_NS, NOON_NS + 1]
     spool.commit([part])
     assert catalog.parts() == []
@@ -241,8 +245,8 @@ def test_statistics_go_into_parts_of_their_own_once_the_object_is_delivered(spoo
     assert keys(rows) == ['a', 'c']
     assert statistics.key.startswith('thor/_stats/date=2025-10-18/')
     assert isinstance(statistics.body, bytes)
-    found = pyarrow.parquet.read_table(io.BytesIO(statistics.body)).to_pylist()
-    assert [(row['key'], row['field'], row['max'], row['count'], row['nan_count']) for row in found] == [
+    found = lines(statistics.body)
+    assert [(row['key'], row['field'], row.get('max'), row['count'], row['nan_count']) for row in found] == [
         ('a', '', None, 2, 0), ('a', 'x', 1.5, 1, 1),
     ]  # fmt: skip
     spool.commit([statistics, rows, gaps])
@@ -258,6 +262,6 @@ def test_statistics_of_many_objects_go_into_several_parts(
     said.add([{'x': 1.5}])
     deliver(spool, put(spool, *(of(name, statistics=packed(said.told())) for name in 'abcde')))
     made = [part for part in catalog.parts() if '/_stats/' in part.key]
-    found = [pyarrow.parquet.read_table(io.BytesIO(part.body)).to_pylist() for part in made if isinstance(part.body, bytes)]
+    found = [lines(part.body) for part in made if isinstance(part.body, bytes)]
     assert [sorted({row['key'] for row in rows}) for rows in found] == [['a', 'b'], ['c', 'd'], ['e']]
     assert len({item.key for item in spool.commit(made)}) == 3

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet
+import pyarrow
 import pytest
 from spool.making import NOON_NS, FakeClock, abandon, make, new_spool
 
@@ -16,6 +15,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.formats.rows.gaps import GAPS
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.lake.gaps import folded, of_rows
 from shadowhound_data_logger.lake.reading import arrow_schema
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
@@ -51,9 +51,9 @@ def told(parts: list[DataObject]) -> list[dict[str, Any]]:
     for part in parts:
         if part.key.startswith('thor/_gaps/'):
             assert isinstance(part.body, bytes)
-            table = pyarrow.parquet.read_table(io.BytesIO(part.body))
-            assert table.schema.equals(arrow_schema(GAPS))
-            found += table.to_pylist()
+            read = read_rows(part.body, 'thor')
+            assert not read.findings
+            found += read.rows['_gaps']
     return found
 
 
@@ -90,7 +90,7 @@ def test_what_was_missed_is_told_once_with_a_watermark_behind_it(spool: Spool, r
     made = catalog.parts()
     assert what(told(made)) == [('gap', 'transport', 4, 0.6), ('complete', None, None, 0.6)]
     (part,) = [part for part in made if part.key.startswith('thor/_gaps/')]
-    assert part.key == 'thor/_gaps/date=2025-10-18/thor_20251018T120000_a-boot.parquet'
+    assert part.key == 'thor/_gaps/date=2025-10-18/thor_20251018T120000_a-boot.jsonl.zst'
     assert (part.protected, part.sensor, part.metadata['count'], part.metadata['gap_version']) == (True, '_catalog', '2', '1')
     spool.commit(made)
     assert catalog.parts() == []

@@ -136,7 +136,7 @@ def test_an_object_without_a_row_is_found(good: Scene) -> None:
     late, twice = 'thor/imu/20251018/120009_imu.json', 'thor/camera/20251018/120000_front.jpg'
     good.deliver(good.spool.commit([an_object(late, b'{"samples": []}', IMU, samples=0)])[0])
     body = encode([row_of('sensor-data', twice, 3, 'image/jpeg', {'robot': 'thor'})])
-    again = make('thor/_catalog/date=2025-10-18/again.parquet', body, sensor='_catalog', topic=None, samples=0)
+    again = make('thor/_catalog/date=2025-10-18/again.jsonl.zst', body, sensor='_catalog', topic=None, samples=0)
     good.deliver(good.spool.commit([again])[0])
     assert good.audit().problems == (f'{twice} has 2 rows in the catalog', f'{late} has 0 rows in the catalog')
 

@@ -12,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import orjson
-import pyarrow.parquet as pq
 import pytest
 from spool.conftest import Moments
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
@@ -29,6 +28,7 @@ from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_me
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.node.encoding.halving import Halving
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.thinning import Thinner, may_halve
@@ -305,7 +305,7 @@ def test_the_catalog_is_told_of_each_step(make_robot: Callable[..., Robot]) -> N
             count
             for part in made
             if part.tells
-            for count in pq.read_table(BytesIO(bytes(part.body)))['count'].to_pylist()  # type: ignore[arg-type]
+            for count in [row['count'] for row in read_rows(bytes(part.body), 'thor').rows['_kept']]  # type: ignore[arg-type]
         ]
 
     item = archive(robot, 0)

@@ -148,6 +148,6 @@ def test_a_tower_is_moved_as_the_manual_says(towers: Towers) -> None:
     assert towers.verify() == {'missing': [gone], 'size': [cut], 'checksum': [changed]}
     assert towers.verify('--deep') == {'missing': [gone], 'size': [cut], 'checksum': [changed, sly]}
     for entry in new.list_objects_v2(Bucket='sensor-data', Prefix='thor/_catalog/')['Contents']:
-        if entry['Key'].endswith('_late.parquet'):
+        if entry['Key'].endswith('_late.jsonl.zst'):
             new.delete_object(Bucket='sensor-data', Key=entry['Key'])
     assert towers.verify('--catalog', str(catalog))['unlisted'] == ['thor/camera/20261028/late.jpg']

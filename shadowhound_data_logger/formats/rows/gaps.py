@@ -1,12 +1,12 @@
-"""The gap journal as it is delivered: statements of what was lost and of how far that is known, in Parquet parts.
+"""The gap journal as it is delivered: statements of what was lost and of how far that is known, in row files.
 
 A row is a statement, and nothing is ever changed in the store: a later statement about the same thing has the same ``id`` and a
 higher ``revision``. The newest counts; ``withdrawn`` says that there is no such gap any more (a late message filled it, an object
 was retried). So statements may arrive in any order, twice, or be merged in any order: the answer is the same.
 
 ``complete`` statements are the watermark of a sink and topic: whatever was lost between their two times is stated, and the rest
-is in the store. Where no such statement reaches, nobody knows. Parts lie at
-``<robot>/_gaps/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``to_ns``, UTC: a question about a
+is in the store. After the last such statement, losses are unknown. Parts are at
+``<robot>/_gaps/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``to_ns``, UTC: a query for a
 time looks at its own date and at the later ones.
 """
 
@@ -16,8 +16,7 @@ import hashlib
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, utc
-from shadowhound_data_logger.formats.rows.parquet import INT32, INT64, STRING, TIME
-from shadowhound_data_logger.formats.rows.schema import GAPS_FOLDER, UNDATED, TableSchema
+from shadowhound_data_logger.formats.rows.schema import GAPS_FOLDER, INT32, INT64, STRING, TIME, UNDATED, TableSchema
 
 FORMAT_VERSION: Final = 1
 """Of the statements. Columns are only ever added, at the end."""

@@ -2,7 +2,7 @@
 
 A row holds nothing that is not in the object's S3 metadata and in a listing: a catalog that is lost is made again from those.
 Every object of a robot is a row but the files of the catalog itself. Parts lie at
-``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC.
+``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``t_start``, UTC.
 Beside them lie the parts of the gap journal (formats/rows/gaps.py), in ``<robot>/_gaps/``, and of the statistics of the objects
 (formats/rows/statistics.py), in ``<robot>/_stats/``.
 """
@@ -16,8 +16,11 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
-from shadowhound_data_logger.formats.rows.parquet import DOUBLE, INT32, INT64, STRING, TIME
 
+STRING, INT32, INT64, DOUBLE, TIME = 'string', 'int32', 'int64', 'double', 'time'
+"""Kinds of columns. ``TIME`` is whole microseconds since 1970, UTC."""
+SUFFIX: Final = '.jsonl.zst'
+"""Of the names of row files."""
 FORMAT_VERSION: Final = 1
 """Of the rows. Columns are only ever added, at the end."""
 BUCKET: Final = 'sensor-data'
@@ -91,7 +94,7 @@ class TableSchema:
 
     def part_key(self, robot: str, date: str, name: str) -> str:
         """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
-        return f'{self.prefix(robot)}date={date}/{robot}_{name}.parquet'
+        return f'{self.prefix(robot)}date={date}/{robot}_{name}{SUFFIX}'
 
 
 OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})

@@ -82,7 +82,7 @@ def test_nothing_in_metadata_or_key_raises(metadata: dict[str, str], key: str) -
 def test_the_catalog_is_not_in_itself() -> None:
     """Everything else is, also another bucket's folder of that name."""
     key = schema.OBJECTS.part_key('thor', '2025-10-18', '20251018T120100_b00t')
-    assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.parquet'
+    assert check_key(key) == 'thor/_catalog/date=2025-10-18/thor_20251018T120100_b00t.jsonl.zst'
     assert key.startswith(schema.OBJECTS.prefix('thor'))
     assert not schema.is_row('sensor-data', key)
     assert schema.is_row('trajectories', key)
