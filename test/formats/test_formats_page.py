@@ -59,7 +59,7 @@ def bucket(ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name).write_bytes(encoding.object.body)
     day = tmp_path / 'thor' / '_catalog' / 'date=2025-10-18'
     day.mkdir(parents=True)
-    (day / 'part.parquet').write_bytes(encode([row_of('sensor-data', 'thor/camera/a.jpg', 1, '', {'pose': '3 1 0 odom'})]))
+    (day / 'part.jsonl.zst').write_bytes(encode([row_of('sensor-data', 'thor/camera/a.jpg', 1, '', {'pose': '3 1 0 odom'})]))
     shutil.copy(ROOT / 'interfaces' / 'go2_interfaces' / 'msg' / 'VoxelMapCompressed.msg', tmp_path)
     write_bag(tmp_path / 'patrol_20261121_120000', imu)
     monkeypatch.chdir(tmp_path)

@@ -1,9 +1,9 @@
 """Row files: what robots write about their data, one JSON object per line, compressed with zstd (docs/formats.md).
 
-Every line has its kind as ``row`` (an object, a gap, ...) and the columns of that kind's table; a column that is null is omitted. Anybody with a robot's keys can
-write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit, bounds the lines and the rows, and
-checks the name, type and range of each value. A row may name only its own robot and the keys of that robot. Rejected lines are
-counted by reason, and the other rows are used.
+Every line has its kind as ``row`` (an object, a gap, ...) and the columns of that kind's table; a column that is null is omitted.
+Anybody with a robot's keys can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit, bounds
+the lines, and checks the name, type and range of each value. A row may name only its own robot and the keys of that robot. Rejected
+lines are counted by reason, and the other rows are used.
 """
 
 from __future__ import annotations
