@@ -226,6 +226,9 @@ def _row_file(source: Bucket, entry: ObjectInfo, body: bytes | ObjectRefused | N
     if found.findings:
         count = sum(each.lines for each in found.rejected)
         findings.add(entry.key, found.findings, None if found.ended else count)
+    others = sum(len(rows) for folder, rows in found.rows.items() if folder != of.folder)
+    if others:
+        findings.add(entry.key, f'{others:,} of its rows belong to another table', others)
     rows = found.rows.get(of.folder, [])
     if rows:
         table = pa.Table.from_pylist(rows, schema=schema)

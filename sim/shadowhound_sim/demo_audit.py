@@ -11,11 +11,11 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.formats.rows.schema import SENSOR, is_row
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
@@ -138,12 +138,10 @@ def _unread(delivered: Mapping[str, str], bodies: Mapping[str, bytes]) -> list[s
 
 def _cataloged(bodies: Mapping[str, bytes]) -> Counter[str]:
     """Rows by key, in all parts of the catalog."""
-    from pyarrow.parquet import read_table  # noqa: PLC0415 - half a second, at the end of the demo only
-
     rows: Counter[str] = Counter()
     for key, body in bodies.items():
         if key.split('/')[1:2] == [SENSOR]:
-            rows.update(read_table(BytesIO(body), columns=['key']).column('key').to_pylist())
+            rows.update(row['key'] for row in read_rows(body, key.partition('/')[0]).rows.get(SENSOR, ()))
     return rows
 
 

@@ -6,19 +6,18 @@ import errno
 import os
 import threading
 from collections import Counter
-from io import BytesIO
 from pathlib import Path
 
 import pytest
 from bags.recording import ROBOT, Desk, desk, journaled, manifest, missing, numbers, start, write_out
 from clocks import Clocks
-from pyarrow.parquet import read_table
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -63,7 +62,7 @@ def test_the_manifest_and_what_the_store_is_told_of_gaps_agree(tmp_path: Path) -
         told = Counter[tuple[str, str]]()
         for part in CatalogWriter(it.spool.root, CatalogSettings(), ROBOT, Clocks()).parts():
             assert isinstance(part.body, bytes)
-            for row in read_table(BytesIO(part.body)).to_pylist() if '/_gaps/' in part.key else ():
+            for row in read_rows(part.body, part.key.partition('/')[0]).rows['_gaps'] if '/_gaps/' in part.key else ():
                 if row['what'] == 'gap':
                     assert (row['sink'], row['kind']) == ('bags', 'dropped')
                     told[row['topic'], row['cause']] += row['count']

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import signal
 from collections import Counter
 from typing import Any
 
-import pyarrow
-import pyarrow.parquet
+import pyarrow as pa
 import pytest
 from e2e.processes import Processes, until
 from e2e.session import DURATION_S, Session
@@ -21,6 +19,7 @@ from shadowhound_data_logger import MissionDataLogger, lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -52,9 +51,9 @@ def cataloged(store: S3Store, robot: str) -> list[dict[str, Any]]:
     """All rows of all parts; each has the schema and the date of its folder."""
     rows = []
     for info in store.list(schema.BUCKET, schema.OBJECTS.prefix(robot)):
-        table = pyarrow.parquet.read_table(io.BytesIO(store.get(schema.BUCKET, info.key)))
-        assert table.schema.equals(reading.arrow_schema())
-        for row in table.to_pylist():
+        found = read_rows(store.get(schema.BUCKET, info.key), robot)
+        assert not found.findings
+        for row in pa.Table.from_pylist(found.rows[schema.SENSOR], schema=reading.arrow_schema()).to_pylist():
             assert f'/date={row["t_start"]:%Y-%m-%d}/' in info.key
             rows.append(row)
     return rows

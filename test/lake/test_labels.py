@@ -56,8 +56,10 @@ def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: 
     said(lake, STAIRS)
     assert names(lake) == ['stairs']
     assert lake.head(first) is not None
-    files = f'{lake.settings.directory}/sensor-data/thor/_labels/*/*.parquet'
-    counts = duckdb.read_parquet(files).query('rows', 'SELECT what, count(*) FROM rows GROUP BY what ORDER BY what')
+    files = f'{lake.settings.directory}/sensor-data/thor/_labels/*/*.jsonl.zst'
+    counts = duckdb.read_json(files, format='newline_delimited', compression='zstd').query(
+        'rows', 'SELECT what, count(*) FROM rows GROUP BY what ORDER BY what'
+    )
     assert counts.fetchall() == [
         ('label', 3),
         ('removed', 1),

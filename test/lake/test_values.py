@@ -13,8 +13,6 @@ from typing import Any
 from unittest import mock
 
 import orjson
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -230,22 +228,13 @@ def test_the_ranges_of_an_answer_choose_objects(tmp_path: Path) -> None:
 
 
 def test_other_readers_read_the_statistics(tmp_path: Path) -> None:
-    """PyArrow and DuckDB, as they are: before compaction and after it."""
+    """DuckDB reads the robot's files directly."""
     duckdb = pytest.importorskip('duckdb')
-    source = filled(tmp_path, BATCHES, [True] * 10)
-    files = f'{tmp_path}/store/sensor-data/thor/_stats/*/*.parquet'
-    asked = f"SELECT DISTINCT key FROM '{files}' WHERE field = 'a' AND max > 11 ORDER BY key"  # noqa: S608 - a test's own path
-    before = duckdb.sql(asked).fetchall()
-    assert before == [('thor/s/20261028/000008_s.json',), ('thor/s/20261028/000009_s.json',)]
-    with closing(open_store(source.settings, UploadSettings())) as store:
-        assert [day.merged for day in compact(source, store, now=lambda: LATER)] == [2]
-        assert [day.deleted for day in compact(source, store, now=lambda: LATER + timedelta(days=9999))] == [2]
-    assert duckdb.sql(asked).fetchall() == before
-    (file,) = tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet')
-    table = pq.read_table(file)
-    assert table.column_names[: len(STATISTICS.columns)] == list(STATISTICS.columns)
-    assert len(table) == 2 * len(BATCHES)
-    assert table.to_pylist()[-1]['mean'] == 11.0
+    filled(tmp_path, BATCHES, [True] * 10)
+    files = f'{tmp_path}/store/sensor-data/thor/_stats/*/*.jsonl.zst'
+    rows = f"read_json('{files}', format='newline_delimited', compression='zstd')"
+    found = duckdb.sql(f"SELECT DISTINCT key FROM {rows} WHERE field = 'a' AND max > 11 ORDER BY key").fetchall()  # noqa: S608
+    assert found == [('thor/s/20261028/000008_s.json',), ('thor/s/20261028/000009_s.json',)]
 
 
 def test_fields_beyond_the_bound_are_unknown(tmp_path: Path) -> None:
@@ -297,13 +286,12 @@ def test_statistics_that_contradict_themselves_are_told(
     """Their object is as one without statistics, never one without the field, and the others are judged as ever."""
     monkeypatch.setattr(reading, 'SMALL_BYTES', small_bytes)
     source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
-    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))
+    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
-    table = pq.read_table(first)
-    rows = table.to_pylist()
+    rows = parts.read_rows(first.read_bytes(), 'thor').rows['_stats']
     lies = {f'thor/s/20261028/{number:06d}_s.json': lie for number, lie in enumerate(LIES)}
     rows = [{**row, **(lies.get(row['key'], {}) if row['field'] else {})} for row in rows]
-    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), first, compression='zstd', row_group_size=3)
+    first.write_bytes(parts.encode(rows, STATISTICS))
     left_out = Findings(lambda _: None)
     found = values.ranges('s.a > 12', source, findings=left_out)
     assert [one.key for one in left_out] == sorted(lies)
@@ -314,13 +302,12 @@ def test_statistics_that_contradict_themselves_are_told(
 def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
     """Objects whose own row cannot be true are unknown, or opened where those of their fields give a reason to."""
     source = filled(tmp_path, [BATCHES[-1]] * 5, [True] * 5)
-    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))
+    first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
-    table = pq.read_table(first)
-    rows = table.to_pylist()
+    rows = parts.read_rows(first.read_bytes(), 'thor').rows['_stats']
     for row, lie in zip((row for row in rows if not row['field']), LIES[-4:], strict=False):
         row.update(lie)
-    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), first, compression='zstd')
+    first.write_bytes(parts.encode(rows, STATISTICS))
     left_out = Findings(lambda _: None)
     found = values.ranges('s.a > 12', source, findings=left_out)
     assert (len(found.ranges), found.opened, found.unknown, len(left_out)) == (5, 5, 0, 4)
@@ -330,13 +317,12 @@ def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
 def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
     """A part that is none, and rows of another robot, are told; what they spoke of is unknown, not absent."""
     source = filled(tmp_path, BATCHES, [True] * 10)
-    for number, path in enumerate(sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.parquet'))):
+    for number, path in enumerate(sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))):
         if number:
             path.unlink()
         else:
-            rows = pq.read_table(path)
-            robots = pa.array(['tachi'] * len(rows))
-            pq.write_table(rows.set_column(0, 'robot', robots), path)
+            rows = parts.read_rows(path.read_bytes(), 'thor').rows['_stats']
+            path.write_bytes(parts.encode([{**row, 'robot': 'tachi'} for row in rows], STATISTICS))
     folder = tmp_path / 'store/sensor-data/thor/_stats/date=2026-10-28'
     (folder / 'thor_20261028T999999_x.parquet').write_bytes(b'PAR1 nothing PAR1')
     left_out = Findings(lambda _: None)

@@ -34,7 +34,7 @@ def listed(root: Path) -> list[str]:
 def part(root: Path, name: str, *keys: str) -> DataObject:
     """A part with rows of all that is listed, or of these."""
     ids = tuple(item.id for item in uncataloged(root, ALL) if not keys or item.key in keys)
-    return make(f'thor/_catalog/{name}.parquet', name.encode(), sensor='_catalog', topic=None, protected=True, catalogs=ids)
+    return make(f'thor/_catalog/{name}.jsonl.zst', name.encode(), sensor='_catalog', topic=None, protected=True, catalogs=ids)
 
 
 def delivered(spool: Spool, *keys: str) -> None:
@@ -116,7 +116,7 @@ def test_death_at_any_moment_of_a_part(root: Path, moments: Moments) -> None:
         spool.open()
         assert_whole(copy)
         state = {row['key']: row['state'] for row in rows(copy)}
-        has_part = state.get('thor/_catalog/one.parquet') == 'pending'
+        has_part = state.get('thor/_catalog/one.jsonl.zst') == 'pending'
         expected = ['a', 'b'] if state['a'] == 'delivered' and not has_part else []
         assert listed(copy) == expected
         seen.append((state['a'], has_part))

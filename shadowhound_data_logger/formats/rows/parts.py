@@ -1,9 +1,9 @@
 """Row files: what robots write about their data, one JSON object per line, compressed with zstd (docs/formats.md).
 
 Every line has its kind as ``row`` (an object, a gap, ...) and the columns of that kind's table; a column that is null is omitted.
-Anybody with a robot's keys can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit, bounds
-the lines, and checks the name, type and range of each value. A row may name only its own robot and the keys of that robot. Rejected
-lines are counted by reason, and the other rows are used.
+Anybody with a robot's keys can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit,
+bounds the lines, and checks the name, type and range of each value. A row may name only its own robot and the keys of that robot.
+Rejected lines are counted by reason, and the other rows are used.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 import orjson
 
 from shadowhound_data_logger.core.keys import is_name
-from shadowhound_data_logger.core.untrusted import is_path
 from shadowhound_data_logger.core.zstd import DecompressionParameter, ZstdDecompressor, ZstdError, compress
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS, WITHDRAWN
 from shadowhound_data_logger.formats.rows.labels import LABEL_KINDS, LABELS
@@ -33,6 +32,7 @@ from shadowhound_data_logger.formats.rows.schema import (
     date_of,
 )
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
+from shadowhound_data_logger.formats.statistics import NUMBERS
 
 CONTENT_TYPE: Final = 'application/zstd'
 KINDS: Final[Mapping[str, TableSchema]] = {
@@ -207,7 +207,7 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row]:
         if value is not None and not check(value):
             raise ValueError(f'{name} is invalid')
     row = {**_EMPTY[of.folder], **said}
-    for name in of.required:
+    for name in _REQUIRED[of.folder]:
         if row[name] is None:
             raise ValueError(f'{name} is missing')
     _check_owner(row, robot, of)
@@ -255,10 +255,6 @@ def _is_bucket(value: Any) -> bool:
     return isinstance(value, str) and is_name(value)
 
 
-def _is_key(value: Any) -> bool:
-    return isinstance(value, str) and is_path(value)
-
-
 _BY_KIND: Final[Mapping[str, Callable[[Any], bool]]] = {
     STRING: _is_text, INT32: _is_int32, INT64: _is_int64, DOUBLE: _is_double, TIME: _is_time,
 }  # fmt: skip
@@ -267,9 +263,13 @@ _BY_KIND: Final[Mapping[str, Callable[[Any], bool]]] = {
 def _check_of(name: str, kind: str) -> Callable[[Any], bool]:
     if name in _NOT_NEGATIVE:
         return _is_count
-    return {'bucket': _is_bucket, 'key': _is_key}.get(name, _BY_KIND[kind])
+    return _is_bucket if name == 'bucket' else _BY_KIND[kind]
 
 
 _TABLES: Final = {of.folder: of for of in KINDS.values()}
 _CHECKS: Final = {folder: {name: _check_of(name, kind) for name, kind in of.columns.items()} for folder, of in _TABLES.items()}
+_REQUIRED: Final = {
+    folder: tuple(name for name in of.required if not (of is STATISTICS and name in NUMBERS)) for folder, of in _TABLES.items()
+}
+"""Numbers of statistics are judged by the query: without its row, an object would seem to be without the field."""
 _EMPTY: Final[Mapping[str, Row]] = {folder: dict.fromkeys(of.columns) for folder, of in _TABLES.items()}

@@ -111,7 +111,6 @@ BAD: dict[str, tuple[bytes, str]] = {
     'a year of six digits': (line(t_start=1 << 62), 't_start is invalid'),
     'another robot': (line(robot='tachi'), 'of another robot'),
     'the key of another robot': (line(key='tachi/camera/1.jpg'), 'of a key of another robot'),
-    'a key outside its folder': (line(key='thor/../tachi/1.jpg'), 'key is invalid'),
     'a bucket that is a path': (line(bucket='../etc'), 'bucket is invalid'),
     'a gap of another robot': (
         orjson.dumps({'row': 'gap', 'robot': 'tachi', 'what': 'gap', 'id': 'a', 'revision': 1, 'sink': 's', 'topic': 't',
