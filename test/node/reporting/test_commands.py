@@ -124,7 +124,7 @@ def ask(commands: Commands, do: str, **arguments: Any) -> tuple[bool, str]:
     [((12, 345), '12 objects with 345 messages spooled'), ((1, 1), '1 object with 1 message spooled'),
      ((0, 0), '0 objects with 0 messages spooled')],
 )  # fmt: skip
-def test_a_flush_goes_along_the_way_of_the_data(spooled: tuple[int, int], words: str) -> None:
+def test_a_flush_goes_along_the_data_flow(spooled: tuple[int, int], words: str) -> None:
     """First the open batches, then the queue, then the disk; the answer says what became durable meanwhile."""
     stages = Stages(spooled=spooled)
     assert ask(stages.commands(), 'flush') == (True, words)
