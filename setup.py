@@ -34,7 +34,7 @@ setup(
         'mcap>=1.1',
         'numpy>=1.21',
         'orjson>=3.11.6',
-        'pillow>=12.2',
+        'pillow>=12.3',
         'rich>=13',
         'rosbags>=0.11.9',
         'ruamel-yaml>=0.17',
@@ -53,7 +53,7 @@ setup(
         ],
         'likeness': ['onnx>=1.16', 'onnxruntime>=1.17', 'tokenizers>=0.15'],
         'missions': ['matplotlib>=3.6', 'mlflow-skinny>=2.14'],
-        'tower': ['grpcio>=1.60'],
+        'tower': ['grpcio>=1.66.2'],
         'train': ['mlflow-skinny>=2.14', 'torch>=2.6'],  # examples/train_navigation_policy.py; torch alone needs 200 MB and more
         'webrtc': ['aiortc>=1.15,<1.17', 'av>=15'],
         'test': ['pytest'],  # colcon runs pytest where a test extra names it
