@@ -21,7 +21,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
-from shadowhound_data_logger.missions.overview import told
+from shadowhound_data_logger.missions.overview import state_of
 from shadowhound_data_logger.stores.s3 import S3Store
 
 ENOUGH = 40
@@ -52,7 +52,7 @@ def heard(station: Station) -> list[dict[str, Any]]:
 
 def sees(folder: MissionFolder) -> bool:
     """Whether the node logged all that it should by now."""
-    story = told(folder).node
+    story = state_of(folder).node
     assert story
     return story.last.get('distance_traveled_m', 0.0) > 0.5 and 'battery_pct' in story.last and story.counts['frame'] >= 2
 
@@ -72,7 +72,7 @@ def test_a_mission_has_its_data_and_nothing_else_is_stored(
         mission_id = logger.start_mission('patrol', 'go round')
         (folder,) = missions(node.home)
         until(folder.node.journal.exists, 'the node joins in')
-        until(lambda: sees(folder), lambda: f'the node logs the robot: {told(folder).node}')
+        until(lambda: sees(folder), lambda: f'the node logs the robot: {state_of(folder).node}')
         assert heard(station)[-1]['mission_id'] == mission_id
         logger.end_mission(True, 0.0, 0.0)
         logger.flush(0.0)
@@ -113,7 +113,7 @@ def test_a_run_has_what_the_node_measured(processes: Processes, tower: Tower, mo
     status = node.home / 'spool' / f'status-{processes.robot}.json'
     until(lambda: json.loads(status.read_bytes())['mission'].get('run_id') == run_id, 'the node knows the run')
     node.received('/imu', node.topic('/imu')['received'] + ENOUGH)
-    until(lambda: sees(folder), lambda: f'the node logs the robot: {told(folder).node}')
+    until(lambda: sees(folder), lambda: f'the node logs the robot: {state_of(folder).node}')
     logger.end_mission(True, 0.0, 0.0)
     until(lambda: complete(node.home), lambda: f'all is sent: {logger.flush(0.0)}')
     assert logger.close().complete
