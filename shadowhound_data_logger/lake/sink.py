@@ -78,7 +78,7 @@ _OF_TYPE: Final = (
     (_KEYWORD, 'what id sink publisher kind cause grade label by result rule'),
     (_DATE, 'time t_start t_end t_from t_to since until made started ended forgotten'),
     ({'type': 'long'}, 'bytes t_start_ns t_end_ns count clock_offset_ns revision session from_ns to_ns merged received skipped'),
-    ({'type': 'long'}, 'since_ns until_ns made_ns received_start_ns received_end_ns by_arrival'),
+    ({'type': 'long'}, 'received_from_ns received_to_ns since_ns until_ns made_ns received_start_ns received_end_ns by_arrival'),
     ({'type': 'double'}, 'x y yaw battery_pct width height distance_m duration_s battery_consumed_pct'),
     (_WORDS, 'command title text note'),
     ({'type': 'boolean'}, 'success'),

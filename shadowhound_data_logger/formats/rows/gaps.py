@@ -40,6 +40,8 @@ GAPS: Final = TableSchema(
         't_to': TIME,
         'from_ns': INT64,
         'to_ns': INT64,
+        'received_from_ns': INT64,
+        'received_to_ns': INT64,
         'count': INT64,
         'merged': INT64,
         'grade': STRING,
@@ -54,8 +56,9 @@ GAPS: Final = TableSchema(
 )
 """``sink topic publisher session kind cause count merged grade mission_id`` are those of ``shadowhound-data ledger --gaps``.
 
-Of a gap, ``from_ns`` is the stamp of the last message before it and ``to_ns`` that of the first one after it; of a ``complete``
-statement, what it speaks of begins and ends there. Both are null where the time is not known. ``clock`` is ``unset`` where they
+Of a gap, ``from_ns`` is the stamp of the last message before it and ``to_ns`` that of the first one after it;
+``received_from_ns`` and ``received_to_ns`` are when these two messages arrived. Of a ``complete`` statement, ``from_ns`` to
+``to_ns`` is the time that it covers. All are null where the time is not known. ``clock`` is ``unset`` where they
 count from the robot's boot: ``t_from`` and ``t_to`` are null then. ``received`` and ``skipped`` (downsampled) are messages of the
 session until ``to_ns``, in ``complete`` statements alone.
 """
