@@ -1,4 +1,4 @@
-"""Ten questions about what was in the data and what was said of it, on a compacted catalog of a million rows.
+"""Ten questions about what was in the data and what was said of it, on the tables of a million rows.
 
 Run it as ``python bench/ask.py [--objects 1000000] [--missions 100000] [--folder F] [--json]``. The objects are batches of an
 IMU of one second; a few of them hold a bump, and only those lie in the store, a folder: all others are never opened.
@@ -34,11 +34,12 @@ from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows.schema import BUCKET, FORMAT_VERSION, OBJECTS, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import FieldStatistics, numbers_of
-from shadowhound_data_logger.lake import compact, search, values
-from shadowhound_data_logger.lake.bucket import Bucket, put_part
-from shadowhound_data_logger.lake.live_files import compacted_key
-from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.lake import search, values
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.ingest import tend
 from shadowhound_data_logger.lake.select import wanted
+from shadowhound_data_logger.lake.tables import TABLES, Tables, arrow_schema
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -66,19 +67,22 @@ def batch(number: int) -> list[dict[str, Any]]:
     return found
 
 
-def fill(store: ObjectStore, folder: Path, objects: int) -> tuple[int, int]:
-    """The compacted parts of all days; bytes of the catalog and of the statistics."""
-    sizes = [0, 0]
+def fill(settings: StoreSettings, store: ObjectStore, folder: Path, objects: int) -> tuple[int, int]:
+    """The tables of all days, one file of each; bytes of the objects and of the statistics."""
+    source = Bucket(settings, BUCKET)
+    tables = Tables.for_ingest(source)
     for start in range(0, objects, DAY):
         numbers = np.arange(start, min(start + DAY, objects))
         rows, told = _rows(numbers), _statistics(store, folder, numbers)
         date = f'{utc(FIRST_NS + start * SECOND):%Y-%m-%d}'
-        for place, (of, table) in enumerate(((OBJECTS, rows), (STATISTICS, told))):
-            body = compact._encoded(compact._IN_ORDER[of.folder](table), of, frozenset(('a', 'b')))
-            put_part(store, compacted_key('thor', date, (date,), is_backfilled=False, of=of), 'thor', body, len(table))
-            sizes[place] += len(body)
+        for of, made in ((OBJECTS, rows), (STATISTICS, told)):
+            table = TABLES[of.folder]
+            dated = made.add_column(0, 'date', pa.array([date] * len(made))).cast(table.schema)
+            tables.append(tables.open(table), table, dated)
         progress(f'{min(start + DAY, objects):,} objects')
-    return sizes[0], sizes[1]
+    tend(source, tables, Findings())
+    sizes = [pa.table(tables.open(TABLES[of.folder]).get_add_actions(flatten=True))['size_bytes'] for of in (OBJECTS, STATISTICS)]
+    return sum(sizes[0].to_pylist()), sum(sizes[1].to_pylist())
 
 
 def _key(number: int) -> str:
@@ -173,7 +177,7 @@ def measure(options: argparse.Namespace) -> Report:
     folder.mkdir(parents=True)
     settings = StoreSettings(directory=folder / 'store')
     with closing(open_store(settings, UploadSettings())) as store:
-        catalog_bytes, statistics_bytes = fill(store, folder, options.objects)
+        catalog_bytes, statistics_bytes = fill(settings, store, folder, options.objects)
     source = Bucket(settings, BUCKET)
     bumps = sum(number % EVERY == EVERY // 2 for number in range(options.objects))
     asked: dict[str, tuple[Callable[[], values.ValueAnswer], int | None]] = {

@@ -25,7 +25,7 @@ from shadowhound_data_logger.formats.rows.schema import KEPT
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.lake.row_files import RowFile, read
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -72,9 +72,8 @@ class Arrivals:
             head = self._source.head(key)
             return int(head.metadata['t_start_ns']) if head else 0
         info = next(info for info in self._source.list(key))
-        rows = [row for table in tables(self._source, [info], ('t_start_ns',), Findings(lambda _: None), of=KEPT)
-                for row in table.to_pylist()]  # fmt: skip
-        return min(row['t_start_ns'] for row in rows)
+        (found,) = read(self._source, [RowFile(KEPT, ROBOT, '', info)], Findings(lambda _: None))
+        return min(found.rows['t_start_ns'].to_pylist())
 
     def seconds(self, folder: str, begin: float = 0.0, end: float = float('inf')) -> list[float]:
         """Of those that came while it looked, in the order of their keys, and between these times."""

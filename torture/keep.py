@@ -44,7 +44,7 @@ from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
 from shadowhound_data_logger.lake import pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.lake.row_files import RowFile, read
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.s3 import S3Store
@@ -443,9 +443,8 @@ def _messages(source: Ranged, wanted: MessageFilter) -> list[tuple[str, int, byt
 
 def _rows(source: Bucket, in_store: set[str], folder: str) -> list[dict[str, Any]]:
     of = {KEPT.folder: KEPT, OBJECTS.folder: OBJECTS}[folder]
-    entries = [info for info in source.list(of.prefix(ROBOT)) if info.key in in_store]
-    columns = ('key', 'where') if of is KEPT else ('key',)
-    return [row for table in tables(source, entries, columns, Findings(lambda _: None), of=of) for row in table.to_pylist()]
+    files = [RowFile(of, ROBOT, '', info) for info in source.list(of.prefix(ROBOT)) if info.key in in_store]
+    return [row for found in read(source, files, Findings(lambda _: None)) for row in found.rows.to_pylist()]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -208,9 +208,9 @@ def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
 def _check(source: Bucket, there: Sequence[Label], *, robots: Iterable[str | None], labels: Iterable[str | None] = (),
            ids: Iterable[str] = ()) -> None:  # fmt: skip
     """Raises UnknownName for a robot that the store does not have, or for a label or an id that is not among those there are."""
-    from shadowhound_data_logger.lake import live_files, names  # noqa: PLC0415
+    from shadowhound_data_logger.lake import names, row_files  # noqa: PLC0415
 
-    known = {'robot': live_files.robots(source), 'label': [each.label for each in there], 'label id': [each.id for each in there]}
+    known = {'robot': row_files.robots(source), 'label': [each.label for each in there], 'label id': [each.id for each in there]}
     for what, wanted in (('robot', robots), ('label', labels), ('label id', ids)):
         for name in filter(None, wanted):
             names.check_name_of(what, name, known[what])
@@ -229,10 +229,10 @@ def _named(robot: str | None) -> str:
 
 def _only_robot() -> str:
     """The only robot of the store. Raises BadUsage if there are several."""
-    from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
+    from shadowhound_data_logger.lake import row_files  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
-    found = live_files.robots(default_source(the_store_settings()))
+    found = row_files.robots(default_source(the_store_settings()))
     if len(found) != 1:
         raise BadUsage(f'which robot? The store has {", ".join(found) or "none"}', '--robot NAME')
     return found[0]

@@ -1,4 +1,4 @@
-"""``shadowhound-data lake``: the catalog itself: its state in the store, compacted, restored, compared with the store."""
+"""``shadowhound-data lake``: the tables of what is stored: made of rows, pruned, restored, compared with the store."""
 
 from __future__ import annotations
 
@@ -30,7 +30,17 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.export import all_datasets
-from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, progress, volume
+from shadowhound_data_logger.cli.output import (
+    counted,
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    progress,
+    volume,
+)
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.errors import StoreUnavailable
@@ -50,15 +60,15 @@ UNLISTED: Final = 'unlisted'
 DAY_NS: Final = 24 * 3600 * SECOND
 MAX_COVERED_NS: Final = 400 * DAY_NS
 WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalog; `lake reindex` adds those that are there"}
-COLUMNS: Final = ('robot', 'days', 'first', 'last', 'files', 'size', 'compacted', 'to compact', 'superseded')
+COLUMNS: Final = ('robot', 'days', 'first', 'last', 'objects', 'rows', 'waiting', 'rejected')
 _robot = click.option('--robot', metavar='NAME', help='Only of this robot.')
 
 
-@click.group(epilog=examples('lake status', 'lake compact'))
+@click.group(epilog=examples('lake status', 'lake ingest'))
 def lake() -> None:
-    """Look after the catalog of what is stored.
+    """Manage the tables of what is stored.
 
-    It is in the store itself: BUCKET/ROBOT/_catalog/.
+    Robots write rows next to their data; the lake makes tables of them.
     """
 
 
@@ -66,24 +76,25 @@ def lake() -> None:
 @_robot
 @as_json
 def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
-    """Show the size of the catalog, by robot."""
+    """Show what the tables contain, by robot.
+
+    `waiting` are row files that are not ingested yet.
+    """
     with asking():
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.live_files import state  # noqa: PLC0415
+        from shadowhound_data_logger.lake.ingest import states  # noqa: PLC0415
 
-    source = default_source(the_store_settings())
-    left_out = quietly()
-    found = state(source, robot, left_out)
+        source, left_out = default_source(the_store_settings()), quietly()
+        found = states(source, left_out, robot)
     if as_json:
         print_json([asdict(row) for row in found])
         return report_skipped(left_out)
     table = plain_table('', COLUMNS, ('robot', 'first', 'last'))
     table.title = None
     for row in found:
-        counts = (row.files, row.size, row.compacted, row.open_days, row.covered)
-        table.add_row(plain(row.robot), number(row.days), row.first, row.last, number(counts[0]), volume(counts[1]),
-                      *map(number, counts[2:]))  # fmt: skip
-    print_page(table if found else plain(f'There is no catalog yet in {source.describe()}.{store_hint()}'))
+        counts = map(number, (row.objects, row.rows, row.waiting, row.rejected))
+        table.add_row(plain(row.robot), number(row.days), row.first or '-', row.last or '-', *counts)
+    print_page(table if found else plain(f'There are no rows yet in {source.describe()}.{store_hint()}'))
     return report_skipped(left_out)
 
 
@@ -134,52 +145,8 @@ def lake_ingest(*, follow: bool, every: float, expire: float | None, as_json: bo
 def _about_ingest(done: Ingested, root: str) -> str:
     if not done.files:
         return f'All row files are in the tables ({root}).'
-    text = f'{number(done.rows)} rows of {number(done.files)} files added to {root}'
-    return text + f'; {number(done.rejected)} rows rejected' * (done.rejected > 0) + '.'
-
-
-@lake.command(
-    'compact',
-    epilog=examples('lake compact', 'lake compact --robot thor --before yesterday --keep'),
-)
-@_robot
-@click.option('--before', metavar='DATE', help='Days earlier than this  [default: today, UTC]')
-@click.option('--keep', is_flag=True, help='Delete nothing.')
-@click.option('--grace', type=click.FloatRange(0.0), default=60.0, show_default=True, metavar='MIN',
-              help='Minutes for which superseded files stay, because somebody may be reading them.')  # fmt: skip
-@as_json
-def lake_compact(*, robot: str | None, before: str | None, keep: bool, grace: float, as_json: bool) -> ExitCode:
-    """Merge the many files of each past day into one.
-
-    Files that an earlier run merged are deleted.
-
-    Exit code 1 when a file is not part of a catalog, or has rows that are not its robot's: it is named and stays as it is.
-    """
-    found = []
-    with asking():
-        before = before and f'{utc(moment("--before", before, SystemClock.of_this_machine().wall_ns())):%Y-%m-%d}'
-        from shadowhound_data_logger.lake import compact as library  # noqa: PLC0415
-        from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-
-    left_out = quietly()
-    how: dict[str, Any] = {'robot': robot, 'before': before or '', 'grace': None if keep else timedelta(minutes=grace)}
-    with the_store() as target, progress() as bar:
-        for day in library.compact(default_source(the_store_settings()), target, findings=left_out, **how):
-            found.append(day)
-            bar.say(f'{day.robot} {day.date}')
-    if as_json:
-        print_json([asdict(day) for day in found])
-        return report_skipped(left_out)
-    merged, deleted, kept = (sum(getattr(day, name) for day in found) for name in ('merged', 'deleted', 'kept'))
-    days = sum(day.merged > 0 for day in found)
-    click.echo(f'{number(merged)} files are {number(days)} now, one a day.' if merged else 'There is nothing to merge.')
-    if deleted:
-        click.echo(f'{number(deleted)} that were merged earlier are deleted.')
-    if kept:
-        click.echo(f'{number(kept)} superseded files are still there: a later run deletes them.')
-    if any(day.denied for day in found):
-        click.echo('These credentials may not delete: the files only take up space.')
-    return report_skipped(left_out)
+    text = f'{counted(done.rows, "row")} of {counted(done.files, "file")} added to {root}'
+    return text + f'; {counted(done.rejected, "row")} rejected' * (done.rejected > 0) + '.'
 
 
 @lake.command(
@@ -212,8 +179,8 @@ def lake_prune(
         now_ns = SystemClock.of_this_machine().wall_ns()
         from shadowhound_data_logger.lake import prune as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
         from shadowhound_data_logger.lake.names import check_name_of  # noqa: PLC0415
+        from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         keep = library.keep_rules(rules, now_ns)
         how: dict[str, Any] = {'robot': robot, 'most_bytes': None if most is None else library.size_of(most), 'is_forced': force}
@@ -449,11 +416,11 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
 
 
 def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_out: Any, *, as_json: bool) -> ExitCode:
-    from shadowhound_data_logger.lake import link, live_files, pictures  # noqa: PLC0415
+    from shadowhound_data_logger.lake import link, pictures, row_files  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
     source = default_source(the_store_settings())
-    names = [robot] if robot else live_files.robots(source)
+    names = [robot] if robot else row_files.robots(source)
     found = [one for name in names for one in link.samples(source, name, since_ns, until_ns, left_out)]
     pictures.wifi(found, f'{" ".join(names)}, {utc(since_ns):%Y-%m-%d %H:%M} to {utc(until_ns):%Y-%m-%d %H:%M} UTC', target)
     click.echo(f'Wrote {target}', err=True)

@@ -55,8 +55,8 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while
         from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.live_files import robots  # noqa: PLC0415
         from shadowhound_data_logger.lake.names import check_name_of  # noqa: PLC0415
+        from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
         robot = flags.get('robot') or _only_robot(source)
@@ -214,9 +214,9 @@ def _expiry_ns(text: str) -> int:
 
 
 def _only_robot(source: Any) -> str:
-    from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
+    from shadowhound_data_logger.lake import row_files  # noqa: PLC0415
 
-    found = live_files.robots(source)
+    found = row_files.robots(source)
     if len(found) != 1:
         raise BadUsage(f'there are {len(found)} robots in {source.describe()}', 'name one: --robot NAME')
     return str(found[0])

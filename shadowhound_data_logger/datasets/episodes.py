@@ -45,7 +45,7 @@ from shadowhound_data_logger.formats.rows import labels as catalogue_labels
 from shadowhound_data_logger.formats.rows.gaps import GAPS as STATEMENTS
 from shadowhound_data_logger.lake import decode, labels
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.lake.reading import arrow_schema, narrow
+from shadowhound_data_logger.lake.tables import arrow_schema, narrow
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

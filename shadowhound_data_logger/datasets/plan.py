@@ -42,8 +42,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, Known, downsampled_times, newest, of_rows, watermarks
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.lake.reading import narrow
-from shadowhound_data_logger.lake.tables import among
+from shadowhound_data_logger.lake.tables import among, narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -25,7 +25,6 @@ from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of
 
-PARQUET: Final = 'application/vnd.apache.parquet'
 THREADS: Final = 16
 """Requests on their way at a time; each waits, most of its time, for the server."""
 _Answer = TypeVar('_Answer')
@@ -80,13 +79,12 @@ def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -
     Its key says which rows are in it: who was there first wrote the same, and is not overwritten.
     """
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
-        kind = PARQUET if key.endswith('.parquet') else CONTENT_TYPE
         path = Path(folder, 'part')
         path.write_bytes(body)
         metadata = {words.ROBOT: robot, words.SENSOR: SENSOR, words.COUNT: str(rows)}
         item = SpooledObject(
             id=0, bucket=BUCKET, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
-            content_type=kind, metadata=metadata, priority=5, created_ns=time.time_ns(),
+            content_type=CONTENT_TYPE, metadata=metadata, priority=5, created_ns=time.time_ns(),
         )  # fmt: skip
         with suppress(ForeignObject):  # written by another version of the library, or in another order
             store.put(item)

@@ -29,7 +29,7 @@ from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.schema import COLUMNS
-from shadowhound_data_logger.lake.live_files import backfilled_key
+from shadowhound_data_logger.lake.row_files import backfilled_key
 
 FOLDER: Final = '.fetch'
 UNWRITABLE: Final = 'name a folder of yours, on a disk that has room'

@@ -12,29 +12,26 @@ lists the row files afterwards, so what it does not find in a file is in its ver
 from __future__ import annotations
 
 import logging
-import re
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from typing import Final, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from deltalake import DeltaTable
 
 from shadowhound_data_logger.core.clock import utc
-from shadowhound_data_logger.core.errors import AccessDenied, LakeError, ObjectRefused
-from shadowhound_data_logger.core.keys import is_name
-from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.formats.rows.schema import SUFFIX, UNDATED, TableSchema
-from shadowhound_data_logger.lake import reading
+from shadowhound_data_logger.core.errors import AccessDenied, LakeError
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, UNDATED, TableSchema
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.row_files import RowFile, RowsOfFile, Scope, read, row_files
 from shadowhound_data_logger.lake.tables import (
     DATE,
     INGESTED,
+    OBJECT_ROWS,
     PART,
     ROBOT,
     SCHEMAS,
@@ -59,26 +56,7 @@ FEW_FILES: Final = 8
 """In a partition of a day that has not ended; with more they are merged."""
 TRIES: Final = 20
 """Of a commit that other ingesters get in the way of."""
-_FOLDER: Final = re.compile(r'date=(\d{4}-\d\d-\d\d)', re.ASCII)
 log = logging.getLogger(__name__)
-
-
-class RowFile(NamedTuple):
-    """One file of rows in the store."""
-
-    of: TableSchema
-    robot: str
-    date: str
-    entry: ObjectInfo
-
-
-@dataclass(frozen=True, slots=True)
-class Scope:
-    """Which row files a query needs."""
-
-    tables: Sequence[TableSchema] = tuple(SCHEMAS.values())
-    robot: str | None = None
-    has_date: Callable[[str], bool] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,13 +76,6 @@ class Ingested:
         )
 
 
-class _Read(NamedTuple):
-    file: RowFile
-    rows: pa.Table
-    rejected: int
-    why: str | None
-
-
 def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[RowFile] | None = None) -> Ingested:
     """Commit these row files, or all that are not in the tables yet. Raises StoreError, LakeError."""
     if files is None:
@@ -112,7 +83,7 @@ def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[R
         files = pending(tables.open(INGESTED), listed)
     done = Ingested()
     for batch in _batched(files):
-        done += _commit(tables, [*_read(source, batch, findings)])
+        done += _commit(tables, [*read(source, batch, findings)])
     return done
 
 
@@ -155,38 +126,8 @@ def known_files(opened: DeltaTable, dates: Collection[str] = (), where: str = 't
 def fresh(source: Bucket, files: Sequence[RowFile], opened: DeltaTable, of: TableSchema, findings: Findings) -> pa.Table:
     """The rows of these files that an opened table does not have yet. Raises StoreError, LakeError."""
     table = TABLES[of.folder]
-    found = [each.rows for each in _read(source, [file for file in files if file.of is of], findings)]
+    found = [each.rows for each in read(source, [file for file in files if file.of is of], findings)]
     return missing(opened, table, pa.concat_tables([table.schema.empty_table(), *found]))
-
-
-def row_files(source: Bucket, findings: Findings, scope: Scope) -> list[RowFile]:
-    """All row files in the store, oldest date first. Raises StoreError."""
-    robots = [scope.robot] if scope.robot else [name for name in source.folders('') if is_name(name)]
-    with ThreadPoolExecutor(THREADS, 'lake-list') as pool:
-        pairs = [(of, robot) for of in scope.tables for robot in robots]
-        found = pool.map(lambda pair: _listed(source, pair[0], pair[1], scope, findings), pairs)
-        return sorted((file for files in found for file in files), key=lambda file: (file.date, file.entry.key))
-
-
-def _listed(source: Bucket, of: TableSchema, robot: str, scope: Scope, findings: Findings) -> list[RowFile]:
-    def skipped(_: str, key: str) -> None:
-        findings.add(key, 'its key is not a path')
-
-    prefixes = [of.prefix(robot)]
-    try:
-        if scope.has_date is not None:
-            dates = (_FOLDER.fullmatch(name) for name in source.folders(prefixes[0]))
-            prefixes = [f'{prefixes[0]}{date[0]}/' for date in dates if date and scope.has_date(date[1])]
-        listed = [entry for prefix in prefixes for entry in source.list(prefix, skipped)]
-    except ObjectRefused as error:
-        findings.add(of.prefix(robot), f'it cannot be listed: it contains an invalid name: {error}')
-        return []
-    found = []
-    for entry in listed:
-        folder = _FOLDER.fullmatch(entry.key.removeprefix(of.prefix(robot)).partition('/')[0])
-        if folder and entry.key.endswith(('.parquet', SUFFIX)):
-            found.append(RowFile(of, robot, folder[1], entry))
-    return found
 
 
 def _batched(files: Iterable[RowFile]) -> Iterator[list[RowFile]]:
@@ -202,29 +143,7 @@ def _batched(files: Iterable[RowFile]) -> Iterator[list[RowFile]]:
         yield batch
 
 
-def _read(source: Bucket, files: Sequence[RowFile], findings: Findings) -> Iterator[_Read]:
-    """Each file with its valid rows. What is rejected is named in the findings. Raises StoreError."""
-    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:
-        for found, left_out in pool.map(lambda file: _contents(source, file), files):
-            for each in left_out:
-                findings.add(each.key, each.why, each.rows)
-            yield found
-
-
-def _contents(source: Bucket, file: RowFile) -> tuple[_Read, Findings]:
-    table, left_out = TABLES[file.of.folder], Findings(lambda _: None)
-    columns = tuple(file.of.columns)
-    found = list(reading.tables(source, [file.entry], columns, left_out, of=file.of))
-    rows = pa.concat_tables([reading.narrow(columns, file.of).empty_table(), *found])
-    robot = pc.fill_null(rows[ROBOT], file.robot)
-    rows = rows.set_column(rows.column_names.index(ROBOT), ROBOT, robot)
-    dates = pc.fill_null(rows[table.dated].cast(pa.date32()).cast(pa.string()), UNDATED)
-    rows = rows.add_column(0, DATE, dates).cast(table.schema)
-    rejected = sum(each.rows or 0 for each in left_out) or len(left_out)
-    return _Read(file, rows, rejected, next((each.why for each in left_out), None)), left_out
-
-
-def _commit(tables: Tables, found: Sequence[_Read]) -> Ingested:
+def _commit(tables: Tables, found: Sequence[RowsOfFile]) -> Ingested:
     """The rows first, then that they are there."""
     done = Ingested(files=len(found), rejected=sum(each.rejected for each in found))
     for folder, table in TABLES.items():
@@ -257,6 +176,68 @@ def _add(tables: Tables, table: Table, rows: pa.Table) -> int:
         else:
             return len(new)
     raise LakeError(f'other ingesters kept adding rows to {table.name}', remedy='try again')
+
+
+# -- state ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class RobotState:
+    """What the tables have of one robot."""
+
+    robot: str
+    days: int = 0
+    """UTC dates with objects."""
+    first: str | None = None
+    last: str | None = None
+    objects: int = 0
+    """Rows of the table ``objects``; those of deleted objects are among them."""
+    rows: int = 0
+    """Of all tables."""
+    waiting: int = 0
+    """Row files that are not in the tables yet."""
+    rejected: int = 0
+    """Rows that were rejected, of files that are still there."""
+
+
+def states(source: Bucket, findings: Findings, robot: str | None = None) -> list[RobotState]:
+    """The state of one robot or of all, by name. Reads the tables' logs, not their rows. Raises StoreError, LakeError."""
+    tables = Tables.of(source)
+    listed = row_files(source, findings, Scope(robot=robot))
+    found: dict[str, RobotState] = {}
+
+    def of(name: str) -> RobotState:
+        return found.setdefault(name, RobotState(name))
+
+    waiting = listed
+    if tables.exists(INGESTED):
+        waiting = pending(tables.open(INGESTED), listed)
+        for name, dates, count, table in _counted(tables):
+            state = of(name)
+            state.rows += count
+            if table is OBJECT_ROWS:
+                state.objects, state.days = count, len(dates)
+                state.first, state.last = min(dates, default=None), max(dates, default=None)
+        there = {file.entry.key: file.robot for file in listed}
+        for each in known_files(tables.open(INGESTED), where='rejected > 0'):
+            if each.part in there:
+                of(there[each.part]).rejected += each.rejected
+    for file in waiting:
+        of(file.robot).waiting += 1
+    return [state for name, state in sorted(found.items()) if robot in {None, name}]
+
+
+def _counted(tables: Tables) -> Iterator[tuple[str, set[str], int, Table]]:
+    """(robot, dates other than that of undated rows, rows, table), from the statistics of the tables' files."""
+    for table in TABLES.values():
+        files = pa.table(tables.open(table).get_add_actions(flatten=True))
+        robots: dict[str, tuple[set[str], int]] = {}
+        if len(files):
+            for date, name, count in zip(*(files[f].to_pylist() for f in ('partition.date', 'partition.robot', 'num_records')),
+                                         strict=True):  # fmt: skip
+                dates, so_far = robots.get(name, (set(), 0))
+                robots[name] = dates | ({date} - {UNDATED}), so_far + count
+        yield from ((name, dates, count, table) for name, (dates, count) in robots.items())
 
 
 # -- upkeep --------------------------------------------------------------------------------------------------------------------
@@ -317,10 +298,13 @@ def _merge(tables: Tables, table: Table, today: str) -> int:
 
 
 def _expire(source: Bucket, tables: Tables, findings: Findings, before: datetime) -> tuple[int, int]:
-    """Delete row files without rejected rows that were ingested before then: how many were, and how many could not be."""
-    listed = row_files(source, findings, Scope())
+    """Delete row files that are in the tables completely, since before then: how many were, and how many could not be.
+
+    Those of deleted objects stay: ``lake prune`` finds there what it has not finished.
+    """
+    listed = row_files(source, findings, Scope(tuple(of for of in SCHEMAS.values() if of is not FORGOTTEN)))
     stamp = literal(before.strftime('%Y-%m-%dT%H:%M:%S.%fZ'))
-    known = known_files(tables.open(INGESTED), where=f'rejected = 0 AND ingested < {stamp}')
+    known = known_files(tables.open(INGESTED), where=f'why IS NULL AND ingested < {stamp}')
     parts = {each.part for each in known}
     old = [file for file in listed if file.entry.key in parts]
 

@@ -13,7 +13,7 @@ from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import UnknownName
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.row_files import robots
 
 MOST_NAMED: Final = 10
 """Names in a remedy."""

@@ -23,7 +23,6 @@ from itertools import groupby
 from typing import Final, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.core import metadata_words as words
@@ -31,22 +30,20 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter
-from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES
 from shadowhound_data_logger.formats.rows import gaps as journal
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, SUFFIX, Row
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
+from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.forgotten import forgotten_entries, forgotten_names, without
 from shadowhound_data_logger.lake.gaps import HOUR_NS, OBJECTS
-from shadowhound_data_logger.lake.live_files import Day, name_of, robots
-from shadowhound_data_logger.lake.reading import narrow, tables
-from shadowhound_data_logger.lake.scan import KEY, folders
-from shadowhound_data_logger.lake.select import Wanted
+from shadowhound_data_logger.lake.row_files import RowFile, Scope, read, robots, row_files
+from shadowhound_data_logger.lake.tables import answer, literal, quoted
+from shadowhound_data_logger.lake.views import views
 from shadowhound_data_logger.stores.base import ObjectStore
 
 FOREVER: Final = 'forever'
@@ -288,7 +285,7 @@ def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = 
         counts.add(group.sensor, group.objects, group.bytes, group.end_ns, lambda group=group: group.why)  # type: ignore[misc]
     if most_bytes is not None:
         counts.cut(most_bytes)
-    made.unfinished = sum(len(_begun(source, name)[1]) for name in named)
+    made.unfinished = sum(len(_begun(source, name, findings)[1]) for name in named)
     return made
 
 
@@ -383,31 +380,31 @@ def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Call
     Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and as ``repeats`` the other rows that name it as
     their content: it is as old as the youngest of them.
     """
+    columns = ', '.join(map(quoted, _COLUMNS))
     for robot in named:
-        found = sorted(folders(source, Wanted(robot=robot), findings), key=lambda day: day.date, reverse=True)
-        gone = forgotten_entries(source, found, findings)
         later: defaultdict[tuple[str, str], list[Row]] = defaultdict(list)
-        for day in found:
-            tell(f'{robot} {day.date}')
-            yield list(_rows_of(source, day, gone.get((robot, day.date), ()), later, findings))
+        with views(source, [OBJECT_ROWS], findings, robot=robot) as ready:
+            of_robot = f'robot = {literal(robot)} AND t_start IS NOT NULL AND t_start_ns IS NOT NULL'
+            dates = answer(ready, f'SELECT DISTINCT date FROM all_objects WHERE {of_robot} ORDER BY date DESC')  # noqa: S608
+            for date in dates['date'].to_pylist():
+                tell(f'{robot} {date}')
+                of_day = f'{of_robot} AND date = {literal(date)} ORDER BY t_start_ns'
+                found = answer(ready, f'SELECT {columns} FROM all_objects WHERE {of_day}')  # noqa: S608
+                yield list(_rows_of(found, robot, date, later))
 
 
-def _rows_of(source: Bucket, day: Day, gone: Sequence[ObjectInfo], later: defaultdict[tuple[str, str], list[Row]],
-             findings: Findings) -> Iterator[Row]:  # fmt: skip
+def _rows_of(found: pa.Table, robot: str, date: str, later: defaultdict[tuple[str, str], list[Row]]) -> Iterator[Row]:
     """``later`` has the rows of younger days whose key has another date than theirs, and gets those of this one.
 
     Such a row is a repeat of what is older, or somebody's invention: by itself it lets nothing go.
     """
-    found = pa.concat_tables([narrow(_COLUMNS).empty_table(), *tables(source, day.entries, _COLUMNS, findings)])
-    found = without(found, forgotten_names(source, gone, findings))
-    found = found.filter(pc.and_(pc.is_valid(found['t_start']), pc.is_valid(found['t_start_ns'])))
-    date = day.date.replace('-', '')
+    day = date.replace('-', '')
     own: dict[tuple[str, str], Row] = {}
-    for row in found.sort_by('t_start_ns').to_pylist():
+    for row in found.to_pylist():
         object_name = row['bucket'], row['key']
-        row['robot'] = day.robot
+        row['robot'] = robot
         row['name'], row['group'] = _group_of(row)
-        if row['group'] is None and date not in row['key']:
+        if row['group'] is None and day not in row['key']:
             later[object_name].append(row)
         elif object_name in own:
             own[object_name]['repeats'].append(row)
@@ -491,40 +488,34 @@ def _digest(rows: Iterable[Row]) -> str:
 
 def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
     """Delete what has a row and is not marked as deleted yet; how many objects that were."""
-    entries, pending = _begun(source, robot)
-    for _, of_date in groupby(pending, _folder):
-        folder = _folder(next(of_date))
-        _state(store, robot, source, [entry for entry in entries if _folder(entry) == folder], findings)
+    files, pending = _begun(source, robot, findings)
+    for date in sorted({file.date for file in pending}):
+        _state(store, robot, source, [file for file in files if file.date == date], findings)
     done = 0
     with ThreadPoolExecutor(THREADS, 'prune') as pool:
-        for entry in pending:
+        for file in pending:
             keys: set[tuple[str, str]] = set()
-            for rows in tables(source, [entry], KEY, findings, of=FORGOTTEN) if f'{REPEATS}_' not in name_of(entry.key) else ():
-                keys.update(zip(*(rows[name].to_pylist() for name in KEY), strict=True))
+            for found in read(source, [] if f'{REPEATS}_' in file.entry.key.rpartition('/')[2] else [file], findings):
+                keys.update(zip(*(found.rows[name].to_pylist() for name in ('bucket', 'key')), strict=True))
             tell(f'{robot}: deleting {len(keys):,} objects')
             for _ in pool.map(lambda pair: steadily(lambda: store.delete(*pair)), sorted(keys)):
                 done += 1
-            put_part(store, entry.key + DELETED, robot, b'{}\n', len(keys))
+            put_part(store, file.entry.key + DELETED, robot, b'{}\n', len(keys))
     return done
 
 
-def _begun(source: Bucket, robot: str) -> tuple[list[ObjectInfo], list[ObjectInfo]]:
-    """The parts that name what is forgotten, and those of them of which not all is known to be deleted."""
-    listed = source.list(FORGOTTEN.prefix(robot))
-    marks = {entry.key for entry in listed if entry.key.endswith(DELETED)}
-    entries = [entry for entry in listed if entry.key.endswith(SUFFIX)]
-    return entries, [entry for entry in entries if entry.key + DELETED not in marks]
+def _begun(source: Bucket, robot: str, findings: Findings) -> tuple[list[RowFile], list[RowFile]]:
+    """The row files that name what is forgotten, and those of them of which not all is known to be deleted."""
+    marks = {entry.key for entry in source.list(FORGOTTEN.prefix(robot)) if entry.key.endswith(DELETED)}
+    files = row_files(source, findings, Scope((FORGOTTEN,), robot))
+    return files, [file for file in files if file.entry.key + DELETED not in marks]
 
 
-def _folder(entry: ObjectInfo) -> str:
-    return entry.key.rpartition('/')[0]
-
-
-def _state(store: ObjectStore, robot: str, source: Bucket, entries: Sequence[ObjectInfo], findings: Findings) -> None:
+def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFile], findings: Findings) -> None:
     """Statements of the gap journal about all of a date that is forgotten, one for each topic and hour; the last one counts."""
     hours: defaultdict[tuple[str, int], dict[tuple[str, str, int], Row]] = defaultdict(dict)
-    for rows in tables(source, entries, tuple(FORGOTTEN.columns), findings, of=FORGOTTEN):
-        for row in rows.to_pylist():
+    for found_in in read(source, files, findings):
+        for row in found_in.rows.to_pylist():
             if row['topic'] is not None:
                 hours[row['topic'], row['t_start_ns'] // HOUR_NS][row['bucket'], row['key'], row['t_start_ns']] = row
     found = []

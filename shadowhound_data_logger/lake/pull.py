@@ -46,8 +46,7 @@ from shadowhound_data_logger.core.untrusted import from_json, visible
 from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import robots
-from shadowhound_data_logger.lake.scan import superseding
+from shadowhound_data_logger.lake.row_files import robots
 from shadowhound_data_logger.lake.select import Wanted, wanted
 from shadowhound_data_logger.lake.tables import answer, literal, quoted
 from shadowhound_data_logger.lake.views import views
@@ -103,6 +102,19 @@ def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> p
         rows = answer(ready, f'SELECT {columns} FROM all_kept k WHERE robot = {literal(robot)} AND NOT EXISTS ({stored})')  # noqa: S608
     rows = superseding(rows)
     return rows.filter(pa.array([takes(want, row) for row in rows.to_pylist()], pa.bool_()))
+
+
+def superseding(rows: pa.Table) -> pa.Table:
+    """One row for each kept object: its ``lost`` row if it has one, and the row of what is left of it rather than of all.
+
+    Whatever is given again, alone or with others, gives what all at once would have given.
+    """
+    ordered = rows.sort_by(
+        [('bucket', 'ascending'), ('key', 'ascending'), ('where', 'ascending'), ('bytes', 'ascending')]
+    )  # lost before robot, thinned before whole
+    numbered = ordered.append_column('_row', pa.array(range(len(ordered)), pa.int64()))
+    first = numbered.group_by(['bucket', 'key']).aggregate([('_row', 'min')])['_row_min']
+    return ordered if len(first) == len(ordered) else ordered.take(first.combine_chunks().sort())
 
 
 def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:

@@ -22,12 +22,12 @@ from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statisti
 from shadowhound_data_logger.formats.statistics import ALL
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import backfilled_key
-from shadowhound_data_logger.lake.scan import KEY
+from shadowhound_data_logger.lake.row_files import backfilled_key
 from shadowhound_data_logger.lake.tables import literal
 from shadowhound_data_logger.lake.views import rows_of
 from shadowhound_data_logger.stores.base import ObjectStore
 
+KEY: Final = ('bucket', 'key')
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000
 """Objects that are asked for at a time, and then written down."""

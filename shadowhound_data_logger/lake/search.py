@@ -36,8 +36,8 @@ from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import robots
 from shadowhound_data_logger.lake.names import check_name_of
+from shadowhound_data_logger.lake.row_files import robots
 from shadowhound_data_logger.lake.select import Wanted
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -31,12 +31,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import urllib3
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
-from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.retry import backoff, steadily
 from shadowhound_data_logger.core.untrusted import from_json, visible
 from shadowhound_data_logger.formats.rows.gaps import GAPS, WITHDRAWN
@@ -45,8 +45,9 @@ from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, Tabl
 from shadowhound_data_logger.lake import search
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import days, folder_of, name_of, robots
-from shadowhound_data_logger.lake.reading import tables
+from shadowhound_data_logger.lake.row_files import Scope, robots
+from shadowhound_data_logger.lake.tables import TABLES, Tables, TableVersion
+from shadowhound_data_logger.lake.views import current
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -55,7 +56,7 @@ WHICH: Final = 'is it an Elasticsearch or an OpenSearch?'
 BULK_BYTES: Final = 4 << 20
 """Of one request; both servers take 100 MB by default (``http.max_content_length``)."""
 BULK_DOCUMENTS: Final = 4_000
-PARTS_AT_A_TIME: Final = 180
+MISSIONS_AT_A_TIME: Final = 180
 """Noted together: what a kill sends again, at most."""
 TRIES: Final = 8
 """Of a request, without ``--follow``: about a minute."""
@@ -370,14 +371,15 @@ def _iso(stamp_ns: int | None) -> str | None:
 
 _SCHEMA: Final = """
 CREATE TABLE indexes (name TEXT PRIMARY KEY, uuid TEXT NOT NULL);
-CREATE TABLE taken (name TEXT, folder TEXT, part TEXT, PRIMARY KEY (name, folder, part)) WITHOUT ROWID;
+CREATE TABLE versions (name TEXT, robot TEXT, id TEXT NOT NULL, number INTEGER NOT NULL, PRIMARY KEY (name, robot)) WITHOUT ROWID;
+CREATE TABLE missions (robot TEXT, run TEXT, PRIMARY KEY (robot, run)) WITHOUT ROWID;
 CREATE TABLE refused (name TEXT, id TEXT, status INTEGER, reason TEXT, PRIMARY KEY (name, id)) WITHOUT ROWID;
 PRAGMA user_version = 1;
 """
 
 
 class Position:
-    """What one server has taken, in a SQLite file: parts of each folder by name, missions by run, and what was refused."""
+    """What one server has, in a SQLite file: of each table up to which version, missions by run, and what it refused."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -406,17 +408,29 @@ class Position:
     def forget(self, name: str) -> None:
         """An index has nothing, whatever it took before."""
         with self._db:
-            self._db.execute('DELETE FROM taken WHERE name = ?', (name,))
+            self._db.execute('DELETE FROM versions WHERE name = ?', (name,))
             self._db.execute('DELETE FROM refused WHERE name = ?', (name,))
+            if name == MISSIONS:
+                self._db.execute('DELETE FROM missions')
 
-    def taken(self, name: str, folder: str) -> set[str]:
-        return {part for (part,) in self._db.execute('SELECT part FROM taken WHERE name = ? AND folder = ?', (name, folder))}
+    def version(self, name: str, robot: str | None) -> TableVersion | None:
+        """Up to which version of its table an index has the rows of one robot, or of all."""
+        found = self._db.execute('SELECT id, number FROM versions WHERE name = ? AND robot = ?', (name, robot or '')).fetchone()
+        return None if found is None else TableVersion(*found)
 
-    def take(self, name: str, parts: Iterable[tuple[str, str]], refused: Iterable[tuple[str, int, str]]) -> None:
-        """Note (folder, part) that the server has, and (id, status, reason) of what it refused; durable on return."""
+    def missions(self, robot: str) -> set[str]:
+        return {run for (run,) in self._db.execute('SELECT run FROM missions WHERE robot = ?', (robot,))}
+
+    def take(self, name: str, robot: str | None, version: TableVersion, refused: Iterable[tuple[str, int, str]]) -> None:
+        """Note what the server has, and (id, status, reason) of what it refused; durable on return."""
         with self._db:
-            self._db.executemany('INSERT OR IGNORE INTO taken VALUES (?,?,?)', ((name, *each) for each in parts))
+            self._db.execute('INSERT OR REPLACE INTO versions VALUES (?,?,?,?)', (name, robot or '', *version))
             self._db.executemany('INSERT OR REPLACE INTO refused VALUES (?,?,?,?)', ((name, *each) for each in refused))
+
+    def take_missions(self, robot: str, runs: Iterable[str], refused: Iterable[tuple[str, int, str]]) -> None:
+        with self._db:
+            self._db.executemany('INSERT OR IGNORE INTO missions VALUES (?,?)', ((robot, run) for run in runs))
+            self._db.executemany('INSERT OR REPLACE INTO refused VALUES (?,?,?,?)', ((MISSIONS, *each) for each in refused))
 
     def refused(self) -> list[tuple[str, str, int, str]]:
         """Index, id, status and reason of each document that the server refused."""
@@ -480,37 +494,34 @@ class Sink:
                 self.position.forget(MISSIONS if kind == EVENTS else kind)
                 if kind == ROWS:
                     self.position.forget(FORGOTTEN_ROWS)
-        named = [robot] if robot else robots(self.source)
-        for kind, table, make in _TABLES:
-            self._send_parts(named, kind, table, make)
-        for each in named:
+        tables = current(self.source, Scope(robot=robot), self.findings)
+        for kind, of, make in _TABLES:
+            self._send_rows(tables, robot, kind, of, make)
+        for each in [robot] if robot else robots(self.source):
             self._send_missions(each)
         return self._sent
 
-    def _send_parts(self, named: Sequence[str], kind: str, of: TableSchema,
-                    make: Callable[[Mapping[str, Any]], SinkDocument]) -> None:  # fmt: skip
-        for parts in _new(self.source, named, of, self.position, kind, self.findings):
-            for rows in tables(self.source, [part.entry for part in parts], tuple(of.columns), self.findings, of=of):
-                self._send(map(make, _rows(rows)))
-            left_out = {one.key for one in self.findings}
-            whole = (part for part in parts if part.entry.key not in left_out)
-            self._take(kind, ((part.folder, name) for part in whole for name in part.names))
+    def _send_rows(self, tables: Tables, robot: str | None, kind: str, of: TableSchema,
+                   make: Callable[[Mapping[str, Any]], SinkDocument]) -> None:  # fmt: skip
+        for batch, version in tables.added(TABLES[of.folder], self.position.version(kind, robot)):
+            if batch is None:
+                self.position.take(kind, robot, version, self._refused)
+                self._refused = []
+            else:
+                rows = batch if robot is None else batch.filter(pc.equal(batch['robot'], robot))
+                self._send(map(make, _rows(rows.select(list(of.columns)))))
 
     def _send_missions(self, robot: str) -> None:
-        folder = f'{robot}/missions/'
-        known = self.position.taken(MISSIONS, folder)
-        new = [run for run in self.source.folders(folder) if run not in known]
-        for start in range(0, len(new), PARTS_AT_A_TIME):
-            some = new[start : start + PARTS_AT_A_TIME]
+        known = self.position.missions(robot)
+        new = [run for run in self.source.folders(f'{robot}/missions/') if run not in known]
+        for start in range(0, len(new), MISSIONS_AT_A_TIME):
+            some = new[start : start + MISSIONS_AT_A_TIME]
             with ThreadPoolExecutor(THREADS, 'lake-sink') as pool:
                 told = list(pool.map(lambda run: search.summary(self.source, robot, run, self.findings), some))
             ended = [(run, said) for run, said in zip(some, told, strict=True) if said is not None]
             self._send(document for run, said in ended for document in of_mission(robot, run, said))
-            self._take(MISSIONS, ((folder, run) for run, _ in ended))
-
-    def _take(self, kind: str, parts: Iterable[tuple[str, str]]) -> None:
-        self.position.take(kind, parts, self._refused)
-        self._refused = []
+            self.position.take_missions(robot, (run for run, _ in ended), self._refused)
+            self._refused = []
 
     def _send(self, documents: Iterable[SinkDocument]) -> None:
         batch: list[tuple[str, bytes]] = []
@@ -573,36 +584,7 @@ class Sink:
                         failed=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
 
 
-class _Part(NamedTuple):
-    """A file with rows that the server does not have yet, or not all of them."""
-
-    entry: ObjectInfo
-    folder: str
-    names: frozenset[str]
-    """Of the robot's own parts that are in it."""
-
-
-def _new(source: Bucket, named: Sequence[str], of: TableSchema, position: Position, index: str,
-         findings: Findings) -> Iterator[list[_Part]]:  # fmt: skip
-    """A compacted part whose sources were all sent has nothing new."""
-    with ThreadPoolExecutor(THREADS, 'lake-sink') as pool:
-        found = days(source, named, None, pool, findings, of=of)
-    parts: list[_Part] = []
-    for day in found:
-        folder = folder_of(day.robot, day.date, of)
-        known = position.taken(index, folder)
-        for entry in day.entries:
-            names = day.sources.get(entry.key, frozenset({name_of(entry.key)}))
-            if not names <= known:
-                parts.append(_Part(entry, folder, names))
-        if len(parts) >= PARTS_AT_A_TIME:
-            yield parts
-            parts = []
-    if parts:
-        yield parts
-
-
-def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
+def _rows(table: pa.RecordBatch) -> Iterator[dict[str, Any]]:
     """Times as microseconds: which there are is all that is asked."""
     columns = [column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column for column in table.columns]
     for values in zip(*(column.to_pylist() for column in columns), strict=True):

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -47,6 +47,8 @@ DATE, ROBOT, PART = 'date', 'robot', 'part'
 PARTITIONS: Final = (DATE, ROBOT)
 INGEST: Final = 'ingest'
 """The application of the Delta transactions that add rows: of two that start from the same version, one fails."""
+VERSIONS_AT_A_TIME: Final = 50
+"""Of a table's changes that are read together."""
 GROUP_ROWS: Final = 16_384
 """Of a row group: statistics can rule out whole groups."""
 _KINDS: Final = {
@@ -69,8 +71,13 @@ class Table:
     partitions: tuple[str, ...] = PARTITIONS
 
 
+def arrow_schema(of: TableSchema = OBJECTS) -> pa.Schema:
+    """The columns of rows of a table, as they are in row files."""
+    return pa.schema([pa.field(name, _KINDS[kind], nullable=name not in of.required) for name, kind in of.columns.items()])
+
+
 def _table(name: str, of: TableSchema, identity: Sequence[str], time: str, dated: str = 't_start') -> Table:
-    fields = [pa.field(DATE, pa.string()), *(pa.field(column, _KINDS[kind]) for column, kind in of.columns.items())]
+    fields = [pa.field(DATE, pa.string()), *(field.with_nullable(True) for field in arrow_schema(of))]
     return Table(name, pa.schema(fields), tuple(identity), time, dated)
 
 
@@ -102,6 +109,14 @@ def narrow(columns: Iterable[str], of: TableSchema = OBJECTS) -> pa.Schema:
     """The schema of these columns of a table."""
     schema = TABLES[of.folder].schema
     return pa.schema([schema.field(name) for name in columns])
+
+
+class TableVersion(NamedTuple):
+    """How far a reader of a table's changes has come."""
+
+    table: str
+    """The table's own id."""
+    number: int
 
 
 class Conflict(Exception):
@@ -180,7 +195,7 @@ class Tables:
                         Path(self._uri(table)).mkdir(parents=True, exist_ok=True)
                     DeltaTable.create(
                         self._uri(table), table.schema, mode='ignore', partition_by=list(table.partitions),
-                        storage_options=self._options(),
+                        storage_options=self._options(), configuration={'delta.enableChangeDataFeed': 'true'},
                     )  # fmt: skip
 
     def open(self, table: Table, as_of: datetime | int | None = None) -> DeltaTable:
@@ -201,6 +216,30 @@ class Tables:
                 opened, rows, mode='append', partition_by=list(table.partitions), writer_properties=writer(),
                 commit_properties=CommitProperties(app_transactions=[Transaction(INGEST, version)]),
             )  # fmt: skip
+
+    def added(self, table: Table, since: TableVersion | None = None) -> Iterator[tuple[pa.RecordBatch | None, TableVersion]]:
+        """The rows added after a version, some versions at a time; a batch of None says that all up to a version were yielded.
+
+        All rows of the newest version for another table than the version is of, or if its files were deleted meanwhile.
+        """
+        opened = self.open(table)
+        newest = TableVersion(str(opened.metadata().id), opened.version())
+        first = since.number + 1 if since is not None and since.table == newest.table else 0
+        for start in range(first, newest.number + 1, VERSIONS_AT_A_TIME):
+            last = min(start + VERSIONS_AT_A_TIME - 1, newest.number)
+            try:
+                with translated():
+                    changes = opened.load_cdf(starting_version=start, ending_version=last)
+                    for batch in pa.RecordBatchReader.from_stream(changes):
+                        rows = batch.filter(pc.equal(batch['_change_type'], 'insert')).select(table.schema.names)
+                        yield rows.cast(_plain(rows.schema)), newest
+            except LakeError:
+                with engine({table.name: opened}) as ready:
+                    for batch in batches(ready, f'SELECT * FROM {table.name}'):  # noqa: S608 - our own name
+                        yield batch, newest
+                yield None, newest
+                return
+            yield None, TableVersion(newest.table, last)
 
     def delete_local(self) -> None:
         """Local tables are derived from the store: they are made again when they are needed."""

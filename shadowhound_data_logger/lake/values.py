@@ -48,7 +48,7 @@ from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
 from shadowhound_data_logger.lake.decode import cloud_points, extension_of, records
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import OBJECTS, newest, watermarks
-from shadowhound_data_logger.lake.live_files import robots
+from shadowhound_data_logger.lake.row_files import robots
 from shadowhound_data_logger.lake.select import LONGEST_BATCH_NS, TimeSpan, Wanted, date_of, wanted
 from shadowhound_data_logger.lake.tables import among, answer, literal, narrow, quoted
 from shadowhound_data_logger.lake.views import views

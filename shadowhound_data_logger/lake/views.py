@@ -17,7 +17,8 @@ from deltalake import QueryBuilder
 from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import Scope, fresh, ingest, known_files, pending, row_files
+from shadowhound_data_logger.lake.ingest import fresh, ingest, known_files, pending
+from shadowhound_data_logger.lake.row_files import Scope, row_files
 from shadowhound_data_logger.lake.tables import INGESTED, TABLES, Tables, answer, engine, literal
 
 _TABLE, _FRESH = '_table', '_fresh'
@@ -33,14 +34,10 @@ def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robo
     Raises StoreError, LakeError.
     """
     of = tuple(dict.fromkeys((*of, FORGOTTEN))) if OBJECTS in of else tuple(of)
-    tables, scope = Tables.of(source), Scope(of, robot, has_date)
-    if not tables.is_shared and as_of is None:
-        _catch_up(source, tables, scope, findings)
+    scope = Scope(of, robot, has_date)
+    tables = current(source, scope, findings) if as_of is None else Tables.of(source)
     ingested = tables.open(INGESTED)
     opened = {each: tables.open(TABLES[each.folder], as_of) for each in of}
-    for bad in known_files(ingested, where='rejected > 0'):
-        if bad.is_in(scope):
-            findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
     found: dict[str, Any] = {f'{TABLES[each.folder].name}{_TABLE}': table for each, table in opened.items()}
     empty = {each for each, table in opened.items() if not table.file_uris()}
     if tables.is_shared and as_of is None:
@@ -67,6 +64,28 @@ def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str |
         query = f'SELECT {names} FROM all_{table.name} WHERE {of_robot} AND ({where})'  # noqa: S608 - our own words
         query += f' ORDER BY {order}' * bool(order) + ('' if limit is None else f' LIMIT {limit}')
         return answer(ready, query)
+
+
+def dates(source: Bucket, robot: str, of: Sequence[TableSchema], findings: Findings) -> list[str]:
+    """The UTC dates for which one of these tables has rows of a robot. Raises StoreError, LakeError."""
+    scope = Scope(tuple(of), robot)
+    tables = current(source, scope, findings)
+    ingested = tables.open(INGESTED)
+    opened = [tables.open(TABLES[each.folder]) for each in of]
+    found = {each['date'] for table in opened for each in table.partitions() if each['robot'] == robot}
+    waiting = pending(ingested, row_files(source, findings, scope)) if tables.is_shared else []
+    return sorted(found.union(file.date for file in waiting))
+
+
+def current(source: Bucket, scope: Scope, findings: Findings) -> Tables:
+    """The tables of a store; those of this user have all row files of the scope. Names what was rejected of these."""
+    tables = Tables.of(source)
+    if not tables.is_shared:
+        _catch_up(source, tables, scope, findings)
+    for bad in known_files(tables.open(INGESTED), where='rejected > 0'):
+        if bad.is_in(scope):
+            findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
+    return tables
 
 
 def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> None:

@@ -302,16 +302,16 @@ class StorePast:
 
     def robots(self) -> list[str]:
         """Raises StoreError."""
-        from shadowhound_data_logger.lake import live_files  # noqa: PLC0415
+        from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
-        return live_files.robots(self._source)
+        return robots(self._source)
 
     def days(self, robot: str) -> list[str]:
         """Raises StoreError."""
-        from shadowhound_data_logger.lake.live_files import dates_of  # noqa: PLC0415
+        from shadowhound_data_logger.lake.views import dates  # noqa: PLC0415
 
-        found = {date for of in (schema.OBJECTS, schema.KEPT) for date in dates_of(self._source, robot, self._findings, of)}
-        return sorted(date for date in found if date > schema.UNDATED)
+        found = dates(self._source, robot, (schema.OBJECTS, schema.KEPT), self._findings)
+        return [date for date in found if date > schema.UNDATED]
 
     def day(self, robot: str, date: str) -> PastDay:
         """Raises StoreError."""

@@ -28,21 +28,18 @@ def run(home: Path, *arguments: str) -> Result:
     return CliRunner().invoke(lake, arguments, env=env, standalone_mode=True)
 
 
-def test_status_compact_status(home: Path) -> None:
-    """Two days of twelve files become one each; what they were is deleted by a later run, or never."""
-    assert json.loads(run(home, 'status', '--json').output)[0] == {
-        'robot': 'thor', 'days': 2, 'first': '2026-10-28', 'last': '2026-10-29', 'files': 24, 'compacted': 0, 'open_days': 2,
-        'covered': 0, 'size': json.loads(run(home, 'status', '--json').output)[0]['size'],
-    }  # fmt: skip
+def test_status_before_and_after_ingest(home: Path) -> None:
+    """Row files wait, then their rows are in the tables; a row that was rejected is counted."""
+    (before,) = json.loads(run(home, 'status', '--json').output)
+    assert (before['robot'], before['objects'], before['waiting'], before['first']) == ('thor', 0, 24, None)
+    run(home, 'ingest')
+    (after,) = json.loads(run(home, 'status', '--json').output)
+    assert after == {'robot': 'thor', 'days': 2, 'first': '2026-10-28', 'last': '2026-10-29', 'objects': 192, 'rows': 192,
+                     'waiting': 0, 'rejected': 0}  # fmt: skip
     assert 'thor' in run(home, 'status').output
-    merged = run(home, 'compact', '--before', '2026-10-30').output
-    assert '24 files are 2 now, one a day' in merged
-    assert '24 superseded files' in merged
-    assert 'There is nothing to merge' in run(home, 'compact', '--before', '2026-10-30', '--keep').output
-    assert [row['covered'] for row in json.loads(run(home, 'status', '--json').output)] == [24]
-    assert '24 that were merged earlier are deleted' in run(home, 'compact', '--before', '2026-10-30', '--grace', '0').output
-    after = json.loads(run(home, 'status', '--json').output)[0]
-    assert (after['files'], after['compacted'], after['open_days'], after['covered']) == (2, 2, 0, 0)
+    (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.jsonl.zst').write_bytes(b'hello')
+    run(home, 'ingest')
+    assert json.loads(run(home, 'status', '--robot', 'thor', '--json').output) == [{**after, 'rejected': 1}]
 
 
 def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None:
@@ -50,16 +47,16 @@ def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None
     first = json.loads(run(home, 'ingest', '--json').output)
     assert (first['files'], first['rows'], first['repeated'], first['rejected']) == (24, 192, 0, 0)
     assert 'All row files are in the tables' in run(home, 'ingest').output
-    (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.parquet').write_bytes(b'hello')
+    (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.jsonl.zst').write_bytes(b'hello')
     bad = run(home, 'ingest')
-    assert '1 rows rejected' in bad.stdout
-    assert 'bad.parquet is left out' in bad.stderr
+    assert '1 row rejected' in bad.stdout
+    assert 'bad.jsonl.zst is left out' in bad.stderr
 
 
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:
     """There is nothing to say and nothing to do."""
-    assert 'no catalog yet in the bucket sensor-data' in run(tmp_path, 'status').output
-    assert run(tmp_path, 'compact').exit_code == 0
+    assert 'no rows yet in the bucket sensor-data' in run(tmp_path, 'status').output
+    assert run(tmp_path, 'ingest').exit_code == 0
 
 
 def test_reindex_says_what_it_found(home: Path) -> None:
@@ -116,9 +113,7 @@ def test_prune_takes_a_name_that_nothing_has_for_wrong_usage(home: Path, argumen
 
 
 def test_bad_usage(home: Path) -> None:
-    """A date that is none; no robot."""
-    assert run(home, 'compact', '--before', 'soon').exit_code == 2
-    assert run(home, 'compact', '--before', '3000d').exit_code == 0
+    """No robot."""
     assert run(home, 'reindex').exit_code == 2
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from datasets.recorded import House, Mission
+from datasets.recorded import House, Mission, kill_this_process
 
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.export import drop, export, resumed
@@ -58,11 +58,6 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> House:
     for number in range(2):
         made.record(Mission(f'm{number}', begin_s=100 * number, seconds=2, sensors=('camera', 'odom')))
     return made
-
-
-def suicide(*_: Any) -> None:
-    """In a worker."""
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def dying(patch: pytest.MonkeyPatch, at: int) -> None:
@@ -115,8 +110,8 @@ def test_a_worker_that_was_killed_is_told(house: House, tmp_path: Path) -> None:
     """Nothing was added then; the next run gives the same files."""
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('shadowhound_data_logger.datasets.export.build', suicide)
-        with pytest.raises(LakeError, match='a process died while episodes were made; m0 is not made'):
+        patch.setattr('shadowhound_data_logger.datasets.export.build', kill_this_process)
+        with pytest.raises(LakeError, match='a process was killed while episodes were made; m0 is not made'):
             export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)
     assert not (tmp_path / 'set' / INFO).exists()
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)

@@ -20,8 +20,8 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.formats.rows.parts import read_rows
-from shadowhound_data_logger.lake import reading
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.tables import arrow_schema
 from shadowhound_data_logger.stores.s3 import S3Store
 
 SEED = 1
@@ -53,7 +53,7 @@ def cataloged(store: S3Store, robot: str) -> list[dict[str, Any]]:
     for info in store.list(schema.BUCKET, schema.OBJECTS.prefix(robot)):
         found = read_rows(store.get(schema.BUCKET, info.key), robot)
         assert not found.findings
-        for row in pa.Table.from_pylist(found.rows[schema.SENSOR], schema=reading.arrow_schema()).to_pylist():
+        for row in pa.Table.from_pylist(found.rows[schema.SENSOR], schema=arrow_schema()).to_pylist():
             assert f'/date={row["t_start"]:%Y-%m-%d}/' in info.key
             rows.append(row)
     return rows

@@ -17,7 +17,6 @@ import tarfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,22 +39,19 @@ from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.cli.output import shown_time
 from shadowhound_data_logger.core.errors import DataLoggerError
-from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.formats.mcap.format import CHUNK, RECORD, record, text
 from shadowhound_data_logger.formats.mcap.index import records
 from shadowhound_data_logger.formats.mcap.messages import unpack
 from shadowhound_data_logger.formats.rows import parts, schema
-from shadowhound_data_logger.lake import decode, query, reading
+from shadowhound_data_logger.lake import decode, query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.fetch import FetchRequest
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
-from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.live_files import sources_of
-from shadowhound_data_logger.lake.reading import narrow
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
+from shadowhound_data_logger.lake.tables import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -244,62 +240,23 @@ def said(ask: Callable[[], object]) -> str:
 # -- the catalogue -------------------------------------------------------------------------------------------------------------
 
 
-class _Bodies:
-    """A source of one bucket in memory."""
-
-    name, settings = schema.BUCKET, StoreSettings()
-
-    def __init__(self, bodies: Mapping[str, bytes]) -> None:
-        self.bodies = bodies
-
-    def entries(self) -> list[ObjectInfo]:
-        now = datetime.now(timezone.utc)
-        return [ObjectInfo(schema.BUCKET, key, len(body), None, modified=now) for key, body in self.bodies.items()]
-
-    def get(self, key: str, most: int) -> bytes:
-        return self.bodies[key]
-
-    def ranges(self, key: str, spans: Any) -> list[bytes]:
-        return [self.bodies[key][start:end] for start, end in spans]
-
-
-def catalogue_parts(shop: Shop) -> Round:
-    """Parts as robots and compaction write them, damaged; beside a sound one, which is always answered."""
+def row_files_(shop: Shop) -> Round:
+    """Row files as robots write them, damaged."""
     rows = [row(sensor, NOON_NS + number * 10**9) for number in range(20) for sensor in ('camera', 'odom')]
-    arrow = reading.arrow_schema()
-    import pyarrow as pa
-
-    whole = pa.Table.from_pylist(rows, schema=arrow)
-    bases = [
-        bad_parts.written(whole), bad_parts.written(whole, group=8),
-        bad_parts.compacted(rows, ['a', 'b'])[1], bad_parts.written(whole, use_dictionary=False),
-        bad_parts.dictionary_bomb(rows[0]),
-    ]  # fmt: skip
-    sound = parts.encode([row('camera', NOON_NS)])
+    bases = [parts.encode(rows), bad_parts.lines(rows), parts.encode(rows[:1]), bad_parts.lines(rows, key='tachi/a')]
 
     def one(rng: random.Random) -> str:
         base = rng.choice(bases)
         body = bad_parts.mutated(base, rng) if rng.random() < 0.8 else damaged(base, rng)
-        if rng.random() < 0.2:
-            body = parts.encode([_row(each, rng) for each in rows[:5]])
-        source: Any = _Bodies(
-            {'thor/_catalog/a.parquet': sound, 'thor/_catalog/b.parquet': body, 'thor/_catalog/c.parquet': sound}
-        )
-        columns = list(schema.COLUMNS) if rng.random() < 0.5 else rng.sample(list(schema.COLUMNS), 4)
-        reading.SMALL_BYTES = rng.choice((256 << 10, 256 << 10, 10))
-        findings = Findings(lambda _: None)
+        if rng.random() < 0.4:
+            body = bad_parts.lines([_row(each, rng) for each in rows[:5]])
         with shop.reading():
-            found = pa.concat_tables(list(reading.tables(source, source.entries(), list({*columns, 'key'}), findings)))
-            whole_ones = list(reading.whole(source, source.entries(), Findings(lambda _: None)))
-        keys = found['key'].to_pylist()
-        assert keys.count(str(row('camera', NOON_NS)['key'])) >= 2, 'a sound part is not answered'
-        assert all(key.startswith('thor/') for key in keys)
-        found.to_pylist()
-        assert len(whole_ones) >= 2
-        for each in found.slice(0, 50).to_pylist():
+            found = parts.read_rows(body, 'thor')
+        for each in found.rows.get('_catalog', []):
+            assert each['key'].startswith('thor/')
             assert all(visible(str(csv_cell(cell))) for cell in each.values() if cell not in {None, ''})
-        assert all('\x1b' not in str(each) for each in findings)
-        return 'left out' if len(findings) else 'answered'
+        assert found.findings.isprintable()
+        return 'left out' if found.findings else 'answered'
 
     return one
 
@@ -316,26 +273,6 @@ def _row(given: schema.Row, rng: random.Random) -> schema.Row:
         if kind == 'double':
             made[name] = rng.choice((float('inf'), -1e308, 0.5))
     return made
-
-
-def source_lists(shop: Shop) -> Round:
-    """What compacted parts say that they were made of."""
-    rows = [row('camera', NOON_NS)]
-    made = bad_parts.compacted(rows, [f'part{number}' for number in range(200)])[1]
-    bombs = [bad_parts.source_list_bomb(rows)[1]]
-
-    def one(rng: random.Random) -> str:
-        body = rng.choice(bombs) if rng.random() < 0.05 else made
-        if rng.random() < 0.6:
-            body = bad_parts.mutated(body, rng)
-        else:
-            packed = bad_parts.compacted(rows, [json.dumps(value(rng)) for _ in range(3)])[1]
-            body = packed if rng.random() < 0.5 else bad_parts.mutated(packed, rng)
-        source: Any = _Bodies({'thor/_catalog/x.parquet': body})
-        with shop.reading():
-            return said(lambda: sources_of(source, source.entries()[0]))
-
-    return one
 
 
 def summaries(shop: Shop) -> Round:
@@ -689,7 +626,7 @@ def packed_bags(shop: Shop) -> Round:
 
 
 KINDS: Final[Mapping[str, Callable[[Shop], Round]]] = {
-    'parts': catalogue_parts, 'source lists': source_lists, 'summaries': summaries, 'fetched objects': fetched_objects,
+    'row files': row_files_, 'summaries': summaries, 'fetched objects': fetched_objects,
     'images': images,
     'clouds': clouds, 'records': records_, 'archives': archives, 'samples': samples, 'slices': slices, 'metadata': metadata,
     'manifests': manifests, 'packed bags': packed_bags,

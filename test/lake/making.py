@@ -17,6 +17,9 @@ from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.tables import Tables
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of
@@ -151,3 +154,11 @@ def watched(settings: StoreSettings, bucket: str = schema.BUCKET) -> Watched:
 
 def keys(rows: Sequence[schema.Row]) -> list[str]:
     return sorted(row['key'] for row in rows)
+
+
+def merge(settings: StoreSettings) -> int:
+    """Ingest all row files, and make one file of each day; how many files of tables became larger ones."""
+    source = Bucket(settings, schema.BUCKET)
+    tables = Tables.for_ingest(source)
+    ingest(source, tables, Findings(lambda _: None))
+    return tend(source, tables, Findings(lambda _: None)).merged

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,21 +10,18 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import simplejpeg
-from lake.making import NOON_NS, folder_store
+from lake.making import NOON_NS, folder_store, merge
 from lake.training import FRAMES_HZ, IMU_HZ, LATE_NS, Drive, imu_reading, jpeg, seconds_of
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import MissionDataset, Near, Window, query, selecting
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.fetch import FetchRequest, fetch
 from shadowhound_data_logger.lake.fetched import keep_rows
-from shadowhound_data_logger.lake.reading import narrow
+from shadowhound_data_logger.lake.tables import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
-from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 if TYPE_CHECKING:
@@ -241,16 +237,15 @@ def test_a_sensor_of_which_nothing_is_known_is_no_neighbour(tmp_path: Path) -> N
             MissionDataset(source, align={'odom': 0.5, name: 0.5})
 
 
-def test_repeats_survive_compaction(tmp_path: Path) -> None:
-    """Rows of one key and different times are different rows, to the reader and to ``lake compact``."""
+def test_repeats_survive_a_merge(tmp_path: Path) -> None:
+    """Rows of one key and different times are different rows, also after files of tables were merged."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
     one = still.one('sensor_msgs/msg/CompressedImage', [NOON_NS], [still.frame(6)])
     still.store([one])
     still.catalogue([(one, {**one.metadata, 't_start_ns': str(NOON_NS + SECOND), 't_end_ns': str(NOON_NS + SECOND)})])
     source = Bucket(settings, BUCKET)
-    with closing(open_store(settings, UploadSettings())) as store:
-        assert [each.rows for each in compact(source, store, grace=None)] == [2]
+    merge(settings)
     assert list(MissionDataset(source).stamps_ns) == [NOON_NS, NOON_NS + SECOND]
 
 

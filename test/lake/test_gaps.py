@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lake.gap_parts import IMU, lost, mark, tell
-from lake.making import DAY_NS, MINUTE_NS, NOON_NS, folder_store
+from lake.making import DAY_NS, MINUTE_NS, NOON_NS, folder_store, merge
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND, utc
@@ -24,9 +23,8 @@ from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, WITHDRAWN, Stat
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, folded, known, of_rows
-from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.lake.tables import arrow_schema
 from shadowhound_data_logger.stores import open_store
 
 
@@ -199,21 +197,14 @@ def test_every_instant_is_in_one_stretch_and_says_what_the_rows_say(gaps: list[t
     assert ends[-1] == NOON_NS + 60 * SECOND
 
 
-def test_a_compacted_day_gives_the_same_answers_and_keeps_withdrawals(store: StoreSettings, tmp_path: Path) -> None:
-    """Superseded statements are gone from it; a part that comes late with an older one changes nothing."""
+def test_a_merged_day_gives_the_same_answers_and_keeps_withdrawals(store: StoreSettings, tmp_path: Path) -> None:
+    """A row file that comes late with an older statement changes nothing."""
     for number in range(20):
         rows = [lost('1', 5, 6, number), lost('2', 7, 8, number, GAP if number < 19 else WITHDRAWN), mark(number + 1, number)]
         tell(store, tmp_path, *rows, lost(f'x{number}', number, number + 0.5), name=f'p{number:02}')
     before = ask(store, 0, 30)
-    with closing(open_store(store, UploadSettings())) as target:
-        source = Bucket(store, BUCKET)
-        (done,) = compact(source, target, before=f'{utc(NOON_NS + DAY_NS):%Y-%m-%d}')
-        assert (done.merged, len(source.list('thor/_gaps/'))) == (20, 21)
-        assert ask(store, 0, 30) == before
-        assert [each.deleted for each in compact(source, target, before='2030', grace=timedelta(0))] == [20]
-        (entry,) = source.list('thor/_gaps/')
-    rows = pa.parquet.read_table(store.directory / BUCKET / entry.key).to_pylist()
-    assert sorted(row['what'] for row in rows) == ['complete', *21 * ['gap'], 'withdrawn']
+    merge(store)
+    assert ask(store, 0, 30) == before
     tell(store, tmp_path, lost('2', 7, 8, 3), name='late')
     assert ask(store, 0, 30) == before
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, add_part, content, folder_store, row
+from lake.making import DAY_NS, MINUTE_NS, NOON_NS, add, add_part, content, folder_store, merge, row
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.bags.manifest import EventOf, Manifest, RecordedTopic
@@ -22,7 +22,6 @@ from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.formats.rows.gaps import complete
 from shadowhound_data_logger.formats.rows.parts import encode
-from shadowhound_data_logger.lake import compact as compaction
 from shadowhound_data_logger.lake import gaps, labels, prune, pull, verify
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -356,14 +355,14 @@ def test_two_at_once_delete_once(settings: StoreSettings) -> None:
 
 
 @pytest.mark.long('a second of CPU or more')
-def test_compaction_changes_nothing_of_it(settings: StoreSettings) -> None:
-    """Whether days are merged before, between or after."""
+def test_merging_changes_nothing_of_it(settings: StoreSettings) -> None:
+    """Whether files of tables are merged before, between or after."""
     with closing(open_store(settings, UploadSettings())) as store:
         made = _plan(settings)
-        list(compaction.compact(_source(settings), store, before=f'{utc(NOW_NS):%Y-%m-%d}', grace=None))
+        merge(settings)
         prune.apply(_source(settings), store, made, now_ns=NOW_NS, findings=Findings())
         _check(settings)
-        list(compaction.compact(_source(settings), store, before='2027-01-01', grace=None))
+        merge(settings)
     _check(settings)
     assert len(_answer(settings)) == 48
 

@@ -100,7 +100,7 @@ def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tm
                 process.send_signal(signal.SIGKILL)
     assert 0 < len(rows) - len(there()) < len(going), 'it was killed in the middle of its work'
     reader = command(seaweed, 'fetch', '--since', f'{KEPT_DAYS - 1}d', '--to', str(tmp_path / 'fetched'))
-    ended([reader, command(seaweed, *prune), command(seaweed, *prune), command(seaweed, 'lake', 'compact')])
+    ended([reader, command(seaweed, *prune), command(seaweed, *prune), command(seaweed, 'lake', 'ingest')])
     ended([command(seaweed, *prune)])
     assert rows.keys() - there() == going
     young = {key for key, each in rows.items() if each['t_start_ns'] >= now_ns - (KEPT_DAYS - 1) * DAY_NS}

@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from click.testing import CliRunner
+from lake.making import merge
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger.bags.kept import KeptCut
@@ -29,11 +30,9 @@ from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.dataset import MissionDataset
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.labels import Label
-from shadowhound_data_logger.lake.scan import superseding
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
@@ -139,7 +138,7 @@ def test_what_was_thinned_is_known_as_it_is_now() -> None:
         table = pa.table(dict(zip(('key', 'where', 'bytes'), columns, strict=True))).append_column(
             'bucket', pa.array(['x'] * len(rows))
         )
-        found = superseding(table).select(['key', 'where', 'bytes']).to_pylist()
+        found = lake.superseding(table).select(['key', 'where', 'bytes']).to_pylist()
         assert [tuple(row.values()) for row in found] == [('a', 'robot', 50), ('b', 'lost', 10)]
 
 
@@ -155,7 +154,7 @@ def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.Mon
 
 
 def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
-    """A row of a loss supersedes that of what was kept, before and after compaction, and so does that of an arrival."""
+    """The row of a loss supersedes that of what was kept, before and after a merge, and so does that of an arrival."""
     field.records(*range(8), size=200 << 10)
     assert field.kept() == [3, 4, 5, 6, 7]
     said = run('pull', '--sensor', 'camera', '--until', '2025-10-18T12:00:04Z')
@@ -166,7 +165,7 @@ def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
     assert (answer['gone']['objects'], answer['gone']['reasons']) == (3, {'evicted: no_room': 3})
     assert field.kept() == [4, 5, 6, 7]
     for _ in range(2):
-        list(compact(field.source, field.store, before='2025-10-19', grace=None))
+        merge(field.settings)
         assert field.kept() == [4, 5, 6, 7]
     field.records(8, 9, size=200 << 10)
     assert field.kept() == [5, 6, 7, 8, 9]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lake.making import DAY_NS, NOON_NS, SENSORS, Watched, add, add_part, content, folder_store, keys, row
+from lake.making import DAY_NS, NOON_NS, SENSORS, Watched, add, add_part, content, folder_store, keys, merge, row
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
@@ -18,7 +18,6 @@ from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import reindex as library
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.stores import open_store
 
 TIMES = [NOON_NS + second * SECOND for second in range(0, 60, 20)] + [NOON_NS + DAY_NS]
@@ -77,15 +76,13 @@ def test_only_what_is_missing_is_asked(settings: StoreSettings, tmp_path: Path) 
 
 
 def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, tmp_path: Path) -> None:
-    """Robots deliver parts after the objects: before and after compaction a row that stands in two files is one row."""
+    """Robots deliver parts after the objects: before and after a merge a row that stands in two files is one row."""
     run(settings)
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')
         assert answer(settings) == ALL
         assert len(lake.objects(Bucket(settings, schema.BUCKET), sensor='camera')) == len(TIMES)
-        source = Bucket(settings, schema.BUCKET)
-        for now in (datetime(2026, 10, 30, tzinfo=timezone.utc), LATER):
-            list(compact(source, store, before='2026-10-30', now=lambda now=now: now))  # type: ignore[misc]
+        merge(settings)
         assert answer(settings) == ALL
         add_part(store, [row('camera', TIMES[0])], 'later', tmp_path / 'tmp')
     assert answer(settings) == ALL

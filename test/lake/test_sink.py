@@ -11,7 +11,6 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from datetime import timedelta
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 from lake import gap_parts
-from lake.making import NOON_NS, add, fill, folder_store, minutes
+from lake.making import NOON_NS, add, add_part, fill, folder_store, merge, minutes, row
 
 from shadowhound_data_logger.cli.common import ExitCode
 from shadowhound_data_logger.cli.main import cli
@@ -30,7 +29,7 @@ from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUna
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.formats.rows.gaps import WITHDRAWN
-from shadowhound_data_logger.lake import compact, labels, sink
+from shadowhound_data_logger.lake import labels, sink
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.stores import open_store
@@ -150,11 +149,13 @@ def test_the_newest_statement_stays(url: str, settings: StoreSettings, tmp_path:
     assert (label['_source']['what'], label['_source']['label']) == ('removed', 'stairs')
 
 
-def test_compaction_sends_nothing_again(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """As long as the parts of which a compacted one was made are there, their names say what it holds."""
+def test_merged_files_of_tables_send_nothing_again(url: str, settings: StoreSettings, tmp_path: Path) -> None:
+    """A merge changes no row."""
     send(url, settings, tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:
-        assert list(compact.compact(Bucket(settings, 'sensor-data'), store, grace=timedelta(hours=1)))
+        add_part(store, [row('camera', NOON_NS + 30 * 10**9)], 'more', tmp_path / 'tmp')
+    assert send(url, settings, tmp_path).added == 1
+    assert merge(settings) >= 2
     assert (send(url, settings, tmp_path).added, counts(url)['missions']) == (0, 3)
 
 
@@ -200,7 +201,7 @@ class Death(BaseException):
 def test_it_may_die_anywhere(url: str, settings: StoreSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before or after any request, again and again: in the end each document is there, and once."""
     monkeypatch.setattr(sink, 'BULK_DOCUMENTS', 7)
-    monkeypatch.setattr(sink, 'PARTS_AT_A_TIME', 2)
+    monkeypatch.setattr(sink, 'MISSIONS_AT_A_TIME', 2)
     requests = [0]
 
     class Dying(sink.SearchServer):
@@ -360,11 +361,11 @@ def test_an_answer_that_is_none(url: str, settings: StoreSettings, tmp_path: Pat
 def test_a_part_that_is_none_is_told_each_time(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """And keeps nothing else back."""
     with closing(open_store(settings, UploadSettings())) as store:
-        add(store, tmp_path, 'thor/_catalog/date=2026-10-28/thor_x.parquet', b'PAR1 it is not')
+        add(store, tmp_path, 'thor/_catalog/date=2026-10-28/thor_x.jsonl.zst', b'it is not')
     for _ in range(2):
         found = Findings(lambda _: None)
         send(url, settings, tmp_path, findings=found)
-        assert [one.key for one in found] == ['thor/_catalog/date=2026-10-28/thor_x.parquet']
+        assert [one.key for one in found] == ['thor/_catalog/date=2026-10-28/thor_x.jsonl.zst']
 
 
 def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from shadowhound_data_logger import lake
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.errors import SettingError, StoreUntrusted
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.lake import scan
 from shadowhound_data_logger.lake.bucket import Bucket
 
 pytestmark = pytest.mark.seaweedfs
@@ -68,14 +67,10 @@ def run(*arguments: str) -> Result:
 
 
 @pytest.mark.long('a second of CPU or more')
-@pytest.mark.parametrize('compacted', [False, True])
 def test_a_private_authority_is_trusted(
     filled: Tower, authorities: dict[str, Authority], towards: Callable[[str], StoreSettings], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, *, compacted: bool,
 ) -> None:  # fmt: skip
-    """Questions, also of files that Daft would read itself, fetches, the verification and data sets all go through TLS."""
-    if compacted:
-        monkeypatch.setattr(scan, 'SMALL_BYTES', 0)
+    """Questions, fetches, the verification and data sets all go through TLS."""
     with secured(filled, authorities['authority'], 'good') as front:
         source = Bucket(towards(front.url), 'sensor-data')
         assert len(lake.objects(source, robot=ROBOT)['key'].to_pylist()) == OBJECTS

@@ -10,13 +10,12 @@ from contextlib import closing, suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import orjson
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from lake.making import NOON_NS, add, folder_store
+from lake.making import NOON_NS, add, folder_store, merge
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
@@ -24,10 +23,8 @@ from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
 from shadowhound_data_logger.formats.statistics import MOST_FIELDS, FieldStatistics
-from shadowhound_data_logger.lake import compact as compacting
-from shadowhound_data_logger.lake import query, reading, values
+from shadowhound_data_logger.lake import query, values
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.compact import compact
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.reindex import add_statistics
 from shadowhound_data_logger.stores import open_store
@@ -170,21 +167,16 @@ examples = [0]
 def test_it_is_what_a_loop_over_all_messages_finds(
     folder: Path, batches: list[list[dict[str, Any]]], conditions: list[str], data: st.DataObject
 ) -> None:
-    """With statistics of all objects, of some, or of fields that were chosen; before compaction and after it."""
+    """With statistics of all objects, of some, or of fields that were chosen; before files of tables are merged and after it."""
     told = data.draw(st.lists(st.booleans(), min_size=len(batches), max_size=len(batches)))
     examples[0] += 1
     root = folder / str(examples[0])
     source = filled(root, batches, told, data.draw(st.sampled_from([(), ('a', 'n')])))
     if data.draw(st.booleans()):
-        rows = data.draw(st.sampled_from([1, 4096]))
-        with closing(open_store(source.settings, UploadSettings())) as store, mock.patch.multiple(
-                compacting, GROUP_ROWS=rows, STATISTICS_ROWS=3 * rows):  # fmt: skip
-            assert len([*compact(source, store, now=lambda: LATER)]) <= any(told)
-    small_bytes = mock.patch.object(reading, 'SMALL_BYTES', data.draw(st.sampled_from([10, reading.SMALL_BYTES])))
+        merge(source.settings)
     seen = [[json.loads(orjson.dumps(message)) for message in messages] for messages in batches]
     for text in conditions:
-        with small_bytes:
-            found = values.ranges(text, source, scan=True, join_s=0.0)
+        found = values.ranges(text, source, scan=True, join_s=0.0)
         assert [(each.since_ns, each.until_ns, each.messages) for each in found.ranges] == expected(text, seen), text
         assert found.unknown == 0
 
@@ -279,12 +271,8 @@ LIES: list[dict[str, Any]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize('small_bytes', [reading.SMALL_BYTES, 10], ids=['small', 'large'])
-def test_statistics_that_contradict_themselves_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_bytes: int
-) -> None:
+def test_statistics_that_contradict_themselves_are_told(tmp_path: Path) -> None:
     """Their object is as one without statistics, never one without the field, and the others are judged as ever."""
-    monkeypatch.setattr(reading, 'SMALL_BYTES', small_bytes)
     source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()
@@ -324,7 +312,7 @@ def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
             rows = parts.read_rows(path.read_bytes(), 'thor').rows['_stats']
             path.write_bytes(parts.encode([{**row, 'robot': 'tachi'} for row in rows], STATISTICS))
     folder = tmp_path / 'store/sensor-data/thor/_stats/date=2026-10-28'
-    (folder / 'thor_20261028T999999_x.parquet').write_bytes(b'PAR1 nothing PAR1')
+    (folder / 'thor_20261028T999999_x.jsonl.zst').write_bytes(b'nothing')
     left_out = Findings(lambda _: None)
     found = values.ranges('s.a > 11', source, findings=left_out)
     assert (len(found.ranges), found.unknown, len(left_out)) == (0, 10, 2)

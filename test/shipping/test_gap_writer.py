@@ -17,7 +17,7 @@ from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObjec
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.lake.gaps import folded, of_rows
-from shadowhound_data_logger.lake.reading import arrow_schema
+from shadowhound_data_logger.lake.tables import arrow_schema
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import gap_table
 from shadowhound_data_logger.spool.gaps import FORGOTTEN

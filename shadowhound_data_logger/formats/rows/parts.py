@@ -2,7 +2,7 @@
 
 Every line has its kind as ``row`` (an object, a gap, ...) and the columns of that kind's table; a column that is null is omitted.
 Anybody with a robot's keys can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit,
-bounds the lines, and checks the name, type and range of each value. A row may name only its own robot and the keys of that robot.
+bounds the lines, and checks the type and range of each value. A row may name only its own robot and the keys of that robot.
 Rejected lines are counted by reason, and the other rows are used.
 """
 
@@ -87,13 +87,18 @@ class RowsRead:
     rows: dict[str, list[Row]] = field(default_factory=dict)
     """By the folder of their table, in the order of the file; each has all columns of the table."""
     rejected: list[Rejected] = field(default_factory=list)
+    extended: int = 0
+    """Valid rows with columns that this version does not know, which it leaves out: their writer is newer."""
     ended: str | None = None
     """Why the rest of the file was not read; None if it was read to its end."""
 
     @property
     def findings(self) -> str:
         """What is missing and why, in a sentence; empty for a valid file."""
-        told = [f'{each.lines:,} rows are rejected: {each.why} (first in line {each.first:,})' for each in self.rejected]
+        told = [
+            f'{each.lines:,} {"row is" if each.lines == 1 else "rows are"} rejected: {each.why} (first in line {each.first:,})'
+            for each in self.rejected
+        ]
         return '; '.join([*told, *([f'the rest of it is not read: {self.ended}'] if self.ended else [])])
 
 
@@ -123,13 +128,14 @@ def read_rows(content: bytes, robot: str) -> RowsRead:
             found.ended = f'it has more than {MAX_LINES:,} lines'
             break
         try:
-            of, row = _checked(line, robot)
+            of, row, is_extended = _checked(line, robot)
         except ValueError as error:
             why = str(error)
             before = reasons.get(why, Rejected(why, 0, number))
             reasons[why] = before._replace(lines=before.lines + 1)
         else:
             found.rows.setdefault(of.folder, []).append(row)
+            found.extended += is_extended
     found.rejected = list(reasons.values())
     return found
 
@@ -187,8 +193,11 @@ def _pieces(content: bytes, found: RowsRead) -> Iterator[bytes]:
             return
 
 
-def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row]:
-    """The row of a line. Raises ValueError with a reason that has no text of the line."""
+def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
+    """The row of a line, and whether it has more columns than this version knows.
+
+    Raises ValueError with a reason that has no text of the line.
+    """
     if line is None:
         raise ValueError(f'longer than {MAX_LINE_BYTES:,} bytes')
     try:
@@ -202,10 +211,11 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row]:
     checks = _CHECKS[of.folder]
     for name, value in said.items():
         check = checks.get(name)
-        if check is None:
-            raise ValueError(f'a column that a row of kind {kind} does not have')
-        if value is not None and not check(value):
+        if check is not None and value is not None and not check(value):
             raise ValueError(f'{name} is invalid')
+    is_extended = not checks.keys() >= said.keys()
+    if is_extended:
+        said = {name: value for name, value in said.items() if name in checks}
     row = {**_EMPTY[of.folder], **said}
     for name in _REQUIRED[of.folder]:
         if row[name] is None:
@@ -216,7 +226,7 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row]:
     for first, last in _SPANS.get(of.folder, ()):
         if row[first] is not None and row[last] is not None and row[first] > row[last]:
             raise ValueError(f'{first} is after {last}')
-    return of, row
+    return of, row, is_extended
 
 
 def _check_owner(row: Row, robot: str, of: TableSchema) -> None:

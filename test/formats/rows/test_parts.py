@@ -100,7 +100,6 @@ BAD: dict[str, tuple[bytes, str]] = {
     'no kind': (line(row=None), 'no known kind'),
     'a list as its kind': (line(row=['object']), 'no known kind'),
     'a kind that is unknown': (line(row='table'), 'no known kind'),
-    'a column that is unknown': (line(color='red'), 'a column that'),
     'a text for a number': (line(bytes='many'), 'bytes is invalid'),
     'true for a number': (line(bytes=True), 'bytes is invalid'),
     'a number that is not whole': (line(count=1.5), 'count is invalid'),
@@ -127,6 +126,13 @@ BAD: dict[str, tuple[bytes, str]] = {
     'a line of 128 KB': (line(topic='/' * (1 << 17)), 'longer than'),
     'an empty line': (b'\n', 'not JSON'),
 }  # fmt: skip
+
+
+def test_a_newer_robots_columns_are_left_out_and_counted() -> None:
+    """Its rows are used."""
+    found = parts.read_rows(compress(line(color='red', shape={'a': [1]}) + line()), 'thor')
+    assert found.rows == {'_catalog': some(1) * 2}
+    assert (found.extended, found.findings) == (1, '')
 
 
 @pytest.mark.parametrize('kind', BAD)
