@@ -20,6 +20,7 @@ from shadowhound_data_logger.bags.remote import RemoteBag, RemoteFile, clock_of,
 from shadowhound_data_logger.core.durable_files import fingerprint, lock, replacing
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.core.model import ObjectInfo
+from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.untrusted import path_below
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, check_document, read_whole
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
@@ -47,20 +48,12 @@ class FetchedBag:
     """Slices that the manifest promises and that are not in the store."""
 
 
-class Told:
-    """Hears how far a fetch has come; any thread calls it."""
-
-    def begin(self, total: int) -> None:
-        """All bytes there are to have."""
-
-    def have(self, count: int) -> None:
-        """So many more are here, downloaded or there already; negative where they turned out wrong."""
-
-
-def fetch(store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = FETCH_THREADS, told: Told | None = None) -> FetchedBag:
+def fetch(
+    store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = FETCH_THREADS, progress: ProgressListener | None = None
+) -> FetchedBag:
     """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
     with on_disk(to):
-        return _fetch(store, bag, to, threads, told or Told())
+        return _fetch(store, bag, to, threads, progress or ProgressListener())
 
 
 @contextmanager
@@ -73,21 +66,21 @@ def on_disk(folder: Path) -> Iterator[None]:
         raise BagError(f'{where} cannot be used: {error.strerror}', remedy='is there space, and may you write there?') from error
 
 
-def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, told: Told) -> FetchedBag:
+def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, progress: ProgressListener) -> FetchedBag:
     folder = to if bag.is_archive else path_below(to, bag.name)
     folder.mkdir(parents=True, exist_ok=True)
     meter = Meter()
-    told.begin(bag.size)
+    progress.begin(bag.size)
     manifest = None
     if (file := bag.file(MANIFEST)) is not None:
         check_document(file.key, file.size)
-        _have(store, file, folder, None, meter, told)
+        _have(store, file, folder, None, meter, progress)
         manifest = Manifest.from_json(read_whole(LocalFile(folder / MANIFEST)), file.key)
     others = [file for file in bag.files if file.name != MANIFEST]
     promised = {each.file: each.sha256 for each in manifest.slices} if manifest else {}
 
     def one(file: RemoteFile) -> str:
-        return _have(store, file, folder, promised.get(file.name), meter, told)
+        return _have(store, file, folder, promised.get(file.name), meter, progress)
 
     checksums = dict(zip((file.name for file in others), _side_by_side(one, others, threads), strict=True))
     missing = tuple(missing_of(bag, manifest)) if manifest is not None else ()
@@ -109,21 +102,23 @@ def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile],
         pool.shutdown(cancel_futures=True)
 
 
-def _have(store: ObjectStore, file: RemoteFile, folder: Path, promised: str | None, got: Meter, told: Told) -> str:
+def _have(
+    store: ObjectStore, file: RemoteFile, folder: Path, promised: str | None, got: Meter, progress: ProgressListener
+) -> str:
     """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
     path = path_below(folder, file.name)
     sha256 = promised or _recorded(store, file)
     if path.is_file() and path.stat().st_size == file.size and (not sha256 or fingerprint(path)[1] == sha256):
-        told.have(file.size)
+        progress.have(file.size)
         return sha256
     path.parent.mkdir(parents=True, exist_ok=True)
 
     def tell(count: int) -> None:
         got.add(max(count, 0))
-        told.have(count)
+        progress.have(count)
 
     with _alone(path) as resumed:
-        told.have(resumed)
+        progress.have(resumed)
         info = download(store, ObjectInfo(BUCKET, file.key, file.size, None), path, tell=tell).info
     if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()

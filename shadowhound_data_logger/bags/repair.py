@@ -20,12 +20,13 @@ from typing import Any, Final
 
 from shadowhound_data_logger.bags.contents import SqliteFile, files_of, no_bag, opened, slices_of
 from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
-from shadowhound_data_logger.bags.fetch import Told, on_disk
+from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.manifest import RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural
 from shadowhound_data_logger.bags.sqlite_repair import LEFT, salvage_tables
 from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
+from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.untrusted import from_yaml
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, read_whole
 from shadowhound_data_logger.formats.mcap.repair import Loss, McapRepair, examine, repair
@@ -39,7 +40,7 @@ UNFINISHED: Final = '.repair'
 """Ends the names of files and folders that are being written."""
 NOTHING: Final = 'nothing of it can be repaired'
 CHANGED: Final = 'the files that it describes have changed'
-NO_TOLD: Final = Told()
+SILENT: Final = ProgressListener()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +103,10 @@ class _Found:
 
 
 def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False, unverified: bool = False,
-               told: Told = NO_TOLD) -> BagRepair:  # fmt: skip
+               progress: ProgressListener = SILENT) -> BagRepair:  # fmt: skip
     """Raises BagError for a path without a bag and an output that exists, BagDamaged for a file of which nothing can be read."""
     if path.is_file():
-        return _repair_file(path, output, in_place=in_place, unverified=unverified, told=told)
+        return _repair_file(path, output, in_place=in_place, unverified=unverified, progress=progress)
     if output is not None and path.resolve() in (output.absolute().resolve(), *output.absolute().resolve().parents):
         raise BagError(f'{output} is within the bag that is repaired', remedy='choose a folder next to it')
     out = path if in_place else output or path.with_name(f'{path.resolve().name}{REPAIRED}')
@@ -117,8 +118,8 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     names = sorted({*slices_of(list(files), claimed), *open_slices}, key=natural)
     if not names:
         raise no_bag(path)
-    told.begin(sum(files[name].stat().st_size for name in names))
-    found = [_examine(name, files[name], told) for name in names]
+    progress.begin(sum(files[name].stat().st_size for name in names))
+    found = [_examine(name, files[name], progress) for name in names]
     infos = {each.out_name: each.info for each in found if each.info is not None}
     absent: tuple[str, ...] = ()
     if claimed is not None:
@@ -129,13 +130,13 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     result = BagRepair(path, None, tuple(each.report for each in found), remarks, absent)
     if not result.is_damaged:
         return result
-    told.begin(sum(each.look[0] * (1 + each.report.is_damaged) for each in found))
+    progress.begin(sum(each.look[0] * (1 + each.report.is_damaged) for each in found))
     with _writing(out, in_place=in_place) as folder:
         for each in found:
             if each.report.is_damaged and not each.report.failed:
                 each.new = folder / (each.name + UNFINISHED if in_place else each.out_name)
                 each.new.parent.mkdir(parents=True, exist_ok=True)
-                _repair(each, told, unverified=unverified)
+                _repair(each, progress, unverified=unverified)
                 each.report = _with_claim(each.report, claimed)
         _check_unchanged(found)
         if not in_place:
@@ -144,9 +145,9 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     return replace(result, out=out, files=tuple(each.report for each in found), metadata=remarks or (CHANGED,))
 
 
-def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified: bool, told: Told) -> BagRepair:
-    told.begin(path.stat().st_size)
-    found = _examine(path.name, path, told)
+def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified: bool, progress: ProgressListener) -> BagRepair:
+    progress.begin(path.stat().st_size)
+    found = _examine(path.name, path, progress)
     if found.report.failed:
         raise BagDamaged(found.report.failed, remedy=NOTHING, path=str(path))
     if not found.report.is_damaged:
@@ -157,7 +158,7 @@ def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified:
     with on_disk(out):
         found.new = out.with_name(out.name + UNFINISHED)
         found.new.unlink(missing_ok=True)
-        _repair(found, told, unverified=unverified)
+        _repair(found, progress, unverified=unverified)
         _check_unchanged([found])
         os.replace(found.new, out)
         if in_place:
@@ -179,7 +180,7 @@ def _beside(path: Path) -> Path:
 # -- one file ------------------------------------------------------------------------------------------------------------------
 
 
-def _examine(name: str, path: Path, told: Told) -> _Found:
+def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
     """What is wrong with a file, without writing anything."""
     look = _look(path)
     size, is_open = look[0], name.endswith(OPEN)
@@ -191,10 +192,10 @@ def _examine(name: str, path: Path, told: Told) -> _Found:
             is_packed = name.endswith(PACKED)
             info, report = None, FileRepair(name, size, None, (), () if is_packed else ('the database',), None,
                                             failed=error.what if is_packed else '')  # fmt: skip
-        told.have(size)
+        progress.have(size)
     else:
         try:
-            found = examine(path, told.have)
+            found = examine(path, progress.have)
             report = _report(name, found, *(['its name'] if is_open else []))
             info = None if report.is_damaged else found.info
         except BagDamaged as error:
@@ -217,7 +218,7 @@ def _check_unchanged(found: Sequence[_Found]) -> None:
             raise BagError(f'{each.path} changed while it was repaired', remedy='repair it when its recorder has stopped')
 
 
-def _repair(found: _Found, told: Told, *, unverified: bool) -> None:
+def _repair(found: _Found, progress: ProgressListener, *, unverified: bool) -> None:
     """Write ``found.new``."""
     assert found.new is not None
     mode = found.path.stat().st_mode & 0o777
@@ -229,7 +230,7 @@ def _repair(found: _Found, told: Told, *, unverified: bool) -> None:
         losses = (Loss(0, 0, lost, None, None, None),) if lost else ()
         found.report = replace(found.report, messages=found.info.messages, losses=losses, lost_messages=None if lost else 0)
         return
-    result = repair(found.path, found.new, told.have, unverified=unverified, mode=mode)
+    result = repair(found.path, found.new, progress.have, unverified=unverified, mode=mode)
     found.info, found.report = result.info, _report(found.name, result)
 
 

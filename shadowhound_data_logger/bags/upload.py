@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.fetch import Told, on_disk
+from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, archive_of, finished, plan_of
 from shadowhound_data_logger.core import metadata_words as words
@@ -23,6 +23,7 @@ from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import BagError, ForeignObject
 from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State
+from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.shipping.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
@@ -75,10 +76,10 @@ def planned(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool)
             shutil.rmtree(work, ignore_errors=True)
 
 
-def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, progress: ProgressListener | None = None) -> Uploaded:
     """Without the spool: returns when the store confirmed all of it. Raises BagError, StoreError."""
-    told = told or Told()
-    told.begin(plan.size)
+    progress = progress or ProgressListener()
+    progress.begin(plan.size)
     end_s = time.monotonic() + deadline_s
 
     def put(place: int) -> None:
@@ -89,7 +90,7 @@ def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, told:
             steadily(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
         except ForeignObject as error:
             raise _taken(plan.bag, str(error.data.get('key'))) from error
-        told.have(file.size)
+        progress.have(file.size)
 
     with ThreadPoolExecutor(THREADS, 'bag-upload') as pool:
         list(pool.map(put, range(len(plan.files) - 1)))
@@ -131,12 +132,14 @@ def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
         yield spool
 
 
-def deliver(settings: Settings, spool: Spool, plan: UploadPlan, *, deadline_s: float, told: Told | None = None) -> Uploaded:
+def deliver(
+    settings: Settings, spool: Spool, plan: UploadPlan, *, deadline_s: float, progress: ProgressListener | None = None
+) -> Uploaded:
     """Wait until the store has it, delivering where no node does. Raises BagError for what the store refuses, SettingError."""
-    told = told or Told()
-    told.begin(plan.size)
+    progress = progress or ProgressListener()
+    progress.begin(plan.size)
     with delivering(spool, settings, CLOSE_S) as (uploader, _):
-        return _wait(spool, plan, uploader, time.monotonic() + deadline_s, told)
+        return _wait(spool, plan, uploader, time.monotonic() + deadline_s, progress)
 
 
 def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> bool:
@@ -148,14 +151,14 @@ def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> b
     return True
 
 
-def _wait(spool: Spool, plan: UploadPlan, uploader: Uploader, end_s: float, told: Told) -> Uploaded:
+def _wait(spool: Spool, plan: UploadPlan, uploader: Uploader, end_s: float, progress: ProgressListener) -> Uploaded:
     done: set[str] = set()
     while True:
         rows = _rows(spool, plan)
         for file in plan.files:
             if file.key not in done and _is_done(rows.get(file.key), plan.bag):
                 done.add(file.key)
-                told.have(file.size)
+                progress.have(file.size)
         if len(done) == len(plan.files) or time.monotonic() >= end_s:
             return Uploaded(plan.robot, plan.bag, len(plan.files), plan.size, len(done), uploader.status().last_error)
         time.sleep(POLL_S)

@@ -11,7 +11,8 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.common import ExitCode, exit_code, the_store
-from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, progress, shown_time
+from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, shown_time
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.shipping.audit import KEYS, KINDS, THREADS, Audit, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.status import targets

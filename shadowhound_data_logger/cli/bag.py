@@ -47,12 +47,12 @@ from shadowhound_data_logger.cli.output import (
     print_json,
     print_lines,
     print_page,
-    progress,
     shown_time,
     value_table,
     volume,
     with_dates,
 )
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import ranges_option
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SystemClock, iso
@@ -244,7 +244,7 @@ def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged:
     if in_place and output is not None:
         raise BadUsage('--in-place and --output exclude each other', 'leave one of them out')
     with progress('read', of='bytes') as bar:
-        found = repair_bag(path, output, in_place=in_place, unverified=keep_damaged, told=bar)
+        found = repair_bag(path, output, in_place=in_place, unverified=keep_damaged, progress=bar)
     if as_json:
         print_json({**asdict(found), 'is_damaged': found.is_damaged})
     else:
@@ -267,7 +267,7 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
         there = find_bag(store, robot, bag)
-        found = fetch(store, there, to, told=bar)
+        found = fetch(store, there, to, progress=bar)
     if as_json:
         print_json({**asdict(found), 'folder': str(found.folder)})
         return ExitCode.FINE
@@ -369,11 +369,11 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     ):
         if now:
             with the_store(STORE_THREADS) as store:
-                found = upload_now(store, sent, deadline_s=deadline, told=bar)
+                found = upload_now(store, sent, deadline_s=deadline, progress=bar)
         else:
             with opened_spool(settings, clock) as spool:
                 spool_upload(sent, spool)
-                found = deliver(settings, spool, sent, deadline_s=deadline, told=bar)
+                found = deliver(settings, spool, sent, deadline_s=deadline, progress=bar)
     if as_json:
         facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks), 'renamed': dict(sent.renamed)}
         print_json({**asdict(found), 'is_delivered': found.is_delivered, **facts})

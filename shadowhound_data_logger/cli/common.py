@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
 from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
@@ -15,8 +16,9 @@ from shadowhound_data_logger.core.config import UploadSettings, home, store_sett
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.stores import open_store
-from shadowhound_data_logger.stores.base import ObjectStore
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.stores.base import ObjectStore
 
 PROGRAM: Final = 'shadowhound-data'
 
@@ -56,6 +58,50 @@ class BadUsage(click.UsageError):
         self.remedy = remedy
 
 
+class Verb(NamedTuple):
+    """A verb whose module is imported when the verb is called, or its help is needed."""
+
+    name: str
+    help: str
+    """The first line of its help."""
+    module: str = ''
+    """In this folder; by default that of its name."""
+    attribute: str = ''
+
+    def load(self) -> click.Command:
+        module = import_module(f'{__package__}.{self.module or self.name}')
+        command: click.Command = getattr(module, self.attribute or self.name)
+        return command
+
+
+class LazyCommands(MutableMapping[str, click.Command]):
+    """The commands of a group: of some only the names are known until they are looked up."""
+
+    def __init__(self, verbs: Iterable[Verb]) -> None:
+        self._found: dict[str, click.Command | Verb] = {verb.name: verb for verb in verbs}
+
+    def __getitem__(self, name: str) -> click.Command:
+        found = self._found[name]
+        if isinstance(found, Verb):
+            found = self._found[name] = found.load()
+        return found
+
+    def __setitem__(self, name: str, command: click.Command) -> None:
+        self._found[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._found
+
+
 def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
     """What ``--robot`` names; raises BadParameter for what is not a name of a robot."""
     try:
@@ -93,6 +139,8 @@ def store_hint() -> str:
 @contextmanager
 def the_store(threads: int = UploadSettings().threads) -> Iterator[ObjectStore]:
     """The one that the environment names, asked by so many threads at a time."""
+    from shadowhound_data_logger.stores import open_store  # noqa: PLC0415 - not every verb opens one
+
     store = open_store(the_store_settings(), UploadSettings(threads=threads))
     try:
         yield store

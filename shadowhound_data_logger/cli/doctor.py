@@ -15,7 +15,8 @@ from rich.padding import Padding
 from rich.text import Text
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code
-from shadowhound_data_logger.cli.output import plain, print_json, progress
+from shadowhound_data_logger.cli.output import plain, print_json
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.core.ros_arguments import ParametersUnreadable
 from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make

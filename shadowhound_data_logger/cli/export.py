@@ -24,7 +24,8 @@ from shadowhound_data_logger.cli.common import (
     the_store,
     the_store_settings,
 )
-from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress, volume
+from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, volume
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, report_skipped
 from shadowhound_data_logger.core.errors import TrackingError
 from shadowhound_data_logger.core.keys import check_name

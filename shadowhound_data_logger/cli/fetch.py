@@ -22,7 +22,8 @@ from shadowhound_data_logger.cli.common import (
     the_home,
     the_store_settings,
 )
-from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, progress, volume
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_lines, volume
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.stores import open_reader

@@ -21,6 +21,8 @@ from shadowhound_data_logger.cli.audit import finding_lines, findings
 from shadowhound_data_logger.cli.common import (
     BadUsage,
     ExitCode,
+    LazyCommands,
+    Verb,
     as_json,
     examples,
     exit_code,
@@ -30,17 +32,8 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.export import all_datasets
-from shadowhound_data_logger.cli.output import (
-    counted,
-    duration,
-    number,
-    plain,
-    plain_table,
-    print_json,
-    print_page,
-    progress,
-    volume,
-)
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.errors import StoreUnavailable
@@ -64,7 +57,16 @@ COLUMNS: Final = ('robot', 'days', 'first', 'last', 'objects', 'rows', 'waiting'
 _robot = click.option('--robot', metavar='NAME', help='Only of this robot.')
 
 
-@click.group(epilog=examples('lake status', 'lake ingest'))
+@click.group(
+    epilog=examples('lake status', 'lake ingest'),
+    commands=LazyCommands(
+        (
+            Verb('index', 'Make the index of words for `search`, or update it.', 'search', 'lake_index'),
+            Verb('embed', 'Make vectors of pictures, by which `query --like` finds them.', 'likeness', 'lake_embed'),
+            Verb('sink', 'Send the catalog to Elasticsearch or OpenSearch.', 'sink', 'lake_sink'),
+        )
+    ),
+)
 def lake() -> None:
     """Manage the tables of what is stored.
 

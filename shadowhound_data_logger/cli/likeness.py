@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
-from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_page, progress
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, print_json, print_page
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
         chosen, left_out = open_model(model), quietly()
         with the_store() as store, progress('pictures', of='objects') as bar:
             source = default_source(the_store_settings())
-            found = likeness.embed(store, source, chosen, findings=left_out, told=bar, **flags)
+            found = likeness.embed(store, source, chosen, findings=left_out, progress=bar, **flags)
         if not found.pictures:
             check_names(source, left_out, **flags)
     took_s = time.monotonic() - begun_s

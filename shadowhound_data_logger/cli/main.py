@@ -15,34 +15,30 @@ from typing import Final
 
 import click
 
-from shadowhound_data_logger.cli.bag import bag
-from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, ExitCode, examples
-from shadowhound_data_logger.cli.doctor import doctor
-from shadowhound_data_logger.cli.export import export
-from shadowhound_data_logger.cli.fetch import fetch
-from shadowhound_data_logger.cli.label import label
-from shadowhound_data_logger.cli.lake import lake
-from shadowhound_data_logger.cli.ledger import ledger
-from shadowhound_data_logger.cli.likeness import lake_embed
-from shadowhound_data_logger.cli.live import live
-from shadowhound_data_logger.cli.missions import missions
-from shadowhound_data_logger.cli.node import node
-from shadowhound_data_logger.cli.output import print_error, report_error
-from shadowhound_data_logger.cli.policy import policy
-from shadowhound_data_logger.cli.pull import pull
-from shadowhound_data_logger.cli.query import query
-from shadowhound_data_logger.cli.search import lake_index, search
-from shadowhound_data_logger.cli.sink import lake_sink
-from shadowhound_data_logger.cli.spool import spool
-from shadowhound_data_logger.cli.status import status
+from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, ExitCode, LazyCommands, Verb, examples
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError, UnknownName
 
-SECTIONS: Final[dict[str, Sequence[click.Command]]] = {
-    'On every machine': (doctor,),
-    'On the robot': (status, ledger, spool, node, live),
-    'On Tower and Spark': (query, search, fetch, pull, bag, lake, label, export),
-    'Missions': (missions,),
-    'Policies': (policy,),
+SECTIONS: Final[dict[str, Sequence[Verb]]] = {
+    'On every machine': (Verb('doctor', 'Find out why it does not work, and what to do.'),),
+    'On the robot': (
+        Verb('status', 'Show what the node on this machine does now.'),
+        Verb('ledger', 'Account for every message: stored, or lost and why.'),
+        Verb('spool', 'Show what is not in the store yet, and why.'),
+        Verb('node', 'Control the node on this machine, without ROS.'),
+        Verb('live', 'Serve a page that shows robot and data.'),
+    ),
+    'On Tower and Spark': (
+        Verb('query', 'Search what is stored, by flags or SQL.'),
+        Verb('search', 'Search what was said: missions, events, errors, labels.'),
+        Verb('fetch', 'Download objects, verified.'),
+        Verb('pull', 'Request data that a robot keeps (ship: on_request).'),
+        Verb('bag', 'Find, download, check, cut and upload bags.'),
+        Verb('lake', 'Manage the tables of what is stored.'),
+        Verb('label', 'Label times, objects and boxes in images.'),
+        Verb('export', 'Make training sets of missions.'),
+    ),
+    'Missions': (Verb('missions', 'Show and send missions logged on this machine.'),),
+    'Policies': (Verb('policy', 'Bring trained policies to robots, signed.'),),
 }
 """The verbs by who needs them, in the order of the help."""
 NO_VERB: Final[tuple[type[click.ClickException], ...]] = (
@@ -56,10 +52,9 @@ class Verbs(click.Group):
     """Its help lists the verbs section by section."""
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
-        room = formatter.width - 6 - max(len(name) for name in self.commands)
         for title, verbs in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl([(verb.name or '', verb.get_short_help_str(room)) for verb in verbs])
+                formatter.write_dl([(verb.name, verb.help) for verb in verbs])
 
     def format_epilog(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         for part in (examples('doctor', 'status --watch', 'query --sensor camera --since 2h'), CODES):
@@ -67,7 +62,11 @@ class Verbs(click.Group):
             formatter.write_text(part)
 
 
-@click.group(cls=Verbs, context_settings={'help_option_names': ['-h', '--help']})
+@click.group(
+    cls=Verbs,
+    commands=LazyCommands(verb for section in SECTIONS.values() for verb in section),
+    context_settings={'help_option_names': ['-h', '--help']},
+)
 @click.version_option(package_name='shadowhound_data_logger', prog_name=PROGRAM)
 def cli() -> None:
     """See, find and move the data of a robot, in its spool and in the store.
@@ -75,13 +74,6 @@ def cli() -> None:
     SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one that ran
     here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with --json.
     """
-
-
-for _verb in (verb for section in SECTIONS.values() for verb in section):
-    cli.add_command(_verb)
-lake.add_command(lake_index)
-lake.add_command(lake_embed)
-lake.add_command(lake_sink)
 
 
 class _WithoutPandas:
@@ -117,6 +109,8 @@ def main() -> None:
     except (click.ClickException, DataLoggerError, OSError, sqlite3.Error, UnicodeEncodeError) as error:
         is_usage = isinstance(error, (click.ClickException, SettingError, UnknownName, UnicodeEncodeError))
         code = ExitCode.USAGE if is_usage else ExitCode.FINDING
+        from shadowhound_data_logger.cli.output import print_error, report_error  # noqa: PLC0415 - rich takes a while
+
         told = described(error, sys.argv[1:])
         if wants_json(sys.argv[1:]):
             print_error(*told, code)

@@ -22,10 +22,10 @@ from shadowhound_data_logger.cli.output import (
     plain_table,
     print_json,
     print_page,
-    progress,
     shown_iso,
     value_table,
 )
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.untrusted import csv_cell
 from shadowhound_data_logger.missions.child import Replayer

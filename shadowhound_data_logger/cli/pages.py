@@ -281,7 +281,7 @@ def commands() -> str:
     for title, verbs in VERBS.items():
         parts += [f'\n## {title}\n', _row('verb', '', 'for example'), '|---|---|---|\n']
         for verb in verbs:
-            parts += _verbs((verb.name or '',), verb)
+            parts += _verbs((verb.name,), verb.load())
     return ''.join(parts)
 
 

@@ -31,10 +31,10 @@ from shadowhound_data_logger.cli.output import (
     print_json,
     print_lines,
     print_page,
-    progress,
     shown_time,
     with_dates,
 )
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import FLAGS, asking, quietly, report_skipped
 
 FILE: Final = 'search.db'

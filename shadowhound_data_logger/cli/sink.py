@@ -12,7 +12,8 @@ from typing import Final
 import click
 
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, robot_name, the_home, the_store_settings
-from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, progress
+from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import asking, quietly, report_skipped
 from shadowhound_data_logger.core.errors import StoreUnavailable
 

@@ -17,18 +17,8 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.common import ExitCode, as_json, examples, exit_code, spool_folder, the_spool
-from shadowhound_data_logger.cli.output import (
-    ProgressBar,
-    counted,
-    duration,
-    number,
-    plain,
-    plain_table,
-    print_json,
-    print_page,
-    progress,
-    volume,
-)
+from shadowhound_data_logger.cli.output import counted, duration, number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.progress import ProgressBar, progress
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError

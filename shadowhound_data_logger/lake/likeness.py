@@ -24,9 +24,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from shadowhound_data_logger.bags.fetch import Told
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
+from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, is_path, open_image
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
@@ -75,13 +75,13 @@ class Likeness:
 
 
 def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Findings | None = None,
-          told: Told | None = None, **flags: Any) -> Embedded:  # fmt: skip
+          progress: ProgressListener | None = None, **flags: Any) -> Embedded:  # fmt: skip
     """Make vectors of all pictures that the flags choose (``query.objects``) and that have none of this model.
 
     It may die anywhere, run again or run twice at once: whole parts are put, and a picture that has a vector is not looked at.
     Raises LakeError, StoreError.
     """
-    findings, told = Findings() if findings is None else findings, told or Told()
+    findings, progress = Findings() if findings is None else findings, progress or ProgressListener()
     rows = pictures(query.objects(source, findings=findings, **flags))
     found = Embedded(pictures=len(rows))
     known = {digest for part in _parts(source, model, rows, findings) for digest in part.digests}
@@ -94,8 +94,8 @@ def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Fi
             known.add(digest)
             todo.append(row)
     pending: dict[tuple[str, str], list[tuple[bytes, NDArray[np.float16]]]] = {}
-    told.begin(len(todo))
-    for some in _opened(source, todo, found, told):
+    progress.begin(len(todo))
+    for some in _opened(source, todo, found, progress):
         try:
             vectors = [*model.of_pictures([picture for _, picture in some]).astype('<f2')] if some else []
         except ValueError:
@@ -157,7 +157,7 @@ def pictures(rows: pa.Table) -> pa.Table:
 
 
 def _opened(
-    source: Bucket, rows: Sequence[Mapping[str, Any]], found: Embedded, told: Told
+    source: Bucket, rows: Sequence[Mapping[str, Any]], found: Embedded, progress: ProgressListener
 ) -> Iterator[list[tuple[Mapping[str, Any], Any]]]:
     """Some pictures at a time, decoded, each with its row; those that are none are counted."""
 
@@ -183,7 +183,7 @@ def _opened(
                 except (OSError, ValueError, SyntaxError):
                     found.refused['unreadable'] += 1
             yield batch
-            told.have(len(some))
+            progress.have(len(some))
 
 
 def _one_by_one(model: ImageModel, some: Sequence[tuple[Mapping[str, Any], Any]], found: Embedded) -> list[Any]:

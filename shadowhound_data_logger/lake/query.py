@@ -37,9 +37,8 @@ from shadowhound_data_logger.lake.names import misspelled
 from shadowhound_data_logger.lake.select import Wanted, date_of, wanted
 from shadowhound_data_logger.lake.tables import among, answer, batches, engine, literal, narrow, quoted
 from shadowhound_data_logger.lake.views import rows_of, views
-from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, parse_manifest, split_id
-from shadowhound_data_logger.policies.registry import BUCKET as POLICIES
-from shadowhound_data_logger.policies.registry import PREFIX
+from shadowhound_data_logger.policies.manifest import BUCKET as POLICIES
+from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PREFIX, parse_manifest, split_id
 
 ALL: Final = 'all_objects'
 """The view of the table; ``objects`` is restricted by the flags."""

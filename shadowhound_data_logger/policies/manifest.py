@@ -18,6 +18,9 @@ from shadowhound_data_logger.core.errors import PolicyRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.untrusted import from_strict_json, is_path
 
+BUCKET: Final = 'lerobot'
+PREFIX: Final = 'policies'
+"""Where policies are in the store."""
 FORMAT: Final = 1
 MANIFEST: Final = 'manifest.json'
 MOST_MANIFEST_BYTES: Final = 1 << 20

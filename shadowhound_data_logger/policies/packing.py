@@ -18,6 +18,7 @@ from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.manifest import (
+    BUCKET,
     FORMAT,
     MANIFEST,
     MOST_MANIFEST_BYTES,
@@ -26,7 +27,7 @@ from shadowhound_data_logger.policies.manifest import (
     check_file_name,
     parse_manifest,
 )
-from shadowhound_data_logger.policies.registry import BUCKET, ID_TAG, ROBOTS_TAG, MlflowRegistry, source_of
+from shadowhound_data_logger.policies.registry import ID_TAG, ROBOTS_TAG, MlflowRegistry, source_of
 from shadowhound_data_logger.policies.smoke import open_model, worst_difference
 from shadowhound_data_logger.policies.trust import MISSING_PACKAGE, target_of
 from shadowhound_data_logger.stores.base import ObjectStore

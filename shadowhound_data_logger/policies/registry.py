@@ -13,9 +13,8 @@ from urllib.parse import urlencode
 from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused, TrackingRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.mlflow_rest import MlflowRest
+from shadowhound_data_logger.policies.manifest import BUCKET, PREFIX
 
-BUCKET: Final = 'lerobot'
-PREFIX: Final = 'policies'
 CHAMPION, CANARY = 'champion', 'canary'
 ROBOTS_TAG: Final = 'shadowhound.robots'
 """Of a version: the robots that take it as a canary, with commas between them."""

@@ -38,7 +38,7 @@ from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.policies import keys
 from shadowhound_data_logger.policies.keys import PRIVATE, SIGNED_DAYS, Passphrase, PublicKey, in_days
-from shadowhound_data_logger.policies.registry import BUCKET
+from shadowhound_data_logger.policies.manifest import BUCKET
 from shadowhound_data_logger.policies.trust import FRESH_DAYS, MAX_METADATA_BYTES, METADATA, ROOT, SIGNED_AT
 from shadowhound_data_logger.stores.base import ObjectStore
 

@@ -23,8 +23,15 @@ from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.content import files_of
 from shadowhound_data_logger.policies.folder import PolicyFolder, newest_of
-from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PolicyManifest, parse_manifest, split_id
-from shadowhound_data_logger.policies.registry import BUCKET, PolicyRegistry, RegisteredVersion, choose, folder_of
+from shadowhound_data_logger.policies.manifest import (
+    BUCKET,
+    MANIFEST,
+    MOST_MANIFEST_BYTES,
+    PolicyManifest,
+    parse_manifest,
+    split_id,
+)
+from shadowhound_data_logger.policies.registry import PolicyRegistry, RegisteredVersion, choose, folder_of
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun, is_enough, run_smoke
 from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT
 from shadowhound_data_logger.stores.base import ObjectStore

@@ -19,7 +19,7 @@ from shadowhound_data_logger.core import durable_files
 from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
 from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, PolicyError, PolicyRefused
 from shadowhound_data_logger.core.retry import steadily
-from shadowhound_data_logger.policies.registry import BUCKET, PREFIX
+from shadowhound_data_logger.policies.manifest import BUCKET, PREFIX
 from shadowhound_data_logger.stores.base import ObjectStore
 
 if TYPE_CHECKING:

@@ -16,11 +16,12 @@ import pytest
 from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from shadowhound_data_logger.bags.fetch import Told, fetch
+from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.core import retry
 from shadowhound_data_logger.core.errors import BagDamaged, BagError, StoreUnavailable
+from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -60,7 +61,7 @@ def files(folder: Path) -> dict[str, str]:
 def test_it_is_the_very_bag(store: Counting, tmp_path: Path) -> None:
     """Every file is what the robot wrote, and nothing else lies beside it; what was told adds up to all bytes."""
 
-    class Sum(Told):
+    class Sum(ProgressListener):
         total = 0
         had = 0
 
@@ -71,7 +72,7 @@ def test_it_is_the_very_bag(store: Counting, tmp_path: Path) -> None:
             self.had += count
 
     told = Sum()
-    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', told=told)
+    found = fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here', progress=told)
     assert files(found.folder) == files(tmp_path / 'robot' / NAME)
     assert (found.is_complete, found.unverified) == (True, ())
     assert told.had == told.total == found.bytes == found.downloaded
@@ -185,14 +186,15 @@ def test_a_kill_costs_nothing(tmp_path: Path) -> None:
     program = (
         'import sys, time, pathlib\n'
         'from shadowhound_data_logger.stores.directory import DirectoryStore\n'
-        'from shadowhound_data_logger.bags.fetch import fetch, Told\n'
+        'from shadowhound_data_logger.bags.fetch import fetch\n'
+        'from shadowhound_data_logger.core.progress import ProgressListener\n'
         'from shadowhound_data_logger.bags.remote import find_bag\n'
-        'class Slow(Told):\n'
+        'class Slow(ProgressListener):\n'
         '    def have(self, count):\n'
         '        if count:\n'
         '            time.sleep(0.3)\n'
         'store = DirectoryStore(pathlib.Path(sys.argv[1]))\n'
-        'fetch(store, find_bag(store, "thor", sys.argv[2]), pathlib.Path(sys.argv[3]), threads=1, told=Slow())\n'
+        'fetch(store, find_bag(store, "thor", sys.argv[2]), pathlib.Path(sys.argv[3]), threads=1, progress=Slow())\n'
     )
     here = tmp_path / 'here'
     child = subprocess.Popen([sys.executable, '-c', program, str(tmp_path / 'home' / 'store'), NAME, str(here)])

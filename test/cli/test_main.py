@@ -95,9 +95,10 @@ def test_an_example_with_a_wrong_option_would_be_found() -> None:
 
 
 def test_the_verbs_are_in_sections() -> None:
-    """Each in one of them, and in full: no line of the list is cut."""
-    listed = [verb.name for section in SECTIONS.values() for verb in section]
-    assert sorted(map(str, listed)) == sorted(cli.commands)
+    """Each in one of them, by its own help, and in full: no line of the list is cut."""
+    listed = [verb for section in SECTIONS.values() for verb in section]
+    assert sorted(verb.name for verb in listed) == sorted(cli.commands)
+    assert [verb.load().get_short_help_str(1000) for verb in listed] == [verb.help for verb in listed]
     text = help_of('')
     for title in SECTIONS:
         assert f'\n{title}:\n' in text
@@ -309,3 +310,12 @@ def test_a_reader_that_goes_away_is_no_error(lines: int) -> None:
         process.stdout.close()
         assert process.stderr.read() == b''
         assert process.wait(30) == ExitCode.FINDING
+
+
+def test_the_help_imports_no_verb() -> None:
+    """Each verb is imported when it is called."""
+    code = 'import sys; from shadowhound_data_logger.cli.main import cli; cli(["-h"], standalone_mode=False); print(*sys.modules)'
+    names = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout.split()
+    loaded = {name for name in names if name.startswith('shadowhound_data_logger.cli.')}
+    assert loaded == {'shadowhound_data_logger.cli.common', 'shadowhound_data_logger.cli.main'}
+    assert not {'rich', 'numpy', 'pyarrow', 'sqlite3.dbapi2', 'mcap'} & {name.partition('.')[0] for name in names}

@@ -18,7 +18,7 @@ from spool.making import BUCKET, assert_whole, make, new_spool, put, rows, settl
 
 from shadowhound_data_logger.cli import spool as drains
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.cli.output import progress
+from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import SpoolError
