@@ -73,7 +73,7 @@ class Arrivals:
             return int(head.metadata['t_start_ns']) if head else 0
         info = next(info for info in self._source.list(key))
         (found,) = read(self._source, [RowFile(KEPT, ROBOT, '', info)], Findings(lambda _: None))
-        return min(found.rows['t_start_ns'].to_pylist())
+        return min(row['t_start_ns'] for row in found.rows)
 
     def seconds(self, folder: str, begin: float = 0.0, end: float = float('inf')) -> list[float]:
         """Of those that came while it looked, in the order of their keys, and between these times."""

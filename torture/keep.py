@@ -444,7 +444,7 @@ def _messages(source: Ranged, wanted: MessageFilter) -> list[tuple[str, int, byt
 def _rows(source: Bucket, in_store: set[str], folder: str) -> list[dict[str, Any]]:
     of = {KEPT.folder: KEPT, OBJECTS.folder: OBJECTS}[folder]
     files = [RowFile(of, ROBOT, '', info) for info in source.list(of.prefix(ROBOT)) if info.key in in_store]
-    return [row for found in read(source, files, Findings(lambda _: None)) for row in found.rows.to_pylist()]
+    return [row for found in read(source, files, Findings(lambda _: None)) for row in found.rows]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -496,7 +496,7 @@ def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, 
         for file in pending:
             keys: set[tuple[str, str]] = set()
             for found in read(source, [] if f'{REPEATS}_' in file.entry.key.rpartition('/')[2] else [file], findings):
-                keys.update(zip(*(found.rows[name].to_pylist() for name in ('bucket', 'key')), strict=True))
+                keys.update((row['bucket'], row['key']) for row in found.rows)
             tell(f'{robot}: deleting {len(keys):,} objects')
             for _ in pool.map(lambda pair: steadily(lambda: store.delete(*pair)), sorted(keys)):
                 done += 1
@@ -515,7 +515,7 @@ def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFi
     """Statements of the gap journal about all of a date that is forgotten, one for each topic and hour; the last one counts."""
     hours: defaultdict[tuple[str, int], dict[tuple[str, str, int], Row]] = defaultdict(dict)
     for found_in in read(source, files, findings):
-        for row in found_in.rows.to_pylist():
+        for row in found_in.rows:
             if row['topic'] is not None:
                 hours[row['topic'], row['t_start_ns'] // HOUR_NS][row['bucket'], row['key'], row['t_start_ns']] = row
     found = []

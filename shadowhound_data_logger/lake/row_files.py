@@ -19,8 +19,8 @@ from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.untrusted import check_size, is_path
-from shadowhound_data_logger.formats.rows.parts import MAX_FILE_BYTES, read_rows
-from shadowhound_data_logger.formats.rows.schema import OBJECTS, SUFFIX, UNDATED, TableSchema
+from shadowhound_data_logger.formats.rows.parts import MAX_FILE_BYTES, read_rows, rows_are
+from shadowhound_data_logger.formats.rows.schema import OBJECTS, SUFFIX, UNDATED, Row, TableSchema
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.tables import DATE, ROBOT, SCHEMAS, TABLES, arrow_schema
@@ -50,11 +50,11 @@ class RowsOfFile(NamedTuple):
     """What a row file contains."""
 
     file: RowFile
-    rows: pa.Table
-    """The valid ones, with the columns of their Delta table."""
-    rejected: int
+    rows: list[Row]
+    """The valid ones of its table; each has its robot."""
+    rejected: int = 0
     """Rows that were rejected; 1 for a file that is not one."""
-    why: str | None
+    why: str | None = None
     """Also where nothing was rejected: of a file with columns that this version does not know."""
 
 
@@ -85,11 +85,20 @@ def row_files(source: Bucket, findings: Findings, scope: Scope) -> list[RowFile]
 
 def read(source: Bucket, files: Sequence[RowFile], findings: Findings) -> Iterator[RowsOfFile]:
     """Each file with its valid rows. What is rejected is named in the findings. Raises StoreError."""
-    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:
-        for found in pool.map(lambda file: _contents(source, file), files):
+    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:  # they wait for the server; threads that parse block each other
+        for file, body in zip(files, pool.map(lambda file: _body(source, file), files), strict=True):
+            found = RowsOfFile(file, [], 1, body) if isinstance(body, str) else _contents(file, body)
             if found.rejected:
-                findings.add(found.file.entry.key, found.why or '', found.rejected)
+                findings.add(file.entry.key, found.why or '', found.rejected)
             yield found
+
+
+def as_table(of: TableSchema, rows: Sequence[Row]) -> pa.Table:
+    """Rows with the columns of their Delta table."""
+    table, schema = TABLES[of.folder], arrow_schema(of)
+    found = pa.table({name: [row[name] for row in rows] for name in schema.names}, schema=schema)
+    dates = pc.fill_null(found[table.dated].cast(pa.date32()).cast(pa.string()), UNDATED)
+    return found.add_column(0, DATE, dates).cast(table.schema)
 
 
 def _listed(source: Bucket, of: TableSchema, robot: str, scope: Scope, findings: Findings) -> list[RowFile]:
@@ -113,26 +122,32 @@ def _listed(source: Bucket, of: TableSchema, robot: str, scope: Scope, findings:
     return found
 
 
-def _contents(source: Bucket, file: RowFile) -> RowsOfFile:
-    table = TABLES[file.of.folder]
+def _body(source: Bucket, file: RowFile) -> bytes | str:
+    """The content of a file, or why it is not a row file."""
     if not is_path(file.entry.key):
-        return RowsOfFile(file, table.schema.empty_table(), 1, 'its name is not a path')
+        return 'its name is not a path'
     try:
         check_size(file.entry.size, MAX_FILE_BYTES)
-        found = read_rows(source.get(file.entry.key, MAX_FILE_BYTES), file.robot)
+        return source.get(file.entry.key, MAX_FILE_BYTES)
     except (ValueError, MemoryError, ObjectRefused) as error:
         if isinstance(error, ObjectRefused) and error.data.get('reason') == 'missing':
             raise
-        why = 'there is not enough memory for it' if isinstance(error, MemoryError) else f'it is not a row file ({error})'
-        return RowsOfFile(file, table.schema.empty_table(), 1, why)
+        return 'there is not enough memory for it' if isinstance(error, MemoryError) else f'it is not a row file ({error})'
+
+
+def _contents(file: RowFile, body: bytes) -> RowsOfFile:
+    try:
+        found = read_rows(body, file.robot)
+    except MemoryError:
+        return RowsOfFile(file, [], 1, 'there is not enough memory for it')
+    rows = found.rows.get(file.of.folder, [])
+    for row in rows:
+        row[ROBOT] = file.robot  # what they name themselves, if anything
     rejected = sum(each.lines for each in found.rejected) + (found.ended is not None)
     reasons = [found.findings] if found.findings else []
-    if others := sum(len(rows) for folder, rows in found.rows.items() if folder != file.of.folder):
+    if others := sum(map(len, found.rows.values())) - len(rows):
         rejected += others
-        reasons.append(f'{others:,} of its rows belong to another table')
+        reasons.append(f'{rows_are(others)} rejected: of another table')
     if found.extended:
-        reasons.append(f'{found.extended:,} rows have columns that this version does not know')
-    rows = pa.Table.from_pylist(found.rows.get(file.of.folder, []), schema=arrow_schema(file.of))
-    rows = rows.set_column(rows.column_names.index(ROBOT), ROBOT, pc.fill_null(rows[ROBOT], file.robot))
-    dates = pc.fill_null(rows[table.dated].cast(pa.date32()).cast(pa.string()), UNDATED)
-    return RowsOfFile(file, rows.add_column(0, DATE, dates).cast(table.schema), rejected, '; '.join(reasons) or None)
+        reasons.append(f'columns that this version does not know are ignored in {found.extended:,} of its rows')
+    return RowsOfFile(file, rows, rejected, '; '.join(reasons) or None)

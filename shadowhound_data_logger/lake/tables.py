@@ -307,22 +307,23 @@ def answer(opened: QueryBuilder, sql: str) -> pa.Table:
 
 
 def missing(opened: DeltaTable, table: Table, rows: pa.Table) -> pa.Table:
-    """Of these rows each once that the table does not have at the opened version."""
+    """The first of each of these rows that the table does not have at the opened version."""
     if not len(rows):
         return rows
-    same = ' AND '.join(f'(t."{name}" IS NOT DISTINCT FROM f."{name}")' for name in (*table.partitions, *table.identity))
-    where = [among(f't."{name}"', rows[name].unique().to_pylist()) for name in table.partitions]
+    names = [*table.partitions, *table.identity]
+    where = [among(f'"{name}"', rows[name].unique().to_pylist()) for name in table.partitions]
     first, last = (pc.min_max(rows[table.time])[end].as_py() for end in ('min', 'max'))
     if first is not None and not rows[table.time].null_count and isinstance(first, int):
-        where.append(f't."{table.time}" BETWEEN {first} AND {last}')
-    identity = ', '.join(f'f."{name}"' for name in (*table.partitions, *table.identity))
-    columns = ', '.join(f'"{name}"' for name in table.schema.names)
-    known = f'SELECT 1 FROM known t WHERE {" AND ".join([*where, same])}'  # noqa: S608 - identifiers and quoted literals
-    ranked = f'row_number() OVER (PARTITION BY {identity} ORDER BY f."{table.time}") AS _copy'
-    new = f'SELECT f.*, {ranked} FROM fresh f WHERE NOT EXISTS ({known})'  # noqa: S608
-    sql = f'SELECT {columns} FROM ({new}) WHERE _copy = 1'  # noqa: S608
-    with engine({'fresh': rows, 'known': opened}) as ready:
-        return answer(ready, sql).cast(table.schema)
+        where.append(f'"{table.time}" BETWEEN {first} AND {last}')
+    columns = ', '.join(map(quoted, names))
+    with engine({'known': opened}) as ready:
+        known = answer(ready, f'SELECT {columns} FROM known WHERE {" AND ".join(where)}')  # noqa: S608 - names and quoted literals
+    new = rows.select(names)
+    # A group, unlike a join, has nulls that are equal: known rows come first, so that the groups they are in begin below zero.
+    every = pa.concat_tables([known.cast(new.schema), new])
+    every = every.append_column('_row', pa.array(range(-len(known), len(new)), pa.int64()))
+    places = every.group_by(names).aggregate([('_row', 'min')])['_row_min']
+    return rows.take(places.filter(pc.greater_equal(places, 0)).combine_chunks().sort())
 
 
 def among(column: str, values: Iterable[Any]) -> str:

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from lake.gap_parts import lost, tell
 from lake.making import NOON_NS, add, add_part, fill, folder_store, keys, row
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import ingest as library
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -76,6 +78,16 @@ def test_a_row_in_two_files_is_added_once(tmp_path: Path, tables: Tables) -> Non
     later = ingest(bucket(tmp_path), tables, Findings())
     assert (done.rows, done.repeated, later.rows, later.repeated) == (4, 2, 0, 4)
     assert table_keys(tables) == keys(rows)
+
+
+def test_a_row_without_a_time_is_added_once(tmp_path: Path, tables: Tables) -> None:
+    """Two rows that both lack a part of their identity are the same row."""
+    untimed = {**lost('1', 1, 2), 'from_ns': None, 'to_ns': None, 't_from': None, 't_to': None}
+    for name in 'ab':
+        tell(folder_store(tmp_path), tmp_path, untimed, untimed, lost('2', 3, 4), name=name)
+        ingest(bucket(tmp_path), tables, Findings())
+    with engine({'gaps': tables.open(TABLES[GAPS.folder])}) as ready:
+        assert sorted(answer(ready, 'SELECT id FROM gaps')['id'].to_pylist()) == ['j/1', 'j/2']
 
 
 def test_a_row_is_dated_by_its_own_time(tmp_path: Path, tables: Tables) -> None:

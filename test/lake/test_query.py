@@ -133,7 +133,7 @@ def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: s
     """Anybody may have written it: the mission has no end then, and the others are told."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
-    untyped = {**row('camera', NOON_NS), 'mission_id': 'odd', 'run_id': 'run-odd', 'mission_type': None}
+    untyped = {**row('camera', NOON_NS + 10**9), 'mission_id': 'odd', 'run_id': 'run-odd', 'mission_type': None}
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/missions/run-odd/summary.json', told.encode())
         add_part(store, [untyped], 'odd', tmp_path / 'tmp')

@@ -95,11 +95,13 @@ class RowsRead:
     @property
     def findings(self) -> str:
         """What is missing and why, in a sentence; empty for a valid file."""
-        told = [
-            f'{each.lines:,} {"row is" if each.lines == 1 else "rows are"} rejected: {each.why} (first in line {each.first:,})'
-            for each in self.rejected
-        ]
-        return '; '.join([*told, *([f'the rest of it is not read: {self.ended}'] if self.ended else [])])
+        found = [f'{rows_are(each.lines)} rejected: {each.why} (first in line {each.first:,})' for each in self.rejected]
+        return '; '.join([*found, *([f'the rest of it is not read: {self.ended}'] if self.ended else [])])
+
+
+def rows_are(count: int) -> str:
+    """``1 row is``, ``2 rows are``."""
+    return '1 row is' if count == 1 else f'{count:,} rows are'
 
 
 def encode(rows: Sequence[Row], of: TableSchema = OBJECTS) -> bytes:
