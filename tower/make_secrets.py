@@ -64,8 +64,13 @@ def actions(user: str) -> list[str]:
     if user == 'mlflow':
         return [f'{action}:mlflow' for action in ('Read', 'Write', 'List', 'Tagging')]
     if user == 'prune':
-        return [f'{action}:{bucket}' for bucket in ('sensor-data', 'trajectories', 'lerobot') for action in ('Read', 'List')] + [
-            f'Write:{bucket}' for bucket in ROBOT_BUCKETS
+        return [
+            *(
+                f'{action}:{bucket}'
+                for bucket in ('sensor-data', 'trajectories', 'lerobot', 'lake')
+                for action in ('Read', 'List')
+            ),
+            *(f'Write:{bucket}' for bucket in (*ROBOT_BUCKETS, 'lake')),
         ]
     if user == 'spark':
         return [

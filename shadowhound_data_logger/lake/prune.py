@@ -1,11 +1,11 @@
-"""``lake prune``: deletes objects that rules name, and leaves a row of each that says so.
+"""``lake prune``: deletes objects that rules name, and keeps a row about each (``formats/rows/schema.py``, ``FORGOTTEN``).
 
-In this order: a part with the rows of what goes (``formats/rows/schema.py``, ``FORGOTTEN``), statements of the gap journal, the
-objects, and a mark beside the part that says that they are deleted. So a run may be killed at any moment, and two may run at
-once: a row may say for a while that an object is gone that is still there, which the next run mends, but never the reverse.
+In this order: a row file with those rows, statements of the gap journal, the commit of the rows to shared tables, the deletion
+of the objects, and a mark next to the row file that says that they are deleted. So a run can be killed at any moment, and two can
+run at a time: an object can be listed as deleted while it still exists, until the next run deletes it, but never the reverse.
 
-What a rule does not name stays, and so does what a data set, a label or an open request of a robot's mailbox refers to. A bag,
-and what a mission stored, goes as a whole or not at all.
+What no rule names is kept, and so is what a dataset, a label or an open request of a robot's mailbox refers to. A bag, and what
+a mission stored, is deleted completely or not at all.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import HOUR_NS, OBJECTS
+from shadowhound_data_logger.lake.ingest import ingest, pending
 from shadowhound_data_logger.lake.row_files import RowFile, Scope, read, robots, row_files
-from shadowhound_data_logger.lake.tables import answer, literal, quoted
+from shadowhound_data_logger.lake.tables import INGESTED, Tables, answer, literal, quoted
 from shadowhound_data_logger.lake.views import views
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -488,12 +489,15 @@ def _digest(rows: Iterable[Row]) -> str:
 
 def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
     """Delete what has a row and is not marked as deleted yet; how many objects that were."""
-    files, pending = _begun(source, robot, findings)
-    for date in sorted({file.date for file in pending}):
+    files, unmarked = _begun(source, robot, findings)
+    for date in sorted({file.date for file in unmarked}):
         _state(store, robot, source, [file for file in files if file.date == date], findings)
+    tables = Tables.of(source)
+    if tables.is_shared and unmarked:  # no reader of the tables alone may expect an object that is deleted
+        ingest(source, tables, findings, pending(tables.open(INGESTED), unmarked))
     done = 0
     with ThreadPoolExecutor(THREADS, 'prune') as pool:
-        for file in pending:
+        for file in unmarked:
             keys: set[tuple[str, str]] = set()
             for found in read(source, [] if f'{REPEATS}_' in file.entry.key.rpartition('/')[2] else [file], findings):
                 keys.update((row['bucket'], row['key']) for row in found.rows)

@@ -51,6 +51,11 @@ VERSIONS_AT_A_TIME: Final = 50
 """Of a table's changes that are read together."""
 GROUP_ROWS: Final = 16_384
 """Of a row group: statistics can rule out whole groups."""
+_KEPT: Final = {
+    'delta.enableChangeDataFeed': 'true', 'delta.deletedFileRetentionDuration': 'interval 30 days',
+    'delta.logRetentionDuration': 'interval 30 days',
+}  # fmt: skip
+"""For so long a table can be read as of a time in the past; vacuum deletes no file that a newer version needs."""
 _KINDS: Final = {
     STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC'),
 }  # fmt: skip
@@ -195,7 +200,7 @@ class Tables:
                         Path(self._uri(table)).mkdir(parents=True, exist_ok=True)
                     DeltaTable.create(
                         self._uri(table), table.schema, mode='ignore', partition_by=list(table.partitions),
-                        storage_options=self._options(), configuration={'delta.enableChangeDataFeed': 'true'},
+                        storage_options=self._options(), configuration=_KEPT,
                     )  # fmt: skip
 
     def open(self, table: Table, as_of: datetime | int | None = None) -> DeltaTable:

@@ -7,10 +7,12 @@ from collections.abc import Iterator
 from contextlib import closing
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 import boto3
 import pytest
-from lake.making import NOON_NS, add_part, fill, keys, row
+from deltalake.exceptions import DeltaError
+from lake.making import DAY_NS, NOON_NS, add_part, fill, folder_store, keys, merge, row
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import lake
@@ -18,11 +20,13 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.lake import prune
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import ingest, tend
-from shadowhound_data_logger.lake.tables import Tables
+from shadowhound_data_logger.lake.tables import OBJECT_ROWS, TABLES, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.base import ObjectStore
 
 pytestmark = pytest.mark.seaweedfs
 
@@ -92,3 +96,45 @@ def test_a_query_as_of_a_time_sees_what_the_tables_had_then(server: Tower, tmp_p
     assert found(owner, as_of=then) == keys(rows)
     assert found(owner) == keys([*rows, *more])
     assert lake.sql('SELECT count(*) AS n FROM objects', owner, as_of=then).to_pylist() == [{'n': len(rows)}]
+
+
+def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower, tmp_path: Path) -> None:
+    """A reader of the tables alone, such as DuckDB, expects no object that is gone; row files about deleted objects are kept."""
+    rows = fill(server.store_settings(), tmp_path / 'tmp', days=(0,), hours=(11,))
+    with_bucket(server)
+    owner = of(server, 'tower')
+    tables = Tables.for_ingest(owner)
+    ingest(owner, tables, Findings())
+    named: list[set[str]] = []
+
+    class Watching:
+        def __init__(self, inner: ObjectStore) -> None:
+            self.put = inner.put
+
+        def delete(self, _: str, key: str) -> None:
+            with engine({'forgotten': tables.open(TABLES['_forgotten'])}) as ready:
+                named.append({key, *answer(ready, 'SELECT key FROM forgotten')['key'].to_pylist()})
+
+    rules = prune.keep_rules('camera 1d', NOON_NS + 9 * DAY_NS)
+    made = prune.plan(owner, rules, exported={}, findings=Findings())
+    with closing(open_store(server.store_settings(), UploadSettings())) as store:
+        watching: Any = Watching(store)
+        prune.apply(owner, watching, made, now_ns=NOON_NS + 9 * DAY_NS, findings=Findings())
+    cameras = {row['key'] for row in rows if row['sensor'] == 'camera'}
+    assert named == [cameras] * len(cameras)
+    tend(owner, tables, Findings(), now=datetime.now(timezone.utc) + timedelta(hours=2))
+    assert len(owner.list('_forgotten/thor/')) == 2
+    assert found(owner) == sorted({row['key'] for row in rows} - cameras)
+
+
+def test_vacuum_keeps_what_a_query_as_of_a_time_within_the_last_month_needs(tmp_path: Path) -> None:
+    """Files that were merged are not deleted before."""
+    source = Bucket(folder_store(tmp_path), schema.BUCKET)
+    fill(source.settings, tmp_path / 'tmp', days=(0,))
+    lake.objects(source)
+    merge(source.settings)
+    opened = Tables.of(source).open(OBJECT_ROWS)
+    with pytest.raises(DeltaError, match='720 hours'):
+        opened.vacuum(retention_hours=29 * 24)
+    first = Tables.of(source).open(OBJECT_ROWS, 1)
+    assert len(first.to_pyarrow_table()) > 0
