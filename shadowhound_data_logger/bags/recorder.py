@@ -288,8 +288,8 @@ class Recorder:
                 self._writing.write(item)
             elif not item.paused:
                 messages = item.messages
-                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].source_ns,
-                                                messages[-1].source_ns)  # fmt: skip
+                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].times,
+                                                messages[-1].times)  # fmt: skip
             self._sync()
         self._sync()
 

@@ -23,8 +23,10 @@ from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.state import ENDED, RECORD, BagState
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.model import RecordingRows
 from shadowhound_data_logger.core.options import BagSettings
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.recovery import recover
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
@@ -104,8 +106,9 @@ class Recording:
             if is_first:
                 self._began_s = self._monotonic()
                 self._repeat(writer, lot.messages[0].received_ns)
-            for cdr, source_ns, _, number, received_ns, *_ in lot.messages:
-                writer.write(channel, received_ns, source_ns, next(places) if number is None else number, cdr)
+            for cdr, source_ns, _, number, received_ns, stamp_ns, *_ in lot.messages:
+                publish_ns = stamp_ns if stamp_ns >= EARLIEST_SANE_NS else source_ns
+                writer.write(channel, received_ns, publish_ns, next(places) if number is None else number, cdr)
         except OSError as error:
             self._break(error)
         else:
@@ -117,8 +120,8 @@ class Recording:
         log_ns, size = max(0, first_ns - REPEAT_LEAD_NS), writer.size
         for lot in self._latched:
             channel = self._channel(lot, repeated=True)
-            for cdr, source_ns, _, number, *_ in lot.messages:
-                writer.write(channel, log_ns, source_ns, number or 0, cdr)
+            for cdr, source_ns, _, number, _, stamp_ns, *_ in lot.messages:
+                writer.write(channel, log_ns, stamp_ns if stamp_ns >= EARLIEST_SANE_NS else source_ns, number or 0, cdr)
         self._repeated_bytes = writer.size - size
 
     def leave_out(self, lost: Mapping[tuple[str, str], int]) -> None:
@@ -312,11 +315,11 @@ class Recording:
     def _drop(self, lot: Lot) -> None:
         reason, messages = self.refused or UNWRITABLE, lot.messages
         self._lost[lot.topic, reason] += len(messages)
-        self._count(lot.topic, reason, len(messages), messages[0].source_ns, messages[-1].source_ns)
+        self._count(lot.topic, reason, len(messages), messages[0].times, messages[-1].times)
 
-    def _count(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
+    def _count(self, topic: str, reason: str, count: int, first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
         self.dropped += count
-        self._place.spool.accounts.drop(f'{self.state.sink}{topic}', reason, count, from_ns, to_ns)
+        self._place.spool.accounts.drop(f'{self.state.sink}{topic}', reason, count, first, last)
 
     def _refuse(self, reason: str, text: str) -> None:
         self._again_s = self._monotonic() + RETRY_S

@@ -31,6 +31,7 @@ from shadowhound_data_logger.bags.state import RECORD, BagState
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, is_name
 from shadowhound_data_logger.core.model import RecordingRows
+from shadowhound_data_logger.core.stamps import Times
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.mcap.index import read_index, read_metadata
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
@@ -273,12 +274,12 @@ def _runs(path: Path) -> dict[str, list[NumberRun]]:
     try:
         source = LocalFile(path)
         for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda channel: not channel.repeated)):
-            number, stamp_ns = message.sequence, message.publish_ns
+            number, times = message.sequence, Times(message.publish_ns, message.log_ns)
             runs = found.setdefault(message.channel.topic, [])
             if runs and number == runs[-1].stop:
-                runs[-1] = runs[-1]._replace(stop=number + 1, to_ns=stamp_ns)
+                runs[-1] = runs[-1]._replace(stop=number + 1, last=times)
             elif len(runs) <= MAX_RANGES:
-                runs.append(NumberRun(number, number + 1, stamp_ns, stamp_ns))
+                runs.append(NumberRun(number, number + 1, times, times))
     except (BagDamaged, OSError):
         return {}  # the spool compares the file with its checksum
     return {

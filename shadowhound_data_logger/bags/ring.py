@@ -173,10 +173,10 @@ class Claims:
                     account.receive_again(each.publisher, each.number)
                 return list(held.lot.messages)
             unknown = account.unknown
-            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number, each.source_ns)]
-            newest_ns = held.lot.messages[-1].source_ns
-            account.appraise(account.unknown - unknown, held.lost, newest_ns)
-            account.gaps.heard_ns = newest_ns
+            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number, each.times)]
+            newest = held.lot.messages[-1].times
+            account.appraise(account.unknown - unknown, held.lost, newest)
+            account.gaps.heard = newest
         return fresh
 
     def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
@@ -184,8 +184,7 @@ class Claims:
         for each in held:
             fresh = self.receive(each)
             if fresh:
-                first_ns, last_ns = fresh[0].source_ns, fresh[-1].source_ns
-                self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh), first_ns, last_ns)
+                self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh), fresh[0].times, fresh[-1].times)
                 self._lost.append(((each.lot.topic, reason), len(fresh)))
 
     def take_lost(self) -> Counter[tuple[str, str]]:

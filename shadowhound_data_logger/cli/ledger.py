@@ -26,7 +26,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.stamps import describe
+from shadowhound_data_logger.core.stamps import SAME_NS, describe
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
@@ -116,20 +116,31 @@ def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None
 
 
 def gaps_page(rows: Sequence[Gap]) -> list[RenderableType]:
-    """A line a gap, the oldest first; what has no time comes first."""
+    """One line per gap, the oldest first, gaps without a time before them.
+
+    ``from`` is a stamp. ``received``, when that message arrived, is shown if it differs from the stamp by more than a second.
+    """
     if not rows:
         return [Text('No gaps are known.')]
-    columns = ['topic', 'sink', 'from', 'for', 'messages', 'gaps', 'what', 'cause', 'mission']
-    shown = [name for name in columns if name != 'mission' or any(gap.mission_id for gap in rows)]
-    table = plain_table('Gaps (UTC)', shown, left=('topic', 'sink', 'from', 'what', 'cause', 'mission'))
+    columns = ['topic', 'sink', 'from', 'for', 'received', 'messages', 'gaps', 'what', 'cause', 'mission']
+    optional = {'mission': any(gap.mission_id for gap in rows), 'received': any(_is_apart(gap) for gap in rows)}
+    shown = [name for name in columns if optional.get(name, True)]
+    table = plain_table('Gaps (UTC)', shown, left=('topic', 'sink', 'from', 'received', 'what', 'cause', 'mission'))
     for gap in rows:
         span = '-' if gap.from_ns is None or gap.to_ns is None else duration((gap.to_ns - gap.from_ns) / SECOND)
         count = number(gap.count) if gap.grade == EXACT else f'~{number(gap.count)}'
         cells = {'topic': gap.topic, 'sink': gap.sink, 'from': shown_time(gap.from_ns), 'for': span, 'messages': count,
+                 'received': shown_time(gap.received_from_ns),
                  'gaps': number(gap.merged), 'what': gap.kind, 'cause': gap.cause, 'mission': gap.mission_id or ''}  # fmt: skip
         table.add_row(*(plain(cells[name]) for name in shown))
     lost = sum(gap.count or 0 for gap in rows)
     return [table, '', Text(f'{lost:,} messages in {len(rows):,} rows; gaps of one kind and cause within a second are one row.')]
+
+
+def _is_apart(gap: Gap) -> bool:
+    """Whether the messages around a gap arrived more than a second before or after their stamps."""
+    pairs = (gap.from_ns, gap.received_from_ns), (gap.to_ns, gap.received_to_ns)
+    return any(stamp_ns and received_ns and abs(received_ns - stamp_ns) > SAME_NS for stamp_ns, received_ns in pairs)
 
 
 def page(found: Mapping[str, Any]) -> list[RenderableType]:

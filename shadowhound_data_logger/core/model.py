@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core.stamps import Times
 
 UPLOAD_WHEN: Final = 'upload.when'
 EVENTS_WHEN: Final = 'events.when'
@@ -33,6 +34,10 @@ class Sample(NamedTuple):
     untrusted_ns: int = 0
     """Its own stamp if it is dated by its arrival instead, as of ``Taken``."""
 
+    @property
+    def times(self) -> Times:
+        return Times(self.stamp_ns, self.received_ns)
+
 
 class Taken(NamedTuple):
     """A serialized message with what the middleware knows of it; None where it does not say."""
@@ -50,6 +55,10 @@ class Taken(NamedTuple):
     """The publisher, if its stamps are trusted and more than a second from their arrival: they follow another clock."""
     untrusted_ns: int = 0
     """Its own stamp if it is dated by its arrival instead; 0 otherwise."""
+
+    @property
+    def times(self) -> Times:
+        return Times(self.stamp_ns, self.received_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +128,12 @@ class DataObject:
     """A part of the table of what is kept: the ids and states of its rows. It is left out where another part has one of them."""
     answers: tuple[str, int, str] | None = None
     """An answer to a request: its id, the answer's number and the state that it tells. It is left out where that was given."""
+
+    @property
+    def last_times(self) -> Times:
+        """Of its last message."""
+        received = self.metadata.get(words.RECEIVED_END_NS, '')
+        return Times(self.t_end_ns, int(received) if received.isdecimal() and len(received) < 20 else 0)
 
     @property
     def is_on_request(self) -> bool:

@@ -42,6 +42,23 @@ SMOOTHING: Final = 32
 _MASK: Final = (1 << RECENT) - 1
 
 
+class Times(NamedTuple):
+    """The two times of a message, ns since 1970; 0 for one that is unknown."""
+
+    stamp_ns: int = 0
+    """The time by which it is dated: its stamp if that is trusted, otherwise its arrival."""
+    received_ns: int = 0
+    """When it arrived at the robot's computer."""
+
+
+NO_TIMES: Final = Times()
+
+
+def by_arrival(received_ns: int) -> Times:
+    """Those of a message that is dated by its arrival."""
+    return Times(received_ns, received_ns)
+
+
 class Dated(NamedTuple):
     """The time of a message."""
 

@@ -238,7 +238,8 @@ class _GapParts:
             self._robot, GAP if gap.count != 0 else WITHDRAWN, name, began_ns + gap.version, sink=gap.sink, topic=gap.topic,
             publisher=gap.publisher, session=gap.session, kind=gap.kind, cause=gap.cause, count=gap.count, merged=gap.merged,
             grade=gap.grade, mission_id=gap.mission_id, clock=clock, from_ns=gap.from_ns if is_dated else gap.from_boot_ns,
-            to_ns=gap.to_ns if is_dated else gap.to_boot_ns,
+            to_ns=gap.to_ns if is_dated else gap.to_boot_ns, received_from_ns=gap.received_from_ns,
+            received_to_ns=gap.received_to_ns,
         )  # fmt: skip
 
     def _made(self, rows: list[Statement], version: int) -> list[DataObject]:

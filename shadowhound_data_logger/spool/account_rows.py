@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from shadowhound_data_logger.core.stamps import StampReport
+from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
 from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
 
 
@@ -21,8 +21,8 @@ class PublisherRow:
     published: int
     received: int
     missed: Mapping[str, int]
-    heard_ns: int = 0
-    """Stamp of the message ``last``; 0 where it is not known."""
+    heard: Times = NO_TIMES
+    """Those of the message ``last``; zeros if they are unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,8 @@ class TopicRow:
     stored: int
     rejected: Mapping[str, int]
     dropped: Mapping[str, int]
-    last_kept_ns: int
+    last_kept: Times
+    """Those of the newest durable sample; zeros if there is none."""
     estimated: int = 0
     """Of ``received``, those without numbers whose losses are estimated."""
     unknown: int = 0
@@ -58,8 +59,8 @@ class TopicRow:
     """Estimated losses by cause; those that numbers tell are in the rows of the publishers."""
     first_ns: int = 0
     """Stamp of a message from which on all are counted, the first by a clock that was set; 0 where it is not known."""
-    heard_ns: int = 0
-    """Stamp of the newest message; 0 where it is not known."""
+    heard: Times = NO_TIMES
+    """Those of the newest message; zeros if they are unknown."""
     complete_ns: int = 0
     """No message up to this stamp can still be lost on its way into the spool."""
     by_arrival: Mapping[str, int] = field(default_factory=dict)

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from shadowhound_data_logger.core.stamps import StampReport
+from shadowhound_data_logger.core.stamps import StampReport, Times
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table
@@ -65,19 +65,19 @@ class AccountTable(Table):
     def write(self, session: int, snapshot: AccountSnapshot) -> None:
         """Replace the session's accounts by a newer snapshot."""
         self._db.executemany(
-            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
+            'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
               _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected),
-              _json(row.stamps._asdict() if row.stamps else {}), row.last_kept_ns,
-              row.first_ns, row.heard_ns, row.complete_ns) for row in snapshot.topics),
+              _json(row.stamps._asdict() if row.stamps else {}), *row.last_kept,
+              row.first_ns, *row.heard, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self._db.executemany(
             'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
         )
         self._db.executemany(
-            'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?)',
+            'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, _json(row.missed),
-              row.heard_ns) for row in snapshot.publishers),
+              *row.heard) for row in snapshot.publishers),
         )  # fmt: skip
         self._db.executemany(
             'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
@@ -101,16 +101,17 @@ class AccountTable(Table):
     def topics(self, session: int | None = None, *, robot: str | None = None) -> list[TopicRow]:
         """Accounts of one session, of those that a robot goes on with, or of all in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else _continued_by(robot)
-        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, rejected, dropped, ifnull(estimated, 0),'
-                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, complete_ns, by_arrival,"
+        columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, last_kept_received_ns, rejected, dropped,'
+                   ' ifnull(estimated, 0),'
+                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, heard_received_ns, complete_ns, by_arrival,"
                    ' corrected, stamps')  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
-            TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), last_ns,
-                     estimated, unknown, json.loads(missed), first_ns, heard_ns, complete_ns,
+            TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), Times(*kept),
+                     estimated, unknown, json.loads(missed), first_ns, Times(heard_ns, heard_received_ns), complete_ns,
                      json.loads(by_arrival), json.loads(corrected), _stamps(stamps))
-            for topic, kind, accounting, received, skipped, stored, last_ns, rejected, dropped, estimated, unknown, missed,
-            first_ns, heard_ns, complete_ns, by_arrival, corrected, stamps in self._db.execute(query, values)
+            for topic, kind, accounting, received, skipped, stored, *kept, rejected, dropped, estimated, unknown, missed,
+            first_ns, heard_ns, heard_received_ns, complete_ns, by_arrival, corrected, stamps in self._db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self, *, robot: str | None = None) -> list[PublisherRow]:
@@ -119,11 +120,11 @@ class AccountTable(Table):
         The last row of a publisher says where its numbers stand.
         """
         where, values = _continued_by(robot)
-        columns = 'topic, publisher, first, last, published, received, missed, heard_ns'
+        columns = 'topic, publisher, first, last, published, received, missed, heard_ns, heard_received_ns'
         rows = self._db.execute(f'SELECT {columns} FROM publishers {where} ORDER BY session', values)  # noqa: S608
         return [
-            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), heard_ns)
-            for topic, publisher, first, last, published, received, missed, heard_ns in rows
+            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), Times(*heard))
+            for topic, publisher, first, last, published, received, missed, *heard in rows
         ]
 
     def other_types(self) -> list[OtherTypeRow]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
-from shadowhound_data_logger.core.stamps import StampReport
+from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
 from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
@@ -95,8 +95,8 @@ class TopicAccount:
     missed_estimated: Counter[str] = field(default_factory=Counter)
     """Beside those that were estimated, by cause."""
     estimate: TopicEstimate = field(default_factory=TopicEstimate)
-    last_kept_ns: int = 0
-    """Stamp of the newest sample that is durable: a restarted node goes on sampling after it."""
+    last_kept: Times = NO_TIMES
+    """Those of the newest sample that is durable: a restarted node continues to sample after it."""
     other_types: dict[str, OtherType] = field(default_factory=dict)
     gone: dict[str, tuple[int, int]] = field(default_factory=dict)
     """First and last number of publishers whose accounts were added up."""
@@ -104,8 +104,8 @@ class TopicAccount:
     """Those among them that the last commit has by name still; with a span without counts where earlier sessions knew it."""
     gaps: TopicGaps = field(default_factory=TopicGaps)
     """When its losses were."""
-    doubted_ns: int = 0
-    """Since when its messages are counted by no rhythm; 0 where they are: one that is found counts back to then."""
+    doubted: Times = NO_TIMES
+    """Since when its messages are counted by no rhythm; zeros where they are: one that is found counts back to then."""
     settled_ns: int = 0
     """No message up to this stamp was open at the last commit: the next one makes what became of them durable."""
     first_ns: int = 0
@@ -134,16 +134,13 @@ class TopicAccount:
             return None
         return self.missed_estimated.total() + sum(span.missed.total() for span in self.publishers.values())
 
-    def receive(self, publisher: str | None, number: int | None, stamp_ns: int = 0) -> bool:
-        """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``.
-
-        ``stamp_ns`` is when it was sent, 0 where that is not known.
-        """
+    def receive(self, publisher: str | None, number: int | None, times: Times = NO_TIMES) -> bool:
+        """Count one taken message; False for a repeat. One without publisher or number is unknown until ``appraise``."""
         if number is not None and number > MAX_NUMBER:
             number = None
         if publisher is not None and number is not None and (self.accounting == EXACT or self._begin_numbers()):
             span = self._span(publisher)
-            if not span.observe(number, stamp_ns):
+            if not span.observe(number, times):
                 return False
             span.used = self.received
         else:
@@ -153,11 +150,11 @@ class TopicAccount:
         self.received += 1
         return True
 
-    def drop(self, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
-        """Count messages that were received and dropped; the stamps as of ``Accounts.drop``."""
+    def drop(self, reason: str, count: int, first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
+        """Count messages that were received and dropped; the times as of ``Accounts.drop``."""
         self.dropped[reason] += count
-        if count and from_ns:
-            self.gaps.add(DROPPED, reason, count, from_ns, to_ns)
+        if count and any(first):
+            self.gaps.add(DROPPED, reason, count, first, last)
 
     def receive_again(self, publisher: str | None, number: int | None) -> None:
         """Count a message that was counted before, and that is wanted once more; arguments as above."""
@@ -171,34 +168,35 @@ class TopicAccount:
         """What is known of the stamps of messages without numbers."""
         self.estimate.expect(expected)
 
-    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: ArrivalContext, newest_ns: int = 0) -> Losses:
+    def observe(self, stamps: Mapping[str, Sequence[int]], hearing: ArrivalContext, newest: Times = NO_TIMES) -> Losses:
         """Estimate what was lost before messages without numbers, just received: publisher ('' where not known) -> stamps.
 
-        ``newest_ns`` is when the last of them was sent, whatever the stamps are; 0 where that is not known.
+        ``newest`` are the times of the last of them, whatever the stamps are.
         """
         found = self.estimate.observe(stamps, hearing)
         self.unknown -= found.covered
         self.estimated += found.covered
-        self._estimate_lost(found.missed, self.doubted_ns or self.gaps.heard_ns, newest_ns)
-        self.doubted_ns = 0 if found.covered >= found.messages else self.doubted_ns or self.gaps.heard_ns or newest_ns
+        before = next((each for each in (self.doubted, self.gaps.heard) if any(each)), newest)
+        self._estimate_lost(found.missed, before, newest)
+        self.doubted = NO_TIMES if found.covered >= found.messages else before
         self.accounting = ESTIMATED if self.estimate.known else RECEIVED_ONLY
         return found.lost
 
-    def _estimate_lost(self, lost: Mapping[str, int], from_ns: int, to_ns: int) -> None:
+    def _estimate_lost(self, lost: Mapping[str, int], before: Times, after: Times) -> None:
         """Count an estimate, or the correction of an earlier one, whose rows are the newest ones of the journal."""
         for cause, change in lost.items():
             self.missed_estimated[cause] += change
-            if change > 0 and from_ns and to_ns:
-                self.gaps.add(MISSED, cause, change, from_ns, to_ns, grade=ESTIMATED)
+            if change > 0 and any(before) and any(after):
+                self.gaps.add(MISSED, cause, change, before, after, grade=ESTIMATED)
 
-    def appraise(self, count: int, lost: Losses, newest_ns: int = 0) -> None:
+    def appraise(self, count: int, lost: Losses, newest: Times = NO_TIMES) -> None:
         """Somebody else estimated what was lost before ``count`` messages without numbers, just received, the last then."""
         if count:
             self.accounting = RECEIVED_ONLY if lost is None else ESTIMATED
             if lost is not None:
                 self.unknown -= count
                 self.estimated += count
-                self._estimate_lost(lost, self.gaps.heard_ns, newest_ns)
+                self._estimate_lost(lost, self.gaps.heard, newest)
                 self.missed_estimated = +self.missed_estimated
 
     def find(self, count: int, runs: Sequence[NumberRun] = ()) -> None:
@@ -249,12 +247,12 @@ class TopicAccount:
             self.accounting, self.is_doubtful, is_new = RECEIVED_ONLY, True, True
         return other.see(nodes, counted=counted) or is_new
 
-    def refuse(self, type_name: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
-        """Messages of another type came, and were thrown away; the stamps as of ``Accounts.drop``."""
+    def refuse(self, type_name: str, count: int, first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
+        """Messages of another type were received and discarded; the times as of ``Accounts.drop``."""
         self.received += count
         self.rejected[WRONG_TYPE] += count
-        if count and from_ns:
-            self.gaps.add(REJECTED, WRONG_TYPE, count, from_ns, to_ns)
+        if count and any(first):
+            self.gaps.add(REJECTED, WRONG_TYPE, count, first, last)
         self._span(WRONG_TYPE).late(count)
         other = self.other_types.get(type_name)
         if other is not None and other.messages is not None:
@@ -265,8 +263,10 @@ class TopicAccount:
         if heard_ns - self.first_ns > LATELY_NS:
             return False
         older = [span for span in self.publishers.values() if span.older]
-        since_ns = self.gaps.before_ns - LATELY_NS
-        return not all(span.inherited for span in older) and any(span.inherited and span.heard_ns > since_ns for span in older)
+        since_ns = self.gaps.before.stamp_ns - LATELY_NS
+        return not all(span.inherited for span in older) and any(
+            span.inherited and span.heard.stamp_ns > since_ns for span in older
+        )
 
     def figures(self) -> Figures:
         """What was lost so far, as the gap journal has it."""
@@ -330,12 +330,12 @@ class Accounts:
     Thread-safe: ``entry`` holds the lock, the other methods take it.
     """
 
-    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, int] | None = None,
+    def __init__(self, inherited: Iterable[PublisherRow] = (), last_kept: Mapping[str, Times] | None = None,
                  rhythms: Iterable[RhythmRow] = (), grades: Mapping[str, str] | None = None,
-                 clock: Clock | None = None, heard: Mapping[str, int] | None = None) -> None:  # fmt: skip
+                 clock: Clock | None = None, heard: Mapping[str, Times] | None = None) -> None:  # fmt: skip
         """``grades`` are those of the newest messages, by account: a gap after others is no loss that these numbers tell.
 
-        ``heard`` are the stamps of the newest messages of earlier sessions, by account.
+        ``heard`` and ``last_kept`` are the times of the newest messages, and of the newest durable ones, of earlier sessions.
         """
         self._lock = threading.Lock()
         self._topics: dict[str, TopicAccount] = {}
@@ -350,7 +350,7 @@ class Accounts:
         self.oldest_open: Callable[[], Mapping[str, int]] = lambda: dict.fromkeys(self._topics, 1)
         """Says of which topics messages have no outcome yet that are not in the writer, and the stamp of the first: set it."""
         self._carried = Counter[str]()
-        self._carried_ns: dict[str, tuple[int, int]] = {}
+        self._carried_times: dict[str, tuple[Times, Times]] = {}
         self._mission = ''
         self._clock = clock
         self._heard = dict(heard or {})
@@ -358,7 +358,7 @@ class Accounts:
         self._last_kept = dict(last_kept or {})
         for row in inherited:
             spans = self._inherited.setdefault(row.topic, {})
-            spans[row.publisher] = Span(row.first, row.last, inherited=True, heard_ns=row.heard_ns, name=row.publisher)
+            spans[row.publisher] = Span(row.first, row.last, inherited=True, heard=row.heard, name=row.publisher)
             if len(spans) >= MAX_PUBLISHERS:
                 del spans[next(iter(spans))]
 
@@ -370,13 +370,13 @@ class Accounts:
         self._dirty = True
         return self._account(topic)
 
-    def reject(self, topic: str, reasons: Mapping[str, int], from_ns: int = 0, to_ns: int = 0) -> None:
-        """Messages were rejected; the stamps as of ``drop``, of those that they came with."""
+    def reject(self, topic: str, reasons: Mapping[str, int], first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
+        """Messages were rejected; the times as of ``drop``, of those that they came with."""
         with self.entry(topic) as account:
             for reason, count in reasons.items():
                 account.rejected[reason] += count
-                if count and from_ns:
-                    account.gaps.add(REJECTED, reason, count, from_ns, to_ns)
+                if count and any(first):
+                    account.gaps.add(REJECTED, reason, count, first, last)
 
     def correct(self, topic: str, reasons: Mapping[str, int]) -> None:
         """Messages are in an object that goes to the spool, but were corrected on the way: reason -> number."""
@@ -392,23 +392,23 @@ class Accounts:
             if self._account(topic).see_other(type_name, nodes, counted=counted, named=named):
                 self._dirty = True
 
-    def refuse(self, topic: str, type_name: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
-        """Messages came that are of another type than the topic's; the stamps as of ``drop``."""
+    def refuse(self, topic: str, type_name: str, count: int, first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
+        """Messages came that are of another type than the topic's; the times as of ``drop``."""
         with self.entry(topic) as account:
-            account.refuse(type_name, count, from_ns, to_ns)
+            account.refuse(type_name, count, first, last)
 
-    def drop(self, topic: str, reason: str, count: int, from_ns: int = 0, to_ns: int = 0) -> None:
-        """Messages were dropped; the stamps are those of the first and the last of them, 0 where they are not known."""
+    def drop(self, topic: str, reason: str, count: int, first: Times = NO_TIMES, last: Times = NO_TIMES) -> None:
+        """Messages were dropped; ``first`` and ``last`` are the times of the first and the last of them."""
         with self.entry(topic) as account:
-            account.drop(reason, count, from_ns, to_ns)
+            account.drop(reason, count, first, last)
 
-    def store(self, stored: Mapping[str, tuple[int, int]]) -> None:
-        """Samples that a group commit made durable: topic -> (count, stamp of the newest)."""
+    def store(self, stored: Mapping[str, tuple[int, Times]]) -> None:
+        """Samples that a group commit made durable: topic -> (count, times of the newest)."""
         with self._lock:
-            for topic, (count, newest_ns) in stored.items():
+            for topic, (count, newest) in stored.items():
                 account = self._account(topic)
                 account.stored += count
-                account.last_kept_ns = max(account.last_kept_ns, newest_ns)
+                account.last_kept = max(account.last_kept, newest)
 
     def carry(self, rows: Iterable[TopicRow]) -> None:
         """Take over what an earlier session left open (the commit that says so is the caller's): it may turn up in files."""
@@ -420,7 +420,7 @@ class Accounts:
                 account.estimated += row.estimated
                 account.unknown += row.unknown
                 self._carried[row.topic] += row.received
-                self._carried_ns[row.topic] = row.last_kept_ns or row.heard_ns, row.heard_ns
+                self._carried_times[row.topic] = row.last_kept if any(row.last_kept) else row.heard, row.heard
 
     def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[NumberRun]]) -> None:
         """Messages of an earlier session turned up in a file that is about to be spooled; ``runs`` as in ``TopicAccount``."""
@@ -437,7 +437,7 @@ class Accounts:
         with self._lock:
             carried, self._carried = +self._carried, Counter()
             for topic, count in carried.items():
-                self._account(topic).drop(reason, count, *self._carried_ns[topic])
+                self._account(topic).drop(reason, count, *self._carried_times[topic])
                 self._dirty = True
             return carried.total()
 
@@ -451,8 +451,8 @@ class Accounts:
             for topic, account in self._topics.items():
                 if account.open > 0 and not topic.startswith(SINKS):
                     lost += account.open
-                    since_ns = account.complete_ns or account.last_kept_ns or account.gaps.heard_ns
-                    account.drop(reason, account.open, since_ns, account.gaps.heard_ns)
+                    since = account.last_kept if any(account.last_kept) else account.gaps.heard
+                    account.drop(reason, account.open, since, account.gaps.heard)
                     self._dirty = True
             return lost
 
@@ -460,7 +460,7 @@ class Accounts:
         """Stamp of the topic's newest durable sample of any session, 0 for none."""
         with self._lock:
             account = self._topics.get(topic)
-            return max(account.last_kept_ns if account else 0, self._last_kept.get(topic, 0))
+            return max(account.last_kept if account else NO_TIMES, self._last_kept.get(topic, NO_TIMES)).stamp_ns
 
     def set_mission(self, mission_id: str) -> None:
         """What is lost from now on is lost in this mission; '' for none."""
@@ -499,7 +499,7 @@ class Accounts:
                 if (topic.startswith(sink) if sink else not topic.startswith(SINKS))
             }
 
-    def snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
+    def snapshot(self, stored: Mapping[str, tuple[int, Times]]) -> AccountSnapshot | None:
         """The state as it will be once ``stored`` is durable; None when nothing changed since the last one."""
         taken = self._snapshot(stored)
         if taken is not None:
@@ -507,10 +507,11 @@ class Accounts:
             with self._lock:
                 for row in taken.topics:
                     account = self._topics[row.topic]
-                    account.settled_ns = min(row.heard_ns, oldest.get(row.topic, row.heard_ns + 1) - 1)
+                    heard_ns = row.heard.stamp_ns
+                    account.settled_ns = min(heard_ns, oldest.get(row.topic, heard_ns + 1) - 1)
         return taken
 
-    def _snapshot(self, stored: Mapping[str, tuple[int, int]]) -> AccountSnapshot | None:
+    def _snapshot(self, stored: Mapping[str, tuple[int, Times]]) -> AccountSnapshot | None:
         with self._lock:
             self._unwritten = []
             if not self._dirty and not stored:
@@ -538,11 +539,12 @@ class Accounts:
             latest_ns = latest(self._clock)
             return AccountSnapshot(
                 tuple(
-                    self._row(topic, account, *stored.get(topic, (0, 0)), latest_ns) for topic, account in self._topics.items()
+                    self._row(topic, account, *stored.get(topic, (0, NO_TIMES)), latest_ns)
+                    for topic, account in self._topics.items()
                 ),
                 tuple(
                     PublisherRow(
-                        topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed), span.heard_ns
+                        topic, publisher, span.first, span.last, span.published, span.received, dict(+span.missed), span.heard
                     )
                     for topic, publisher, span in spans
                 ),
@@ -593,15 +595,16 @@ class Accounts:
             account = self._topics[topic] = TopicAccount(
                 publishers=self._inherited.pop(topic, {}), before=self._grades.get(topic, ''),
                 estimate=TopicEstimate(before=self._rhythms.pop(topic, None)),
-                gaps=TopicGaps(self._mission, self._clock, self._heard.get(topic, 0)),
+                gaps=TopicGaps(self._mission, self._clock, self._heard.get(topic, NO_TIMES)),
             )  # fmt: skip
             for span in account.publishers.values():
                 span.gaps = account.gaps
         return account
 
     @staticmethod
-    def _row(topic: str, account: TopicAccount, count: int, newest_ns: int, latest_ns: int) -> TopicRow:
-        heard_ns = min(account.gaps.heard_ns, latest_ns)
+    def _row(topic: str, account: TopicAccount, count: int, newest: Times, latest_ns: int) -> TopicRow:
+        heard = account.gaps.heard
+        heard_ns = min(heard.stamp_ns, latest_ns)
         if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_received:
             account.first_ns = heard_ns
         if account.accounting not in {'', RECEIVED_ONLY} and not account.is_awaiting(heard_ns):
@@ -609,13 +612,14 @@ class Accounts:
             if account.open <= count:
                 settled_ns = heard_ns
             elif topic.startswith(SINKS):  # written in the order of arrival
-                settled_ns = newest_ns - MAX_AGE_NS
+                settled_ns = newest.stamp_ns - MAX_AGE_NS
             account.complete_ns = min(max(account.complete_ns, settled_ns), latest_ns)
         return TopicRow(
             topic, account.type, account.accounting, account.received, account.skipped, account.stored + count,
-            dict(account.rejected), dict(account.dropped), max(account.last_kept_ns, newest_ns),
-            account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns, heard_ns,
-            account.complete_ns, dict(account.by_arrival), dict(account.corrected), account.stamps,
+            dict(account.rejected), dict(account.dropped), max(account.last_kept, newest),
+            account.estimated, account.unknown, dict(+account.missed_estimated), account.first_ns,
+            heard._replace(stamp_ns=heard_ns), account.complete_ns, dict(account.by_arrival),
+            dict(account.corrected), account.stamps,
         )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import check_key, check_name
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
+from shadowhound_data_logger.core.stamps import NO_TIMES
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.files import Tree, description_of
@@ -197,6 +198,6 @@ def _counts(said: dict[str, Any]) -> dict[str, int]:
 
 def _more(row: TopicRow | None, topic: str, samples: int, item: DataObject) -> TopicRow:
     """The account with the samples of one more file."""
-    count, newest_ns = (row.stored, row.last_kept_ns) if row else (0, 0)
+    count, newest = (row.stored, row.last_kept) if row else (0, NO_TIMES)
     count += samples
-    return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest_ns, item.t_end_ns), unknown=count)
+    return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest, item.last_times), unknown=count)

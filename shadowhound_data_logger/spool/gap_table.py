@@ -24,7 +24,10 @@ NEXT_VERSION: Final = '(SELECT ifnull(max(version), 0) + 1 FROM gaps)'
 MERGE: Final = """
   ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
     from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-    to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END"""
+    to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
+    received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
+      ELSE excluded.received_from_ns END,
+    received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END"""
 """What an INSERT does if the row exists; the triggers of schema.sql do the same."""
 MOST_ROWS: Final = 500_000
 """Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
@@ -66,8 +69,8 @@ class GapTable(Table):
                     less.append(TakenBack(row.topic, *key[:3], -row.messages))
                 continue
             self._db.execute(
-                f'INSERT INTO gaps VALUES (?,?,?,?,?,?,?,?,?,?,?,?,{NEXT_VERSION}) {MERGE}',  # noqa: S608 - own constants only
-                (session, row.topic, *key, row.from_ns, row.to_ns, row.messages, row.merged),
+                f'INSERT INTO gaps VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,{NEXT_VERSION}) {MERGE}',  # noqa: S608 - own constants only
+                (session, row.topic, *key, *row[2:]),
             )
         for each in (*less, *taken_back):
             self._take_back(session, each)
@@ -118,7 +121,7 @@ class GapTable(Table):
             ends[row[:5]] = max(end_ns, last_ns) if is_known else None
             told[row[:5]] = min(told.get(row[:5], _SUM_OF_TOLD), _SUM_OF_TOLD if row[11] else _SUM_OF_UNTOLD)
         self._db.executemany(
-            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},?,?,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
+            f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},?,?,NULL,NULL,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
             ((*what, told[what], ends[what], count, merged[what]) for what, count in sums.items()),
         )
         self._db.executemany(
@@ -257,11 +260,11 @@ class GapTable(Table):
         return {(*what,): count for *what, count in self._db.execute(query)}
 
     def _gaps(self, where: str, values: tuple[object, ...], offsets: Mapping[str, int]) -> Iterator[Gap]:
-        columns = ('session, topic, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,'
-                   ' robot, boot_id, started_ns')  # fmt: skip
+        columns = ('session, topic, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns,'
+                   ' received_from_ns, received_to_ns, count, merged, version, robot, boot_id, started_ns')  # fmt: skip
         query = f'SELECT {columns} FROM gaps LEFT JOIN sessions ON sessions.id = session WHERE {where}'  # noqa: S608 - own conditions
-        for (session, account, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, count, merged, version,
-             robot, boot_id, started_ns) in self._db.execute(query, values):  # fmt: skip
+        for (session, account, kind, cause, grade, publisher, mission, begin_ns, from_ns, to_ns, received_from_ns,
+             received_to_ns, count, merged, version, robot, boot_id, started_ns) in self._db.execute(query, values):  # fmt: skip
             sink, topic = split(account)
             if begin_ns == FORGOTTEN:
                 from_ns = to_ns = None  # noqa: PLW2901 - a sum has no time
@@ -269,8 +272,8 @@ class GapTable(Table):
             offset_ns = offsets.get(boot_id) if is_boot else 0
             yield Gap(
                 sink, topic, publisher or None, session or None, kind, cause, _plus(from_ns, offset_ns), _plus(to_ns, offset_ns),
-                count, merged, grade, mission or None, robot, boot_id if is_boot else None, from_ns if is_boot else None,
-                to_ns if is_boot else None, started_ns, begin_ns, version,
+                received_from_ns, received_to_ns, count, merged, grade, mission or None, robot, boot_id if is_boot else None,
+                from_ns if is_boot else None, to_ns if is_boot else None, started_ns, begin_ns, version,
             )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, FUTURE_SLACK_NS, SECOND, Clock
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 
 MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped', 'evicted', 'quarantined'
 """Kinds."""
@@ -51,6 +52,10 @@ class Gap:
     """UTC stamp of the last message before; of an object, of its first. None where no clock knows it."""
     to_ns: int | None
     """UTC stamp of the first message after; of an object, of its last."""
+    received_from_ns: int | None
+    """When the message of ``from_ns`` arrived. None if that is unknown."""
+    received_to_ns: int | None
+    """When the message of ``to_ns`` arrived."""
     count: int | None
     """Messages; 0 for a row that was true once, and is not any more. None where it is not known."""
     merged: int
@@ -74,7 +79,7 @@ class Gap:
         return {name: getattr(self, name) for name in _PRINTED}
 
 
-_PRINTED: Final = tuple(each.name for each in fields(Gap))[:12]
+_PRINTED: Final = tuple(each.name for each in fields(Gap))[:14]
 
 
 class Watermark(NamedTuple):
@@ -106,13 +111,15 @@ class GapKey(NamedTuple):
 
 
 class GapRow(NamedTuple):
-    """A change of a row: times that it comprises, and how many messages and gaps more."""
+    """A change of a row: the times that it covers, and how many messages and gaps are added to it."""
 
     topic: str
     """The account: with the prefix of its sink."""
     key: GapKey
     from_ns: int | None
     to_ns: int | None
+    received_from_ns: int | None
+    received_to_ns: int | None
     messages: int
     merged: int
 
@@ -139,39 +146,39 @@ class TopicGaps:
     """The one that is active now."""
     clock: Clock | None = None
     """Of this machine: of stamps from before it was set."""
-    heard_ns: int = 0
-    """Stamp of the newest message, first of an earlier session; 0 before the first."""
-    before_ns: int = field(init=False)
-    """The same of the earlier session; 0 where there is none."""
+    heard: Times = NO_TIMES
+    """Those of the newest message, first of an earlier session; zeros before the first."""
+    before: Times = field(init=False)
+    """The same of the earlier session; zeros if there is none."""
     count: int = 0
     """Gaps so far, of whatever kind."""
     _changes: dict[GapKey, GapRow] = field(default_factory=dict)
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
-    _since_ns: int = 0
-    """``heard_ns`` at the last commit."""
+    _since: Times = NO_TIMES
+    """``heard`` at the last commit."""
     _recent: dict[GapKey, None] = field(default_factory=dict)
     """Rows that are not new: the last ones that something was added to."""
     _hour: int = 0
     _new_rows: int = 0
     """In this hour since boot."""
-    _before: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], int] | None = None
+    _before_commit: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], Times] | None = None
 
     def __post_init__(self) -> None:
-        self.before_ns = self.heard_ns
+        self.before = self.heard
 
     @property
     def has_received(self) -> bool:
         """Whether a message came in this session."""
-        return self.heard_ns != self.before_ns
+        return self.heard != self.before
 
-    def add(self, kind: str, cause: str, messages: int, from_ns: int, to_ns: int, publisher: str = '',
+    def add(self, kind: str, cause: str, messages: int, before: Times, after: Times, publisher: str = '',
             grade: str = EXACT) -> GapKey:  # fmt: skip
-        """Messages were lost between these stamps, 0 where they are not known. Returns the row's key.
+        """Messages were lost between these two, or are these two and all between them. Returns the row's key.
 
         Stamps of a wall clock that was never set become those of the boot clock, as in ``stamps.StampRule``. What is not a time,
         or more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts.
         """
-        from_ns, to_ns = self._time(from_ns), self._time(to_ns)
+        from_ns, to_ns = self._time(before.stamp_ns), self._time(after.stamp_ns)
         if (from_ns < EARLIEST_SANE_NS) != (to_ns < EARLIEST_SANE_NS):
             from_ns = to_ns = max(from_ns, to_ns)
         from_ns, to_ns = from_ns or to_ns, to_ns or from_ns
@@ -180,15 +187,16 @@ class TopicGaps:
         else:
             start_ns, end_ns = min(from_ns, to_ns), max(from_ns, to_ns)
             begin_ns = start_ns // SECOND * SECOND if end_ns - start_ns < SECOND else start_ns
+        received = [each.received_ns for each in (before, after) if each.received_ns >= EARLIEST_SANE_NS]
         key = self._bounded(GapKey(kind, cause, grade, publisher, self.mission, begin_ns))
         self.count += 1
-        self._change(GapRow('', key, start_ns, end_ns, messages, 1))
+        self._change(GapRow('', key, start_ns, end_ns, min(received, default=None), max(received, default=None), messages, 1))
         return key
 
     def fill(self, key: GapKey, messages: int, merged: int) -> None:
         """Messages of a gap came after all; ``merged`` is the change of how many gaps there are."""
         self.count += merged
-        self._change(GapRow('', key, None, None, -messages, merged))
+        self._change(GapRow('', key, None, None, None, None, -messages, merged))
 
     def settle(self, topic: str, figures: Figures) -> tuple[list[GapRow], list[TakenBack]]:
         """What a commit with these figures has to change in the journal; ``undo`` if it fails."""
@@ -200,21 +208,21 @@ class TopicGaps:
             rest = figures.get(what, 0) - self._journaled.get(what, 0) - added[what]
             kind, cause, grade = what
             if rest > 0:
-                self.add(kind, cause, rest, self._since_ns or self.heard_ns, self.heard_ns, grade=grade)
+                self.add(kind, cause, rest, self._since if any(self._since) else self.heard, self.heard, grade=grade)
             elif rest < 0:
                 taken_back.append(TakenBack(topic, kind, cause, grade, -rest))
-        self._before = self._changes, self._journaled, self._since_ns
+        self._before_commit = self._changes, self._journaled, self._since
         changes, self._changes = self._changes, {}
-        self._journaled, self._since_ns = {what: count for what, count in figures.items() if count}, self.heard_ns
+        self._journaled, self._since = {what: count for what, count in figures.items() if count}, self.heard
         return [row._replace(topic=topic) for row in changes.values() if row.messages or row.merged], taken_back
 
     def undo(self) -> None:
         """The commit did not become durable."""
-        if self._before is None:
+        if self._before_commit is None:
             return
         newer = self._changes
-        self._changes, self._journaled, self._since_ns = self._before
-        self._before = None
+        self._changes, self._journaled, self._since = self._before_commit
+        self._before_commit = None
         for row in newer.values():
             self._change(row)
 
@@ -249,11 +257,20 @@ class TopicGaps:
     def _change(self, row: GapRow) -> None:
         known = self._changes.get(row.key)
         if known is not None:
-            starts = [stamp for stamp in (known.from_ns, row.from_ns) if stamp is not None]
-            ends = [stamp for stamp in (known.to_ns, row.to_ns) if stamp is not None]
-            row = GapRow('', known.key, min(starts, default=None), max(ends, default=None), known.messages + row.messages,
-                         known.merged + row.merged)  # fmt: skip
+            row = GapRow(
+                '', known.key, _first(known.from_ns, row.from_ns), _last(known.to_ns, row.to_ns),
+                _first(known.received_from_ns, row.received_from_ns), _last(known.received_to_ns, row.received_to_ns),
+                known.messages + row.messages, known.merged + row.merged,
+            )  # fmt: skip
         self._changes[row.key] = row
+
+
+def _first(*times_ns: int | None) -> int | None:
+    return min((each for each in times_ns if each is not None), default=None)
+
+
+def _last(*times_ns: int | None) -> int | None:
+    return max((each for each in times_ns if each is not None), default=None)
 
 
 def latest(clock: Clock | None) -> int:

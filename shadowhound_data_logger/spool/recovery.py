@@ -253,7 +253,7 @@ def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -
         report.counts['messages lost with an open batch'] += row.open
         if row.open > 0:
             gaps = TopicGaps()
-            gaps.add(DROPPED, 'restart', row.open, row.last_kept_ns or row.heard_ns, row.heard_ns)
+            gaps.add(DROPPED, 'restart', row.open, row.last_kept if any(row.last_kept) else row.heard, row.heard)
             lost += gaps.settle(row.topic, {(DROPPED, 'restart', EXACT): row.open})[0]
     with index.transaction():
         index.accounts.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))

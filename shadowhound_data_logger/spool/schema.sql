@@ -186,9 +186,11 @@ CREATE TABLE accounts (
   by_arrival TEXT NOT NULL,     -- JSON: messages dated by their arrival, by the reason why their own time was not trusted
   corrected TEXT NOT NULL,      -- JSON: messages stored by the only reading that their data allow, by what was wrong with them
   stamps TEXT NOT NULL,         -- JSON: what was unusual about its publishers' stamps (core/stamps.py, StampReport); '{}' if nothing
-  last_kept_ns INTEGER NOT NULL,
+  last_kept_ns INTEGER NOT NULL,          -- of the newest durable sample: its stamp ...
+  last_kept_received_ns INTEGER NOT NULL, -- ... and when it arrived
   first_ns INTEGER NOT NULL,
-  heard_ns INTEGER NOT NULL,
+  heard_ns INTEGER NOT NULL,              -- of the newest message: the same two
+  heard_received_ns INTEGER NOT NULL,
   complete_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic)) WITHOUT ROWID;
 CREATE TABLE publishers (
@@ -200,7 +202,8 @@ CREATE TABLE publishers (
   published INTEGER NOT NULL,
   received INTEGER NOT NULL,
   missed TEXT NOT NULL,         -- JSON: messages by cause
-  heard_ns INTEGER NOT NULL,
+  heard_ns INTEGER NOT NULL,    -- of the message with the number last
+  heard_received_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
 -- Types that a topic was published under and that were not logged; messages is NULL if they were not counted.
 CREATE TABLE other_types (
@@ -235,8 +238,10 @@ CREATE TABLE gaps (
   publisher TEXT NOT NULL,
   mission TEXT NOT NULL,
   begin_ns INTEGER NOT NULL,    -- from_ns, rounded down for gaps under a second; -1 without a time, -2 for a sum of forgotten rows
-  from_ns INTEGER,
+  from_ns INTEGER,              -- stamps of the messages around the gap ...
   to_ns INTEGER,
+  received_from_ns INTEGER,     -- ... and when these two arrived
+  received_to_ns INTEGER,
   count INTEGER NOT NULL,
   merged INTEGER NOT NULL,      -- gaps that are in this row
   version INTEGER NOT NULL,     -- rises with each change of any row
@@ -253,24 +258,34 @@ CREATE TABLE gaps_reported (
 CREATE VIEW messages AS
   SELECT objects.id, ifnull(objects.topic, contents.topic) AS topic, ifnull(contents.samples, objects.samples) AS samples,
     state, ifnull(reason, '') AS reason, mission, t_start_ns, t_end_ns,
+    CAST(json_extract(metadata, '$.received_start_ns') AS INTEGER) AS received_start_ns,
+    CAST(json_extract(metadata, '$.received_end_ns') AS INTEGER) AS received_end_ns,
     CASE WHEN t_end_ns - t_start_ns < 1000000000 THEN t_start_ns / 1000000000 * 1000000000 ELSE t_start_ns END AS begin_ns
   FROM objects LEFT JOIN contents ON contents.id = objects.id AND objects.topic IS NULL
   WHERE ifnull(objects.topic, contents.topic) IS NOT NULL AND ifnull(contents.samples, objects.samples) > 0;
 
 CREATE TRIGGER object_lost AFTER INSERT ON objects WHEN NEW.state IN ('evicted', 'quarantined') BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns, samples, 1,
+  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
+      received_start_ns, received_end_ns, samples, 1,
       (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id
     ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
       from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END;
+      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
+      received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
+        ELSE excluded.received_from_ns END,
+      received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
 END;
 CREATE TRIGGER contents_lost AFTER INSERT ON contents
     WHEN (SELECT state FROM objects WHERE id = NEW.id) IN ('evicted', 'quarantined') BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns, samples, 1,
+  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
+      received_start_ns, received_end_ns, samples, 1,
       (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id AND topic = NEW.topic
     ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
       from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END;
+      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
+      received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
+        ELSE excluded.received_from_ns END,
+      received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
 END;
 -- A lost object may still be found, or be lost for another reason: its messages leave the row that has them, or the sum that row is in.
 CREATE TRIGGER object_found BEFORE UPDATE OF state, reason ON objects
@@ -286,11 +301,15 @@ CREATE TRIGGER object_found BEFORE UPDATE OF state, reason ON objects
 END;
 CREATE TRIGGER object_lost_later AFTER UPDATE OF state, reason ON objects
     WHEN NEW.state IN ('evicted', 'quarantined') AND (OLD.state <> NEW.state OR OLD.reason IS NOT NEW.reason) BEGIN
-  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns, samples, 1,
+  INSERT INTO gaps SELECT 0, topic, state, reason, 'exact', '', mission, begin_ns, t_start_ns, t_end_ns,
+      received_start_ns, received_end_ns, samples, 1,
       (SELECT ifnull(max(version), 0) + 1 FROM gaps) FROM messages WHERE id = NEW.id
     ON CONFLICT DO UPDATE SET version = excluded.version, count = count + excluded.count, merged = merged + excluded.merged,
       from_ns = CASE WHEN count > 0 THEN min(from_ns, excluded.from_ns) ELSE excluded.from_ns END,
-      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END;
+      to_ns = CASE WHEN count > 0 THEN max(to_ns, excluded.to_ns) ELSE excluded.to_ns END,
+      received_from_ns = CASE WHEN count > 0 THEN min(received_from_ns, excluded.received_from_ns)
+        ELSE excluded.received_from_ns END,
+      received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
 END;
 
 PRAGMA user_version = 1;

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.durable_files import lock
+from shadowhound_data_logger.core.stamps import NO_TIMES
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
@@ -54,13 +55,13 @@ def carry(index: Index, session: int, robot: str, sink: str) -> list[TopicRow]:
     for number in index.accounts.sessions_with_open(robot, sink):
         for row in index.accounts.topics(number):
             if row.topic.startswith(sink) and row.open > 0:
-                before = moved.get(row.topic) or TopicRow(row.topic, '', '', 0, 0, 0, {}, {}, 0)
+                before = moved.get(row.topic) or TopicRow(row.topic, '', '', 0, 0, 0, {}, {}, NO_TIMES)
                 unknown = min(row.unknown, row.open)
                 estimated = min(row.estimated, row.open - unknown)
                 moved[row.topic] = replace(
                     before, type=row.type, accounting=row.accounting, received=before.received + row.open,
                     estimated=before.estimated + estimated, unknown=before.unknown + unknown,
-                    last_kept_ns=max(before.last_kept_ns, row.last_kept_ns), heard_ns=max(before.heard_ns, row.heard_ns),
+                    last_kept=max(before.last_kept, row.last_kept), heard=max(before.heard, row.heard),
                 )  # fmt: skip
                 index.accounts.take_over(number, row.topic, row.open, estimated, unknown)
     index.accounts.write(session, AccountSnapshot(tuple(moved.values()), ()))

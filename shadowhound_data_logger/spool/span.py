@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.spool.gaps import MISSED, GapKey, TopicGaps
 
 MAX_RANGES: Final = 512
@@ -24,10 +25,10 @@ class NumberRun(NamedTuple):
     start: int
     stop: int
     """Of the first one that is not in it."""
-    from_ns: int
-    """Stamp of its first message."""
-    to_ns: int
-    """Stamp of its last message."""
+    first: Times
+    """Those of its first message."""
+    last: Times
+    """Those of its last message."""
 
 
 class Ranges:
@@ -97,8 +98,8 @@ class Span:
     first: int | None = None
     last: int | None = None
     inherited: bool = False
-    heard_ns: int = 0
-    """Stamp of ``last``; 0 where it is not known."""
+    heard: Times = NO_TIMES
+    """Those of the message with the number ``last``; zeros if they are unknown."""
     name: str = ''
     gaps: TopicGaps = field(default_factory=TopicGaps)
     """Where the times of what is missed go: those of its topic."""
@@ -123,16 +124,16 @@ class Span:
         self._base = self.first
         self.older = self.inherited
 
-    def observe(self, number: int, stamp_ns: int = 0) -> bool:
+    def observe(self, number: int, times: Times = NO_TIMES) -> bool:
         """Count a message by its sequence number; False if it was counted before (a repeat)."""
         if self.first is None or self._base is None or self.last is None:
             self.first = self._base = self.last = number
-            self.heard_ns = stamp_ns
+            self.heard = times
         elif number > self.last:
             if number > self.last + 1:
-                self._skip(self.last + 1, number, stamp_ns)
+                self._skip(self.last + 1, number, times)
             self.last = number
-            self.heard_ns = stamp_ns
+            self.heard = times
             self.inherited = self._rebased = False
             self._late = 0
         elif holes := self._holes.within(number, number + 1):
@@ -193,16 +194,18 @@ class Span:
         last = self.last
         assert last is not None
         is_own = any(
-            run.start == last + 1 or (run.start <= last < run.stop and run.from_ns <= self.heard_ns <= run.to_ns) for run in runs
+            run.start == last + 1
+            or (run.start <= last < run.stop and run.first.stamp_ns <= self.heard.stamp_ns <= run.last.stamp_ns)
+            for run in runs
         )
         fresh = [run._replace(start=max(run.start, last + 1)) for run in runs if run.stop > last + 1]
         if not is_own or sum(run.stop - run.start for run in fresh) != count:
             return False
         for run in fresh:
             if run.start > last + 1:
-                self._skip(last + 1, run.start, run.from_ns)
+                self._skip(last + 1, run.start, run.first)
             self.last = last = run.stop - 1
-            self.heard_ns = run.to_ns
+            self.heard = run.last
         self.received += count
         self.published += count
         self.changed = True
@@ -244,7 +247,7 @@ class Span:
                 filled += count
         return filled
 
-    def _skip(self, start: int, stop: int, stamp_ns: int) -> None:
+    def _skip(self, start: int, stop: int, times: Times) -> None:
         """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
         cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
         if self.missed.total() + stop - start > MAX_MISSED:
@@ -256,5 +259,5 @@ class Span:
             count = stop - start - known
             self.missed[cause] += count
             self.published += count
-            hole = self.gaps.add(MISSED, cause, count, self.heard_ns or self.gaps.heard_ns, stamp_ns, self.name)
+            hole = self.gaps.add(MISSED, cause, count, self.heard if any(self.heard) else self.gaps.heard, times, self.name)
         self._holes.append(start, stop, hole)

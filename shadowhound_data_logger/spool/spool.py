@@ -24,6 +24,7 @@ from shadowhound_data_logger.core.config import KeepSettings, SpoolSettings
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -565,22 +566,23 @@ def _continued(index: Index, robot: str, clock: Clock) -> Accounts:
     for row in index.accounts.publishers(robot=robot):
         last.pop((row.topic, row.publisher), None)  # so that the newest are the last
         last[row.topic, row.publisher] = row
-    kept: dict[str, int] = {}
+    kept: dict[str, Times] = {}
     grades: dict[str, str] = {}
-    heard: dict[str, int] = {}
+    heard: dict[str, Times] = {}
     for account in index.accounts.topics(robot=robot):
-        kept[account.topic] = max(kept.get(account.topic, 0), account.last_kept_ns)
-        heard[account.topic] = account.heard_ns or account.last_kept_ns or heard.get(account.topic, 0)
+        kept[account.topic] = max(kept.get(account.topic, NO_TIMES), account.last_kept)
+        known = (account.heard, account.last_kept, heard.get(account.topic, NO_TIMES))
+        heard[account.topic] = next((each for each in known if any(each)), NO_TIMES)
         if account.received:
             grades[account.topic] = account.accounting
     return Accounts(last.values(), kept, index.accounts.rhythms(), grades, clock, heard)
 
 
-def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, int]]:
-    """By account: (samples, stamp of the newest)."""
-    counts: dict[str, tuple[int, int]] = {}
+def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, Times]]:
+    """By account: (samples, times of the newest)."""
+    counts: dict[str, tuple[int, Times]] = {}
     for item in objects:
         for account, samples in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
-            count, newest_ns = counts.get(account, (0, 0))
-            counts[account] = (count + samples, max(newest_ns, item.t_end_ns))
+            count, newest = counts.get(account, (0, NO_TIMES))
+            counts[account] = (count + samples, max(newest, item.last_times))
     return counts

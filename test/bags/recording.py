@@ -36,7 +36,14 @@ HOLD_S = 600.0
 def messages(numbers: range, size: int = 0) -> list[Taken]:
     """Of one publisher, a hundredth of a second apart; each came a millisecond after it was sent."""
     return [
-        Taken(b'\0\1\0\0%08d' % number + b'x' * size, NOON_NS + number * 10**7, 'p', number, NOON_NS + number * 10**7 + 10**6)
+        Taken(
+            b'\0\1\0\0%08d' % number + b'x' * size,
+            NOON_NS + number * 10**7,
+            'p',
+            number,
+            NOON_NS + number * 10**7 + 10**6,
+            NOON_NS + number * 10**7,
+        )
         for number in numbers
     ]
 
@@ -84,7 +91,7 @@ class Desk:
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:
             for message in heard.messages:
                 assert account.receive(message.publisher, message.number)
-            account.gaps.heard_ns = heard.messages[-1].source_ns
+            account.gaps.heard = heard.messages[-1].times
         dropped = self.queue.put(heard)
         if dropped:
             self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)

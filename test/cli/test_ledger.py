@@ -18,6 +18,7 @@ from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.stamps import Times, by_arrival
 
 STATES = ('delivered', 'pending', 'held', 'evicted', 'quarantined', 'deduplicated')
 
@@ -292,10 +293,10 @@ def lossy(root: Path) -> None:
     spool.open()
     with spool.accounts.entry('/camera') as account:
         for number in (1, 5, 6, 7):
-            account.receive('p', number, NOON_NS + number * 100_000_000)
+            account.receive('p', number, Times(NOON_NS + number * 100_000_000, NOON_NS + 146 * SECOND + number * 100_000_000))
         account.skipped += 2
     spool.accounts.set_mission('patrol-7')
-    spool.accounts.drop('/camera', 'queue_full', 2, NOON_NS + 60 * SECOND, NOON_NS + 61 * SECOND)
+    spool.accounts.drop('/camera', 'queue_full', 2, by_arrival(NOON_NS + 60 * SECOND), by_arrival(NOON_NS + 61 * SECOND))
     spool.commit()
     spool.close()
 
@@ -314,7 +315,8 @@ def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
     text, rows = gaps(tmp_path / 'spool')
     assert text.return_value == 0
     lines = [line.split() for line in text.stdout.splitlines()]
-    assert ['/camera', 'objects', '2025-10-18', '12:00:00.100', '0.4', 's', '3', '1', 'missed', 'transport'] in lines
+    arrived = ['2025-10-18', '12:02:26.100']
+    assert ['/camera', 'objects', '2025-10-18', '12:00:00.100', '0.4', 's', *arrived, '3', '1', 'missed', 'transport'] in lines
     assert [
         '/camera',
         'objects',
@@ -322,6 +324,8 @@ def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
         '12:01:00.000',
         '1.0',
         's',
+        '2025-10-18',
+        '12:01:00.000',
         '2',
         '1',
         'dropped',
@@ -330,8 +334,8 @@ def test_gaps_say_when_how_long_how_many_and_why(tmp_path: Path) -> None:
     ] in lines
     assert rows[0] == {
         'sink': 'objects', 'topic': '/camera', 'publisher': 'p', 'session': 1, 'kind': 'missed', 'cause': 'transport',
-        'from_ns': NOON_NS + 100_000_000, 'to_ns': NOON_NS + 500_000_000, 'count': 3, 'merged': 1, 'grade': 'exact',
-        'mission_id': None,
+        'from_ns': NOON_NS + 100_000_000, 'to_ns': NOON_NS + 500_000_000, 'received_from_ns': NOON_NS + 146_100_000_000,
+        'received_to_ns': NOON_NS + 146_500_000_000, 'count': 3, 'merged': 1, 'grade': 'exact', 'mission_id': None,
     }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from spool.making import NOON_NS, FakeClock, abandon, make, new_spool
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
+from shadowhound_data_logger.core.stamps import by_arrival
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.lake.gaps import folded, of_rows
@@ -61,8 +62,8 @@ def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
     """Messages with these numbers, a tenth of a second apart."""
     with spool.accounts.entry(topic) as account:
         for number in numbers:
-            account.receive('p', number, NOON_NS + number * SECOND // 10)
-            account.gaps.heard_ns = NOON_NS + number * SECOND // 10
+            account.receive('p', number, by_arrival(NOON_NS + number * SECOND // 10))
+            account.gaps.heard = by_arrival(NOON_NS + number * SECOND // 10)
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * SECOND // 10)
@@ -303,7 +304,7 @@ def test_revisions_go_on_when_the_index_is_made_anew(root: Path) -> None:
 def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: Path) -> None:
     """First without a date, then with one, under the same name: the newest is the dated one."""
     with spool.accounts.entry(CAMERA) as account:
-        account.drop('queue_full', 3, 5 * SECOND, 6 * SECOND)
+        account.drop('queue_full', 3, by_arrival(5 * SECOND), by_arrival(6 * SECOND))
     spool.commit()
     catalog = writer(root)
     made = catalog.parts()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from spool.conftest import Open
 from spool.making import receive
 
+from shadowhound_data_logger.core.stamps import by_arrival
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool import span as module
 from shadowhound_data_logger.spool.account_rows import PublisherRow
@@ -28,6 +29,10 @@ from shadowhound_data_logger.spool.accounts import (
     TopicAccount,
 )
 from shadowhound_data_logger.spool.span import NumberRun, Ranges, Span
+
+
+def run(start: int, stop: int, first_ns: int, last_ns: int) -> NumberRun:
+    return NumberRun(start, stop, by_arrival(first_ns), by_arrival(last_ns))
 
 
 def taken(span: Span, *numbers: int) -> list[bool]:
@@ -129,26 +134,26 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
 
 def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> None:
     """They come again as repeats; what is missing between them and after them is missed by the restart."""
-    span = Span(first=1, last=10, inherited=True, heard_ns=100)
-    assert span.recall([NumberRun(7, 13, 70, 120), NumberRun(15, 18, 150, 170)], 5)
+    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
+    assert span.recall([run(7, 13, 70, 120), run(15, 18, 150, 170)], 5)
     assert taken(span, 12, 17, 20) == [False, False, True]
     assert figures(span) == (10, 6, {'restart': 4})
 
 
 def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> None:
     """Though the message before it is in none."""
-    span = Span(first=1, last=10, inherited=True, heard_ns=100)
-    assert span.recall([NumberRun(11, 13, 110, 120)], 2)
+    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
+    assert span.recall([run(11, 13, 110, 120)], 2)
     assert taken(span, 13) == [True]
     assert figures(span) == (3, 3, {})
 
 
 @pytest.mark.parametrize('runs', [
-    [NumberRun(1, 6, 101, 150)], [NumberRun(12, 17, 120, 160)], [NumberRun(10, 13, 500, 520)], [NumberRun(10, 16, 101, 150)], [],
+    [run(1, 6, 101, 150)], [run(12, 17, 120, 160)], [run(10, 13, 500, 520)], [run(10, 16, 101, 150)], [],
 ])  # fmt: skip
 def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[NumberRun]) -> None:
     """Then so many messages are counted, and whatever number comes next is a message as any other."""
-    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
     assert not span.recall(runs, 5)
     span.late(5)
     assert taken(span, 11, 12, 12, 18) == [True, True, False, True]
@@ -157,18 +162,18 @@ def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[Nu
 
 def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
     """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
-    span = Span(first=1, last=10, inherited=True, heard_ns=100)
+    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
     assert taken(span, 20) == [True]
-    assert span.recall([NumberRun(5, 13, 50, 120), NumberRun(14, 16, 140, 150)], 4)
+    assert span.recall([run(5, 13, 50, 120), run(14, 16, 140, 150)], 4)
     assert taken(span, 12, 13, 14, 17) == [False, True, False, True]
     assert figures(span) == (10, 7, {'restart': 3})
 
 
 def test_numbers_in_a_file_are_the_low_32_bits() -> None:
     """As MCAP has them: those of the publisher's last number are added."""
-    span = Span(first=1, last=(1 << 32) - 2, inherited=True, heard_ns=100)
-    assert span.recall([NumberRun((1 << 32) - 2, 1 << 32, 100, 110)], 1)
-    assert span.recall([NumberRun(0, 2, 120, 130)], 2)
+    span = Span(first=1, last=(1 << 32) - 2, inherited=True, heard=by_arrival(100))
+    assert span.recall([run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
+    assert span.recall([run(0, 2, 120, 130)], 2)
     assert taken(span, (1 << 32) + 1, (1 << 32) + 2) == [False, True]
     assert figures(span) == (4, 4, {})
 
@@ -377,7 +382,7 @@ def test_open_is_what_has_no_outcome() -> None:
         account.skipped += 3
     accounts.reject('/odom', {'bad': 1})
     accounts.drop('/odom', 'full', 2)
-    accounts.store({'/odom': (3, 77)})
+    accounts.store({'/odom': (3, by_arrival(77))})
     with accounts.entry('/odom') as account:
         assert account.open == 1
     assert accounts.last_kept_ns('/odom') == 77
@@ -388,11 +393,11 @@ def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
     accounts = Accounts()
     with accounts.entry('/odom') as account:
         account.receive('p', 5)
-    snapshot = accounts.snapshot({'/odom': (1, 9)})
+    snapshot = accounts.snapshot({'/odom': (1, by_arrival(9))})
     assert snapshot is not None
-    assert (snapshot.topics[0].stored, snapshot.topics[0].open, snapshot.topics[0].last_kept_ns) == (1, 0, 9)
+    assert (snapshot.topics[0].stored, snapshot.topics[0].open, snapshot.topics[0].last_kept.stamp_ns) == (1, 0, 9)
     assert snapshot.publishers == (PublisherRow('/odom', 'p', 5, 5, 1, 1, {}),)
-    accounts.store({'/odom': (1, 9)})
+    accounts.store({'/odom': (1, by_arrival(9))})
     assert accounts.snapshot({}) is None
     accounts.mark_dirty()
     assert accounts.snapshot({}) is not None
@@ -400,16 +405,16 @@ def test_a_snapshot_holds_what_is_about_to_be_durable() -> None:
 
 def test_samples_of_a_topic_that_nobody_received_show() -> None:
     """An object of a topic without an account makes the topic's account negative at once, not silently nothing."""
-    snapshot = Accounts().snapshot({'/ghost': (2, 1)})
+    snapshot = Accounts().snapshot({'/ghost': (2, by_arrival(1))})
     assert snapshot is not None
     assert [(row.topic, row.open) for row in snapshot.topics] == [('/ghost', -2)]
 
 
 def test_the_last_kept_stamp_is_inherited() -> None:
     """A restarted node goes on sampling after the newest durable sample of any session."""
-    accounts = Accounts(last_kept={'/odom': 50})
+    accounts = Accounts(last_kept={'/odom': by_arrival(50)})
     assert accounts.last_kept_ns('/odom') == 50
-    accounts.store({'/odom': (1, 40)})
+    accounts.store({'/odom': (1, by_arrival(40))})
     assert accounts.last_kept_ns('/odom') == 50
     assert accounts.last_kept_ns('/imu') == 0
 

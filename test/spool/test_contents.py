@@ -12,6 +12,7 @@ from spool.making import FakeClock, clear_uncataloged, index_of, make, new_spool
 
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, State
+from shadowhound_data_logger.core.stamps import NO_TIMES
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.span import NumberRun
@@ -57,7 +58,7 @@ def find(spool: Spool, item: DataObject) -> None:
 
 def runs(item: DataObject) -> dict[str, list[NumberRun]]:
     """The numbers of a slice's messages, where it has all of the publisher."""
-    return {topic: [NumberRun(1, 1 + count, 0, 0)] for topic, count in item.counts.items()}
+    return {topic: [NumberRun(1, 1 + count, NO_TIMES, NO_TIMES)] for topic, count in item.counts.items()}
 
 
 def die(spool: Spool, root: Path) -> Path:

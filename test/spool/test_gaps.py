@@ -14,6 +14,7 @@ from spool.making import NOON_NS, FakeClock, abandon, make, new_spool, put
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import Outcome, SpooledObject, State
+from shadowhound_data_logger.core.stamps import Times, by_arrival
 from shadowhound_data_logger.spool import gap_table, gaps, ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.gap_table import GapTable
@@ -23,6 +24,8 @@ from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MS = SECOND // 1000
+LATE_NS = 146 * SECOND
+"""How much later than their stamps these messages arrive."""
 DAY_NS = 24 * 3600 * SECOND
 CAMERA = '/camera'
 
@@ -52,8 +55,9 @@ def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA,
     """Take the messages with these numbers, sent at noon and a period later for each."""
     with spool.accounts.entry(topic) as account:
         for number in numbers:
-            account.receive(publisher, number, NOON_NS + number * period_ns)
-            account.gaps.heard_ns = NOON_NS + number * period_ns
+            times = Times(NOON_NS + number * period_ns, NOON_NS + number * period_ns + LATE_NS)
+            account.receive(publisher, number, times)
+            account.gaps.heard = times
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * period_ns)
@@ -69,8 +73,8 @@ def test_a_gap_has_the_times_of_its_neighbors(spool: Spool, root: Path) -> None:
     (gap,) = journal(root)
     assert gap.as_dict() == {
         'sink': 'objects', 'topic': CAMERA, 'publisher': 'p', 'session': 1, 'kind': 'missed', 'cause': 'transport',
-        'from_ns': NOON_NS + 200 * MS, 'to_ns': NOON_NS + 600 * MS, 'count': 3, 'merged': 1, 'grade': 'exact',
-        'mission_id': 'patrol-7',
+        'from_ns': NOON_NS + 200 * MS, 'to_ns': NOON_NS + 600 * MS, 'received_from_ns': NOON_NS + 200 * MS + LATE_NS,
+        'received_to_ns': NOON_NS + 600 * MS + LATE_NS, 'count': 3, 'merged': 1, 'grade': 'exact', 'mission_id': 'patrol-7',
     }  # fmt: skip
     assert (gap.robot, gap.began_ns) == ('thor', NOON_NS)
 
@@ -158,8 +162,8 @@ def test_a_stamp_of_the_future_moves_no_watermark_beyond_now(spool: Spool) -> No
     """Whoever publishes may stamp as it likes: it vouches for no time to come, in this session or later."""
     hear(spool, 1, 2)
     with spool.accounts.entry(CAMERA) as account:
-        account.receive('hostile', 1, NOON_NS + 365 * 24 * 3600 * SECOND)
-        account.gaps.heard_ns = NOON_NS + 365 * 24 * 3600 * SECOND
+        account.receive('hostile', 1, by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND))
+        account.gaps.heard = by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND)
     deliver(spool, *spool.commit([make('a', samples=3)]))
     assert watermark(spool) == (0.2, 0.2)
     hear(spool, 4)
@@ -171,15 +175,15 @@ def test_a_stamp_of_the_future_is_the_time_of_no_loss() -> None:
     """More than a day ahead of our clock nobody believes it: the other end of the gap counts, or nothing."""
     found = TopicGaps(clock=FakeClock())
     later_ns = NOON_NS + 25 * 3600 * SECOND
-    assert found.add('missed', 'transport', 2, NOON_NS, later_ns).begin_ns == NOON_NS
-    assert found.add('missed', 'transport', 2, later_ns, later_ns).begin_ns == gaps.UNTIMED
-    assert found.add('missed', 'transport', 2, -5, NOON_NS).begin_ns == NOON_NS
+    assert found.add('missed', 'transport', 2, by_arrival(NOON_NS), by_arrival(later_ns)).begin_ns == NOON_NS
+    assert found.add('missed', 'transport', 2, by_arrival(later_ns), by_arrival(later_ns)).begin_ns == gaps.UNTIMED
+    assert found.add('missed', 'transport', 2, by_arrival(-5), by_arrival(NOON_NS)).begin_ns == NOON_NS
 
 
 def test_a_loss_is_not_timed_by_two_clocks() -> None:
     """One publisher with UTC and one with a clock that was never set: no gap is from the one to the other."""
     found = TopicGaps(clock=FakeClock(now_ns=50 * SECOND))
-    key = found.add('missed', 'transport', 2, NOON_NS, 40 * SECOND)
+    key = found.add('missed', 'transport', 2, by_arrival(NOON_NS), by_arrival(40 * SECOND))
     ((row,), _) = found.settle(CAMERA, {key[:3]: 2})
     assert (row.from_ns, row.to_ns) == (NOON_NS, NOON_NS)
 
@@ -192,8 +196,8 @@ def test_a_clock_that_is_set_back_takes_the_watermark_along(spool: Spool) -> Non
     assert isinstance(clock, FakeClock)
     clock.now_ns = NOON_NS
     with spool.accounts.entry(CAMERA) as account:
-        account.receive('p', 101, NOON_NS)
-        account.gaps.heard_ns = NOON_NS
+        account.receive('p', 101, by_arrival(NOON_NS))
+        account.gaps.heard = by_arrival(NOON_NS)
     deliver(spool, *spool.commit([make('b')]))
     assert watermark(spool) == (0, 0)
 
@@ -309,7 +313,7 @@ def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) ->
     spool.open()
     with spool.accounts.entry(CAMERA) as account:
         account.receive(None, None)
-        account.appraise(1, {'restart': 4}, NOON_NS + 5 * SECOND)
+        account.appraise(1, {'restart': 4}, by_arrival(NOON_NS + 5 * SECOND))
     spool.commit()
     found = [gap for gap in journal(root) if gap.grade == 'estimated']
     spool.close()
@@ -320,7 +324,7 @@ def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) ->
 
 def test_messages_of_another_type_have_their_time(spool: Spool, root: Path) -> None:
     """Though none of the topic's own came."""
-    spool.accounts.refuse(CAMERA, 'x/msg/Y', 3, NOON_NS, NOON_NS + SECOND)
+    spool.accounts.refuse(CAMERA, 'x/msg/Y', 3, by_arrival(NOON_NS), by_arrival(NOON_NS + SECOND))
     spool.commit()
     assert short(root) == [('rejected', 'wrong_type', 3, 0.0, 1.0)]
 
@@ -414,8 +418,8 @@ def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch
     for number in range(300):
         with spool.accounts.entry(CAMERA) as account:
             stamp_ns = NOON_NS - number * DAY_NS if number % 3 else 0
-            account.receive(f'p{number}', 1, stamp_ns)
-            account.receive(f'p{number}', 5, stamp_ns + 10 * SECOND)
+            account.receive(f'p{number}', 1, by_arrival(stamp_ns))
+            account.receive(f'p{number}', 5, by_arrival(stamp_ns + 10 * SECOND))
             lost += 3
         if number % 10 == 0:
             spool.commit()
@@ -427,13 +431,13 @@ def test_rows_of_an_hour_are_bounded(root: Path, monkeypatch: pytest.MonkeyPatch
     assert shared.from_ns == NOON_NS - 299 * DAY_NS, 'it reaches from the first one to the last one'
     assert shared.begin_ns == NOON_NS, 'and is of the hour in which they were found'
     with spool.accounts.entry(CAMERA) as account:
-        assert account.receive('p299', 3, NOON_NS)
+        assert account.receive('p299', 3, by_arrival(NOON_NS))
     spool.commit()
     assert sum(row.count or 0 for row in journal(root)) == lost - 1, 'a late message is taken out of it'
     assert ledger.read(root, 'thor')['balanced']
     clock.now_ns += 3600 * SECOND
     with spool.accounts.entry(CAMERA) as account:
-        account.receive('p299', 50, clock.now_ns)
+        account.receive('p299', 50, by_arrival(clock.now_ns))
     spool.commit()
     assert 'p299' in {row.publisher for row in journal(root)}, 'the next hour has rows of its own again'
     spool.close()
@@ -451,7 +455,7 @@ def test_a_gap_stays_until_it_is_told(root: Path) -> None:
     spool = new_spool(root, clock)
     spool.open()
     with spool.accounts.entry(CAMERA) as account:
-        account.receive('p', 9, clock.now_ns)
+        account.receive('p', 9, by_arrival(clock.now_ns))
     spool.commit()
     spool.commit()
     assert [(gap.cause, gap.count) for gap in journal(root)] == [('restart', 7)]
@@ -472,8 +476,8 @@ def test_rows_of_no_known_time_go_with_their_session(root: Path) -> None:
     spool.open()
     for publisher, first_ns in (('boot', 100 * SECOND), ('future', NOON_NS * 3), ('none', 0)):
         with spool.accounts.entry(CAMERA) as account:
-            account.receive(publisher, 1, first_ns)
-            account.receive(publisher, 4, first_ns + 10 * SECOND if first_ns else 0)
+            account.receive(publisher, 1, by_arrival(first_ns))
+            account.receive(publisher, 4, by_arrival(first_ns + 10 * SECOND if first_ns else 0))
     spool.commit()
     assert {gap.publisher for gap in journal(root)} >= {'boot', 'future'}
     clock.now_ns = NOON_NS
@@ -496,8 +500,8 @@ def test_there_are_never_more_rows_than_that(spool: Spool, root: Path, clock: Fa
     clock.now_ns = 500 * SECOND
     for number in range(30):
         with spool.accounts.entry(CAMERA) as account:
-            account.receive(f'p{number}', 1, 400 * SECOND)
-            account.receive(f'p{number}', 3, 402 * SECOND)
+            account.receive(f'p{number}', 1, by_arrival(400 * SECOND))
+            account.receive(f'p{number}', 3, by_arrival(402 * SECOND))
         spool.commit()
     clock.now_ns += 3600 * SECOND
     for _ in range(3):
@@ -514,7 +518,7 @@ def test_before_the_clock_is_set_losses_have_times_since_boot() -> None:
     """A publisher on this machine stamps by the same wrong clock; an offset that is known later dates them."""
     clock = FakeClock(now_ns=5 * SECOND)
     found = TopicGaps(clock=clock)
-    key = found.add('missed', 'transport', 2, 3 * SECOND, 4 * SECOND)
+    key = found.add('missed', 'transport', 2, by_arrival(3 * SECOND), by_arrival(4 * SECOND))
     assert key.begin_ns == 3 * SECOND
 
 
@@ -611,9 +615,9 @@ def _count(spool: Spool, clock: FakeClock, what: str, number: int) -> None:
             account.find(number)
         elif what == 'unnumbered':
             account.receive(None, None)
-            account.appraise(1, {'transport': number - 2}, clock.now_ns)
+            account.appraise(1, {'transport': number - 2}, by_arrival(clock.now_ns))
     if what == 'drop':
-        accounts.drop(CAMERA, 'queue_full', count, clock.now_ns - SECOND, clock.now_ns)
+        accounts.drop(CAMERA, 'queue_full', count, by_arrival(clock.now_ns - SECOND), by_arrival(clock.now_ns))
     elif what == 'reject':
         accounts.reject(CAMERA, {'truncated': count})
 

@@ -17,6 +17,7 @@ from typing import Final
 
 from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.core.model import Batch, DataObject
+from shadowhound_data_logger.core.stamps import by_arrival
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.registry import encode
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -206,20 +207,20 @@ class EncodePool:
                 worker.stop()
 
     def _encode(self, batch: Batch) -> None:
-        first_ns, last_ns = batch.samples[0].received_ns, batch.samples[-1].received_ns  # what is wrong may have any stamp
+        first, last = (by_arrival(batch.samples[at].received_ns) for at in (0, -1))  # what is wrong may have any stamp
         try:
             encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
         except BaseException:
-            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)}, first_ns, last_ns)
+            self._accounts.reject(batch.topic, {ENCODER_FAILED: len(batch.samples)}, first, last)
             raise
         if encoding.rejected:
-            self._accounts.reject(batch.topic, encoding.rejected, first_ns, last_ns)
+            self._accounts.reject(batch.topic, encoding.rejected, first, last)
             self._reports.add(batch.topic, batch.sensor, encoding.rejections)
         if encoding.object is not None:
             try:
                 self._spool(encoding.object)
             except BaseException:
-                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples}, first_ns, last_ns)
+                self._accounts.reject(batch.topic, {ENCODER_FAILED: encoding.object.samples}, first, last)
                 raise
             if encoding.corrected:
                 self._accounts.correct(batch.topic, encoding.corrected)

@@ -182,14 +182,15 @@ class Sampler(Consumer):
         try:
             kept = self._kept(sampled, drained)
         except Exception:
-            account.drop(SAMPLER_FAILED, len(messages), messages[0].stamp_ns, messages[-1].stamp_ns)
+            account.drop(SAMPLER_FAILED, len(messages), messages[0].times, messages[-1].times)
             raise
         sampled.chosen = kept
         if kept:
             sampled.kept_ns = kept[-1][1].stamp_ns
             sampled.open_ns = sampled.open_ns or kept[0][1].stamp_ns
         if drained.paused:
-            account.drop(PAUSED, len(messages), account.gaps.heard_ns or messages[0].stamp_ns, messages[-1].stamp_ns)
+            heard = account.gaps.heard
+            account.drop(PAUSED, len(messages), heard if any(heard) else messages[0].times, messages[-1].times)
         else:
             account.skipped += len(messages) - len(kept)
 
@@ -246,7 +247,7 @@ class Sampler(Consumer):
         """To the encoders; what their queue has no room for is dropped."""
         for lost in self._queue.put(batch, self._sensors[batch.sensor].priority):
             samples = lost.samples
-            self._accounts.drop(lost.topic, QUEUE_FULL, len(samples), samples[0].stamp_ns, samples[-1].stamp_ns)
+            self._accounts.drop(lost.topic, QUEUE_FULL, len(samples), samples[0].times, samples[-1].times)
 
 
 _Chosen = tuple[str | None, Sample]

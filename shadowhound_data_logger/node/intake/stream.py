@@ -16,7 +16,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Taken
-from shadowhound_data_logger.core.stamps import StampReport, StampRule, StampTracks
+from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, StampRule, StampTracks
 from shadowhound_data_logger.formats.types import CounterField, MessageTypes, header_stamp_ns
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, count_failure, deliver
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -234,15 +234,15 @@ class SensorStream:
                 if (gid is None or number is None or account.accounting != EXACT) and self._recent.has(message):
                     continue
                 known, refused = date(message, publisher)
-                if not account.receive(publisher, number, known.stamp_ns):
+                if not account.receive(publisher, number, known.times):
                     continue
                 if refused:
                     account.by_arrival.update(refused)
                 fresh.append(known)
                 if publisher is None or number is None:
                     unnumbered.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
-            newest_ns = fresh[-1].stamp_ns if fresh else 0
-            lost = account.observe(unnumbered, self._arrivals.hear(senders, now_s), newest_ns) if unnumbered else None
+            newest = fresh[-1].times if fresh else NO_TIMES
+            lost = account.observe(unnumbered, self._arrivals.hear(senders, now_s), newest) if unnumbered else None
             is_refuted = bool(unnumbered) and account.estimate.refuted
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
@@ -251,7 +251,7 @@ class SensorStream:
                         consumer.choose(drained, account)
                     except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
                         failed[consumer] = error
-                account.gaps.heard_ns = newest_ns
+                account.gaps.heard = newest
                 account.stamps = self._times.report()
         if is_refuted and not self._is_refuted:
             self._is_refuted = True

@@ -21,7 +21,7 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SensorSettings
-from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.core.stamps import StampRule, by_arrival
 from shadowhound_data_logger.formats.payload import Rejection
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
@@ -118,7 +118,8 @@ class OtherTypes:
     def _count(self, topic: str, reader: Reader) -> None:
         refused = reader.drain()
         if refused:
-            self._accounts.refuse(topic, reader.plan.type, len(refused), refused[0].received_ns, refused[-1].received_ns)
+            self._accounts.refuse(topic, reader.plan.type, len(refused), by_arrival(refused[0].received_ns),
+                                  by_arrival(refused[-1].received_ns))  # fmt: skip
             by = Counter(message.publisher or '' for message in refused)
             text = f'{WRONG_TYPE}: it is a {reader.plan.type}'
             self._reports.add(topic, '', [Rejection(WRONG_TYPE, gid, text, count, OTHER_REMEDY) for gid, count in by.items()],

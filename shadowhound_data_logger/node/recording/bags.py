@@ -55,13 +55,13 @@ class BagConsumer(Consumer):
             receive, unknown = account.receive, account.unknown
             fresh = [
                 message for message in drained.messages
-                if receive(message.publisher, message.number, message.source_ns) or self._is_earlier(topic, message, account)
+                if receive(message.publisher, message.number, message.times) or self._is_earlier(topic, message, account)
             ]  # fmt: skip
-            newest_ns = drained.messages[-1].source_ns
-            account.appraise(account.unknown - unknown, drained.lost, newest_ns)
+            newest = drained.messages[-1].times
+            account.appraise(account.unknown - unknown, drained.lost, newest)
             if paused and fresh:
-                account.drop(PAUSED, len(fresh), fresh[0].source_ns, fresh[-1].source_ns)
-            account.gaps.heard_ns = newest_ns
+                account.drop(PAUSED, len(fresh), fresh[0].times, fresh[-1].times)
+            account.gaps.heard = newest
         if not fresh:
             return
         if paused:
@@ -70,7 +70,7 @@ class BagConsumer(Consumer):
         if not paused or latched:  # slices after the pause begin with what was latched in it
             dropped = self._queue.put(Lot(topic, type_name, qos, fresh, latched, paused))
             if dropped and not paused:
-                self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].source_ns, fresh[-1].source_ns)
+                self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].times, fresh[-1].times)
 
     def _is_earlier(self, topic: str, message: Taken, account: TopicAccount) -> bool:
         """Whether it is a latched message that an earlier recording had already, and that this one has not yet: counted again."""

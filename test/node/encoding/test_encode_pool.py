@@ -12,6 +12,7 @@ import pytest
 
 from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
+from shadowhound_data_logger.core.stamps import Times, by_arrival
 from shadowhound_data_logger.formats.registry import Encoding, encode
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding import encode_pool as pool_module
@@ -45,9 +46,9 @@ class Outcome:
         with self.lock:
             self.objects.append(item)
 
-    def reject(self, topic: str, reasons: Mapping[str, int], from_ns: int, to_ns: int) -> None:
+    def reject(self, topic: str, reasons: Mapping[str, int], first: Times, last: Times) -> None:
         assert topic == '/talk'
-        assert (from_ns, to_ns) == (ARRIVAL_NS, ARRIVAL_NS)
+        assert first == last == by_arrival(ARRIVAL_NS)
         with self.lock:
             self.rejected.update(reasons)
 

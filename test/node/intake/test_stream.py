@@ -11,7 +11,7 @@ import pytest
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.core.model import Batch, Taken
-from shadowhound_data_logger.core.stamps import DAY_NS, StampRule
+from shadowhound_data_logger.core.stamps import DAY_NS, NO_TIMES, StampRule, by_arrival
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake import sampling
@@ -43,7 +43,7 @@ class Talk:
         self.senders = Senders()
         self.numbers = count(1)
         if last_kept_ns:
-            self.accounts.store({TOPIC: (0, last_kept_ns)})
+            self.accounts.store({TOPIC: (0, by_arrival(last_kept_ns))})
         self.sensors, types, self.stamps = {'talk': self.sensor}, MessageTypes(), StampRule(SystemClock.of_this_machine())
         queue: Any = self.batches
         self.sampler = Sampler(self.sensors, self.accounts, types, queue)
@@ -363,7 +363,7 @@ def test_the_journal_is_complete_up_to_what_has_an_outcome() -> None:
         batch = queue.get(0.0)
         assert batch is not None
         assert complete() in {0, 9}
-        talk.accounts.store({TOPIC: (len(batch.samples), 0)})
+        talk.accounts.store({TOPIC: (len(batch.samples), NO_TIMES)})
         queue.done(batch)
 
     talk.add(talk.messages(12))  # a batch of 9 in the queue, another one open
