@@ -94,7 +94,8 @@ def test_what_is_known_is_told_once(
 
 
 @pytest.mark.parametrize(
-    ('package', 'oldest'), [('aiohttp', (3, 14, 4)), ('orjson', (3, 11, 6)), ('pillow', (12, 2)), ('torch', (2, 6))]
+    ('package', 'oldest'),
+    [('aiohttp', (3, 14, 4)), ('orjson', (3, 11, 6)), ('pillow', (12, 3)), ('grpcio', (1, 66, 2)), ('torch', (2, 6))],
 )
 def test_no_version_with_a_known_hole_is_enough(package: str, oldest: tuple[int, ...]) -> None:
     """The lowest version that setup.py allows has the security fixes that docs/dependencies.md names."""

@@ -32,7 +32,7 @@ from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
 from shadowhound_data_logger.spool.ledger import imbalances, journal
 from shadowhound_data_logger.spool.ledger import read as read_ledger
-from shadowhound_data_logger.spool.status import robots
+from shadowhound_data_logger.spool.status import not_logged, robots
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})
@@ -94,6 +94,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         raise BadUsage('--again is for --verify and --deep', 'add --verify')
     names = robots(folder)
     found = read_ledger(folder, _robot(folder))
+    found['not_logged'] = not_logged(folder, found['robot'])
     found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
     if as_json:
         print_json(found)
@@ -214,6 +215,7 @@ def notes(found: Mapping[str, Any]) -> list[str]:
             lines.append(f'{topic}: not one message of it was received')
         elif row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
+    lines += [f'{topic}: not logged: {why}' for topic, why in found.get('not_logged', {}).items()]
     return [*lines, *clock_notes(found.get('clock', {}))]
 
 
@@ -236,12 +238,16 @@ def clock_notes(clock: Mapping[str, Any]) -> Iterator[str]:
 def verdict(found: Mapping[str, Any]) -> Text:
     """One line, or one for each identity that does not hold."""
     if found['balanced']:
-        return Text.assemble(('The ledger balances', 'green'), f': {_known(found["topics"])}')
+        return Text.assemble(('The ledger balances', 'green'), f': {_known(found)}')
     return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(dict(found)))
 
 
-def _known(topics: Mapping[str, Any]) -> str:
-    """What the ledger says of all messages: no more than the worst grade among them."""
+def _known(found: Mapping[str, Any]) -> str:
+    """What the ledger says of all messages: no more than the worst grade among them, and only of what was listened to."""
+    topics = found['topics']
+    unheard = [other for row in topics.values() for other in row.get('other_types', {}).values() if other['messages'] is None]
+    if unheard or found.get('not_logged'):
+        return 'every message that was received is stored, skipped, or listed as lost; what is not logged is listed above.'
     graded = [{*row['by_grade'], row['accounting']} - {None} for row in topics.values()]
     worst = [max(grades, key=GRADES.index) for grades in graded if grades]
     if not set(worst) - {EXACT}:

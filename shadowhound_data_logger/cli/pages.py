@@ -96,6 +96,7 @@ SECTIONS: Final = (
         'setting are listed [below](#the-sensors).',
         (
             'robot',
+            'capture.topics',
             'SENSOR.enabled',
             'SENSOR.rate_hz',
             'mission.capture',

@@ -132,6 +132,8 @@ def view(found: Mapping[str, Any], console: Console) -> list[RenderableType]:
     parts: list[RenderableType] = [_head(found), '']
     if live:
         parts += [*_topics(found['topics'], found['middleware']['unheard'] or {}), '']
+    if live and found.get('not_logged'):
+        parts += [plain(f'Not logged: {", ".join(found["not_logged"])} (`ledger` says why)', 'dim'), '']
     if live or found['spool']:
         parts += [_way(found, console, live=live), '']
     if found.get('policy'):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,10 +17,12 @@ from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.keys import KeyTemplate, check_name
 from shadowhound_data_logger.core.options import (
     ARCHIVES,
+    AUTO,
     BATCHED,
     DEFAULT_SENSORS,
     FORMATS,
     GROUPS,
+    NAMED,
     BagSettings,
     CaptureSettings,
     CatalogSettings,
@@ -111,8 +113,11 @@ class Settings:
         """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
         robot = _robot(given.pop('robot', ''), environ, namespace)
+        is_listed = 'sensors' in given
         sensors = _sensors(given, robot)
-        groups = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
+        groups: dict[str, Any] = {name: _fill(kind, name, given) for name, kind in GROUPS.items()}
+        if groups['capture'].topics == AUTO and is_listed:
+            groups['capture'] = replace(groups['capture'], topics=NAMED)
         _check_fields(groups['mission'])
         _check_expressions('bag', groups['bag'], ('regex', 'exclude'))
         _check_events(groups['events'])

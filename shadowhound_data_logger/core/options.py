@@ -22,6 +22,8 @@ ALWAYS, ON_REQUEST = 'always', 'on_request'
 SHIPS: Final = (ALWAYS, ON_REQUEST)
 COMPRESSIONS: Final = ('zstd', 'none')
 RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS = 'auto', 'robot', 'fastrtps'
+AUTO, NAMED, ALL = 'auto', 'sensors', 'all'
+"""Which topics are logged."""
 COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
@@ -44,7 +46,9 @@ class SensorSettings:
     enabled: bool = _setting(True, 'Log this sensor.', live=True)
     topics: tuple[str, ...] = _setting((), 'Topics it can come from, the preferred one first; relative to the namespace.')
     types: tuple[str, ...] = _setting(
-        (), 'Message type of each topic; other types on it are not logged. Where empty, the first that is published.'
+        (),
+        'Message type of each topic, alternatives separated by |; others on it are not logged. Where empty, the first that is '
+        'published.',
     )
     rate_hz: float = _setting(
         1.0, 'Keep the first message of each whole period; 0 keeps every message.', low=0.0, high=1e6, live=True
@@ -91,6 +95,12 @@ class CaptureSettings:
         RMW_AUTO,
         "RMW to listen with: the robot's own, fastrtps, or auto (fastrtps where that hears as much as Cyclone DDS).",
         choices=(RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS),
+    )
+    topics: str = _setting(
+        AUTO,
+        'sensors: log the topics of the sensors; all: also any other topic whose type has a rule; auto: all, unless sensors are '
+        'listed or the robot is a Unitree.',
+        choices=(AUTO, NAMED, ALL),
     )
 
 
@@ -294,7 +304,10 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'topics': ('point_cloud2',), 'types': (POINT_CLOUD,), 'format': 'pcd',
         'key': '{robot}/lidar/{date}/{time}_scan.{ext}', 'priority': 7,
     },
-    'imu': {'topics': ('imu',), 'types': ('go2_interfaces/msg/IMU',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4},
+    'imu': {
+        'topics': ('imu',), 'types': ('go2_interfaces/msg/IMU|sensor_msgs/msg/Imu',), 'rate_hz': 0.0, 'batch_s': 1.0,
+        'priority': 4,
+    },
     'odom': {'topics': ('odom',), 'types': ('nav_msgs/msg/Odometry',), 'priority': 3},
     'states': {
         'topics': ('go2_states',), 'types': ('go2_interfaces/msg/Go2State',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 3,

@@ -15,6 +15,7 @@ from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
 from shadowhound_data_logger.node.intake.middleware import Middleware
+from shadowhound_data_logger.ros.endpoints import alternatives, logged_type
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import Heard
@@ -80,7 +81,8 @@ def check(context: Context) -> Iterator[Result]:
         resolved = {topic: node.resolve_topic_name(topic) for sensor in sensors for topic in sensor.topics}
         names = list(dict.fromkeys(resolved.values()))
         found = ros_watch.discover(node, names)
-        types = {resolved[topic]: name for sensor in sensors for topic, name in zip(sensor.topics, sensor.types, strict=False)}
+        pairs = [pair for sensor in sensors for pair in zip(sensor.topics, sensor.types, strict=False)]
+        types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
     if not heard:
         yield from _nobody(context, names, listener)
@@ -110,13 +112,14 @@ def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
     from shadowhound_data_logger.ros.reader import unavailable  # noqa: PLC0415 - rclpy
 
     missing: dict[str, dict[str, str]] = {}
-    for name in sorted({name for sensor in sensors for name in sensor.types}):
-        if reason := unavailable(name):
-            missing.setdefault(name.partition('/')[0], {})[name] = reason
-    for package, reasons in missing.items():
+    for names in sorted({alternatives(name) for sensor in sensors for name in sensor.types if name}):
+        reasons = {name: unavailable(name) for name in names}
+        if all(reasons.values()):
+            missing.setdefault(names[0].partition('/')[0], {})[names[0]] = reasons[names[0]]
+    for package, by_type in missing.items():
         yield error(
             'ros.types',
-            f'{", ".join(reasons)} cannot be received: {next(iter(reasons.values()))}',
+            f'{", ".join(by_type)} cannot be received: {next(iter(by_type.values()))}',
             'the workspace with this package is not sourced in this shell, was not built for this Python, or has no such type',
             TYPES_REMEDY.format(package=package),
         )

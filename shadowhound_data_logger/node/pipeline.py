@@ -28,13 +28,14 @@ from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
 from shadowhound_data_logger.core.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.core.keys import dated
 from shadowhound_data_logger.core.model import DataObject
-from shadowhound_data_logger.core.options import ON_REQUEST
+from shadowhound_data_logger.core.options import NAMED, ON_REQUEST
 from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, EncodePool
 from shadowhound_data_logger.node.encoding.halving import Halving
 from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
+from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.node.intake.sampling import Sampler
@@ -155,7 +156,9 @@ class Pipeline:
         accounts.oldest_open = sampler.oldest_open
         bags = BagConsumer(node, settings.bag, accounts, bag_queue)
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
-        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=[track.odometry])
+        named = [node.resolve_topic_name(topic) for sensor in settings.sensors for topic in sensor.topics]
+        found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=[track.odometry], found=found)
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)

@@ -62,13 +62,21 @@ class Plan:
         return f'{self.topic} ({self.type}, {reliability}{", TRANSIENT_LOCAL" * self.transient_local}, depth {self.depth})'
 
 
+def alternatives(named: str) -> tuple[str, ...]:
+    """The types that the settings name for a topic."""
+    return tuple(name.strip() for name in named.split('|'))
+
+
 def logged_type(publishers: Sequence[Endpoint], named: str | None, current: str = '') -> str:
     """The one type of a topic that is listened to: the one that the settings name, whoever publishes what.
 
+    Of alternatives (``a|b``) it is ``current`` while that has a publisher, else the first that has one, else the first.
     Where they name none, ``current`` stays while it has a publisher, else it is the most common one; empty without any.
     """
     if named:
-        return named
+        names = alternatives(named)
+        there = {publisher.type for publisher in publishers}.intersection(names)
+        return next((each for each in (current, *names) if each in there), names[0])
     counts = Counter(publisher.type for publisher in publishers)
     return max(counts, key=lambda name: (name == current, counts[name], name)) if counts else ''
 

@@ -53,7 +53,7 @@ _WORKER: Final[dict[str, Any]] = {
 }  # fmt: skip
 _HEAD: Final[dict[str, Any]] = {
     'version': '', 'pid': 0, 'boot_id': '', 'boot_ns': 0, 'time': '', 'uptime_s': 0.0, 'paused': False, 'ended': False,
-    'stalls': {},
+    'stalls': {}, 'not_logged': {},
 }  # fmt: skip
 
 
@@ -71,6 +71,12 @@ def targets(spool: Path) -> list[str]:
     """The stores that the nodes of this spool delivered to when they last wrote a status, as a store describes itself."""
     written = (_load(file(spool, robot)) for robot in robots(spool))
     return sorted({one['store']['target'] for one in written if one} - {''})
+
+
+def not_logged(spool: Path, robot: str) -> dict[str, str]:
+    """Topics that the node of a robot found and did not log when it last wrote its status, and why."""
+    written = _load(file(spool, robot))
+    return written['not_logged'] if written and isinstance(written['not_logged'], dict) else {}
 
 
 def limits(spool: Path, own: SpoolSettings) -> SpoolSettings:

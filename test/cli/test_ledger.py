@@ -211,6 +211,18 @@ def test_no_sentence_claims_more_than_the_grades(rows: list[dict[str, Any]], wor
     assert ('balances: every message is stored' in text) == (rows == [{}])
 
 
+@pytest.mark.parametrize('unknown', [
+    {'not_logged': {'/led': 'there is no rule for its type'}},
+    {'topics': {'odom': {'other_types': {'x/msg/Y': {'messages': None, 'publishers': ['/a']}}}}},
+])  # fmt: skip
+def test_the_verdict_is_about_what_was_received_where_something_is_not_logged(unknown: dict[str, Any]) -> None:
+    """And what that is, is listed above it."""
+    found = a_ledger(odom=a_topic(**unknown.get('topics', {}).get('odom', {})))
+    text = shown({**found, 'not_logged': unknown.get('not_logged', {})}, 200)
+    assert 'balances: every message that was received is stored, skipped, or listed as lost; what is not logged is listed' in text
+    assert '/led: not logged: there is no rule for its type' in text or 'so the number of messages is not known' in text
+
+
 def test_a_topic_that_was_never_heard() -> None:
     """Its figures are not known, and it spoils no total."""
     never = a_topic(accounting=None, received=0, published=None, missed=None, stored=0, skipped=0, by_grade={})

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,13 @@ def test_nothing_has_to_be_set() -> None:
 
 
 def test_the_defaults_can_be_spelled_out() -> None:
-    """Giving every parameter its default changes nothing."""
-    assert Settings.load(default_parameters(), {}) == load()
+    """Giving every parameter its default changes nothing, but that listed sensors are all that is logged."""
+    given = default_parameters()
+    spelled_out = Settings.load(given, {})
+    assert spelled_out.capture.topics == 'sensors'
+    assert replace(spelled_out, capture=load().capture) == load()
+    del given['sensors']
+    assert Settings.load(given, {}) == load()
 
 
 @pytest.mark.parametrize(('given', 'environ', 'namespace', 'robot'), [

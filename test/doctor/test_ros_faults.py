@@ -76,7 +76,7 @@ def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
 
     here = SimpleNamespace(resolve_topic_name=lambda topic: '/' + topic.lstrip('/'))
     monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
-    monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: ['somebody'] for name in names})
+    monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: [SimpleNamespace(type='a/msg/B')] for name in names})
     monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __, ___: [ros_watch.Heard(name, []) for name in found])
     own = {'sensors': ['imu', 'again'], 'again.topics': ['/imu'], 'again.types': ['sensor_msgs/msg/Imu']}
     context = make(scene.environ, role=scene.role, parameters=own, root=scene.root)

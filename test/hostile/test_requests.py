@@ -50,7 +50,7 @@ def is_harmless(text: str) -> bool:
     return all(each.isprintable() or each == '\n' for each in text)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(answer=ANSWERS, is_addressed=st.booleans())
 def test_any_answer_is_listed(home: Path, answer: dict[str, Any], is_addressed: bool) -> None:
     """As text and as JSON; the request is there either way, and no control character reaches the terminal."""
@@ -99,7 +99,7 @@ HOSTILE: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize('kind', HOSTILE)
 def test_hostile_labels_of_a_robot_harm_nobody_else(tmp_path: Path, kind: str) -> None:
     """The label beside it is shown, and every verb that reads labels answers without a control character."""
-    fill(folder_store(tmp_path), tmp_path, days=(0,))
+    fill(folder_store(tmp_path), tmp_path, days=(0,), hours=(12,))
     source = Bucket(folder_store(tmp_path), 'sensor-data')
     bad_parts.put(folder_store(tmp_path), parts.encode([row()], LABELS), 'thor_good', of=LABELS)
     bad_parts.put(folder_store(tmp_path), parts.encode([row(**{'id': 'f' * 16, **HOSTILE[kind]})], LABELS), 'thor_bad', of=LABELS)

@@ -51,6 +51,11 @@ def test_an_expected_topic_is_listened_to_both_ways() -> None:
         ('', '', [OTHER, TYPE, TYPE], TYPE),
         ('', OTHER, [OTHER, TYPE, TYPE], OTHER),
         ('', OTHER, [TYPE], TYPE),
+        (f'{TYPE}|{OTHER}', '', [], TYPE),
+        (f'{TYPE}|{OTHER}', '', [OTHER], OTHER),
+        (f'{TYPE}|{OTHER}', '', [OTHER, TYPE], TYPE),
+        (f'{TYPE}|{OTHER}', OTHER, [OTHER, TYPE], OTHER),
+        (f'{TYPE}|{OTHER}', OTHER, [TYPE], TYPE),
     ],
 )
 def test_one_type_of_a_topic_is_logged(named: str, current: str, published: list[str], logged: str) -> None:

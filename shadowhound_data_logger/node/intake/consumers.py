@@ -36,6 +36,11 @@ class Drained(NamedTuple):
     """Whether messages are only counted now."""
 
 
+def is_plain_name(topic: str) -> bool:
+    """Whether a full name is valid in ROS and not hidden (no part of it begins with ``_``)."""
+    return '/_' not in topic and len(topic) <= MAX_NAME and _FULL_NAME.fullmatch(topic) is not None
+
+
 class TopicChoice:
     """Which topics a consumer wants, by its settings, the sensors and the graph. New for each set of settings."""
 

@@ -22,8 +22,9 @@ from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.consumers import Consumer
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
+from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
-from shadowhound_data_logger.ros.endpoints import POLL_S
+from shadowhound_data_logger.ros.endpoints import POLL_S, alternatives
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 
@@ -41,20 +42,22 @@ class Intake:
     ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
     """
 
-    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes, stamps: StampRule,
-                 consumers: Sequence[Consumer], first: Collection[str] = ()) -> None:  # fmt: skip
+    def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,  # noqa: PLR0913 - its neighbors
+                 stamps: StampRule, consumers: Sequence[Consumer], *, first: Collection[str] = (),
+                 found: FoundTopics | None = None) -> None:  # fmt: skip
         """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
 
-        ``first`` are topics to be drained before all others.
+        ``first`` are topics to be drained before all others; ``found`` finds sensors in the graph.
         """
         self._sensors = sensors
         self._consumers = consumers
-        around = Surroundings(node, PolledGroup(), accounts, types, stamps)
+        self._found = found
+        self._around = around = Surroundings(node, PolledGroup(), accounts, types, stamps)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
         self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)
-        named = {node.resolve_topic_name(topic): type_name for sensor in sensors.values()
-                 for topic, type_name in zip(sensor.topics, sensor.types, strict=False) if type_name}  # fmt: skip
+        pairs = [pair for sensor in sensors.values() for pair in zip(sensor.topics, sensor.types, strict=False)]
+        named = {node.resolve_topic_name(topic): name for topic, name in pairs if name and len(alternatives(name)) == 1}
         self._extra = [ExtraTopics(around, consumers[place:], named)
                        for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
         self._listening = [extra for extra in self._extra if extra.consumer.from_start]
@@ -87,6 +90,11 @@ class Intake:
     def left_out(self, consumer: Consumer) -> int:
         """Topics that a consumer would have by an expression, and does not: there are too many."""
         return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)
+
+    @property
+    def not_logged(self) -> Mapping[str, str]:
+        """Topics that no sensor names and that are not logged, and why."""
+        return self._found.not_logged if self._found is not None else {}
 
     def status(self) -> list[SubscriberStatus]:
         return [subscriber.status() for subscriber in self._subscribers]
@@ -140,7 +148,7 @@ class Intake:
         todo: list[Callable[[], None]] = []
         if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
-            todo += [partial(subscriber.refresh, now_s) for subscriber in self._by_turn]
+            todo += [partial(self._find, now_s), *(partial(subscriber.refresh, now_s) for subscriber in self._by_turn)]
         todo += [partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)]
         todo.append(self._others.drain)
         if refreshes and self._listening:
@@ -151,6 +159,15 @@ class Intake:
     def _handle_requests(self) -> None:
         while self._requests:
             self._requests.popleft()()
+
+    def _find(self, now_s: float) -> None:
+        """Sensors of topics that the settings do not name; they are subscribed to at the next look."""
+        for sensor in self._found.look(self._sensors, now_s) if self._found is not None else ():
+            self._sensors[sensor.name] = sensor
+            subscriber = Subscriber(self._around, sensor, self._consumers, self._others)
+            subscriber.paused = self.paused
+            self._subscribers = (*self._subscribers, subscriber)
+            self._by_turn = [*self._by_turn, subscriber]
 
     def _drain(self, now_s: float) -> None:
         _each([partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)])

@@ -27,7 +27,7 @@ from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
 from shadowhound_data_logger.node.intake.consumers import Consumer
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
-from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, logged_type, plans
+from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, alternatives, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, node_of, unavailable
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE, Accounts
 
@@ -205,7 +205,8 @@ class Subscriber:
     @property
     def wanted(self) -> dict[str, str]:
         """Its topics in the order of preference, with the type that the settings name for each, or nothing."""
-        return {topic: self._types_expected.get(topic, '') for topic in self._topics}
+        expected = {topic: alternatives(self._types_expected.get(topic, '')) for topic in self._topics}
+        return {topic: self._type if self._type in names else names[0] for topic, names in expected.items()}
 
     def status(self) -> SubscriberStatus:
         """From any thread: each of its figures is replaced as a whole."""
@@ -294,7 +295,7 @@ class Subscriber:
     def _has_own(self, topic: str, publishers: Sequence[Endpoint]) -> bool:
         """Whether somebody publishes the topic with the type that is named for it."""
         named = self._types_expected.get(topic)
-        return any(not named or publisher.type == named for publisher in publishers)
+        return any(not named or publisher.type in alternatives(named) for publisher in publishers)
 
     def _look_at_others(self, type_name: str, found: Sequence[Endpoint], now_s: float) -> None:
         """Account for the types that the topic is published under besides this one; name each once in the log."""

@@ -128,6 +128,7 @@ class Status:
             'robot': self._settings.robot, 'version': self.version, 'pid': os.getpid(), 'boot_id': self._clock.boot_id,
             'boot_ns': boot_ns, 'time': iso(self._clock.wall_ns()), 'uptime_s': round((boot_ns - self._began_ns) / SECOND, 1),
             'paused': self._stages.intake.paused, 'ended': ended, 'middleware': self._middleware(now_s),
+            'not_logged': dict(self._stages.intake.not_logged),
             'mission': self._stages.mission.status(), 'bag': self._bag(), 'events': self._events(), 'topics': self._topics(now_s),
             'queue': _fields(self._stages.queue.status()) | _fields(self._settings.queue),
             'spool': {'path': str(self._stages.spool.root), **_fields(usage), 'evicted': self._stages.spool.evicted,

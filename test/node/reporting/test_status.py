@@ -35,6 +35,7 @@ class Intake:
     def __init__(self) -> None:
         self.paused = False
         self.worker = Worker('intake', lambda: None)
+        self.not_logged = {'/led': 'no rule'}
         self.sources = [SubscriberStatus('imu', '/imu', enabled=True, publishers=1, received_s=None)]
 
     def left_out(self, _: object) -> int:

@@ -1,0 +1,86 @@
+"""Topics that no sensor names: which of them become sensors (``capture.topics``). Owned by the intake thread."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Mapping
+from typing import Final
+
+from rclpy.node import Node
+
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.options import AUTO, COMPRESSED_IMAGE, IMAGE
+from shadowhound_data_logger.core.type_rules import is_of_go2, sensor_for
+from shadowhound_data_logger.node.intake.consumers import is_plain_name
+from shadowhound_data_logger.ros.reader import endpoints
+
+log = logging.getLogger(__name__)
+
+SETTLE_S: Final = 3.0
+"""How long the graph is looked at before it is concluded that it is not that of a Go2."""
+MAX_FOUND: Final = 200
+"""Sensors made of topics that no settings name: a subscription takes 100 KB, and who publishes decides how many there are."""
+NOT_LOGGED: Final = frozenset({'/parameter_events', '/rosout', '/clock'})
+"""Topics of ROS itself: the node's own log is on one of them."""
+
+
+class FoundTopics:
+    """Finds topics to log. New; ``look`` at each look at the graph."""
+
+    def __init__(self, node: Node, which: str, named: Collection[str]) -> None:
+        """``which`` is ``capture.topics``; ``named`` are full names of the topics that sensors name."""
+        self._node = node
+        self._is_auto = which == AUTO
+        self._named = frozenset(named)
+        self._seen: set[str] = set()
+        self._since_s: float | None = None
+        self._is_go2 = False
+        self._count = 0
+        self.not_logged: Mapping[str, str] = {}
+        """Topic -> why it is not logged. Replaced as a whole."""
+
+    def look(self, sensors: Mapping[str, SensorSettings], now_s: float) -> Iterator[SensorSettings]:
+        """The sensors to add. A topic is judged once: what its publishers are when it is first seen decides."""
+        graph = {name: types for name, types in self._node.get_topic_names_and_types() if is_plain_name(name)}
+        self._since_s = now_s if self._since_s is None else self._since_s
+        if self._is_auto and (self._is_go2 or self._has_go2(graph)):
+            self._is_go2 = True
+            return
+        if now_s - self._since_s < SETTLE_S:
+            return
+        left_out = dict(self.not_logged)
+        for topic in sorted(graph.keys() - self._named - self._seen - NOT_LOGGED):
+            publishers = [each for each in endpoints(self._node, topic) if not each.node or each.node != self._own_name]
+            if not publishers:
+                continue
+            self._seen.add(topic)
+            type_name = publishers[0].type
+            latched = all(each.transient_local for each in publishers)
+            sensor = sensor_for(topic, type_name, sensors.keys(), is_latched=latched)
+            why = self._why_not(topic, type_name, sensor, graph)
+            if sensor is not None and not why:
+                self._count += 1
+                yield sensor
+            else:
+                left_out[topic] = why
+                log.info('%s (%s) is not logged: %s', printable(topic), type_name, why)
+        self.not_logged = left_out
+
+    def _has_go2(self, graph: Mapping[str, list[str]]) -> bool:
+        """Whether somebody publishes what only a Unitree does: the default sensors subscribe to it in any case."""
+        topics = (topic for topic, types in graph.items() if any(map(is_of_go2, types)))
+        return any(is_of_go2(each.type) for topic in topics for each in endpoints(self._node, topic))
+
+    @property
+    def _own_name(self) -> str:
+        return str(self._node.get_fully_qualified_name())
+
+    def _why_not(self, topic: str, type_name: str, sensor: SensorSettings | None, graph: Mapping[str, list[str]]) -> str:
+        if sensor is None:
+            return f'there is no rule for {type_name}; name a sensor for it in the settings'
+        if type_name == IMAGE and COMPRESSED_IMAGE in graph.get(f'{topic}/compressed', ()):
+            return f'{topic}/compressed is'
+        if self._count >= MAX_FOUND:
+            return f'{MAX_FOUND} topics that no settings name are logged already'
+        return ''
