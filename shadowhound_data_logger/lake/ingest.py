@@ -20,17 +20,20 @@ from datetime import datetime, timedelta, timezone
 from typing import Final, NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from deltalake import DeltaTable
 
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import AccessDenied, LakeError
-from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, UNDATED, Row, TableSchema
+from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, UNDATED, Row, TableSchema
+from shadowhound_data_logger.lake import summaries
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import RowFile, RowsOfFile, Scope, as_table, read, row_files
 from shadowhound_data_logger.lake.tables import (
     DATE,
     INGESTED,
+    MISSION_ROWS,
     OBJECT_ROWS,
     PART,
     ROBOT,
@@ -165,10 +168,22 @@ def _commit(source: Bucket, tables: Tables, files: Sequence[RowFile], findings: 
         found = read(source, [file for file in files if file.of is of], findings)
         rows = pa.concat_tables(_tables(of, found, records))
         added = _add(tables, TABLES[of.folder], rows)
+        if of is OBJECTS:
+            _add_missions(source, tables, rows)
         done = replace(done, rows=done.rows + added, repeated=done.repeated + len(rows) - added)
     now = datetime.now(timezone.utc)
     _add(tables, INGESTED, pa.Table.from_pylist([{**each, 'ingested': now} for each in records], schema=INGESTED.schema))
     return replace(done, rejected=sum(each['rejected'] for each in records))
+
+
+def _add_missions(source: Bucket, tables: Tables, rows: pa.Table) -> None:
+    """How the missions ended that these rows of objects name, as far as that is known."""
+    named = rows.filter(pc.is_valid(rows['run_id'])).group_by([ROBOT, 'run_id']).aggregate([])
+    runs = {*zip(named[ROBOT].to_pylist(), named['run_id'].to_pylist(), strict=True)}
+    if runs:
+        there = summaries.known(runs, tables)
+        runs -= {*zip(there[ROBOT].to_pylist(), there['run_id'].to_pylist(), strict=True)}
+        _add(tables, MISSION_ROWS, summaries.uploaded(source, runs))
 
 
 def _add(tables: Tables, table: Table, rows: pa.Table) -> int:

@@ -6,10 +6,8 @@ The engine is that of the tables (lake/tables.py): what a query restricts by fla
 from __future__ import annotations
 
 import re
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
@@ -22,20 +20,31 @@ import pyarrow.compute as pc
 from deltalake import QueryBuilder
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.errors import LakeError, ObjectRefused, PolicyRefused, StoreError
+from shadowhound_data_logger.core.errors import LakeError, PolicyRefused, StoreError
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
 from shadowhound_data_logger.formats.rows.schema import COLUMNS, FORGOTTEN, OBJECTS
 from shadowhound_data_logger.lake import labels
-from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
+from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.gaps import newest, watermarks
 from shadowhound_data_logger.lake.names import misspelled
 from shadowhound_data_logger.lake.select import Wanted, date_of, wanted
-from shadowhound_data_logger.lake.tables import among, answer, batches, engine, literal, narrow, quoted
+from shadowhound_data_logger.lake.summaries import SUMMARY, ended
+from shadowhound_data_logger.lake.tables import (
+    MISSION_ROWS,
+    ROBOT,
+    Tables,
+    among,
+    answer,
+    batches,
+    engine,
+    literal,
+    narrow,
+    quoted,
+)
 from shadowhound_data_logger.lake.views import rows_of, views
 from shadowhound_data_logger.policies.manifest import BUCKET as POLICIES
 from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PREFIX, parse_manifest, split_id
@@ -79,19 +88,8 @@ LONGEST_NS: Final = 24 * 3600 * SECOND
 """For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
 _TIMES: Final = ('robot', 'bucket', 'key', 't_start_ns', 't_end_ns')
 """What says whether an object is in a time that was chosen."""
-_SUMMARY: Final[Mapping[str, tuple[str, pa.DataType]]] = {
-    'command': ('mission_command', pa.string()),
-    'started': ('start', pa.string()),
-    'ended': ('end', pa.string()),
-    'result': ('result', pa.string()),
-    'success': ('success', pa.bool_()),
-    'distance_m': ('distance_m', pa.float64()),
-    'duration_s': ('duration_s', pa.float64()),
-    'battery_consumed_pct': ('battery_consumed_pct', pa.float64()),
-    'policy': ('policy', pa.string()),
-    'policies': ('policies', pa.string()),
-}
-"""Columns of ``missions`` that come from ``summary.json``, null for a mission that has none yet: name there, type."""
+_OF_SUMMARY: Final = [name for name in SUMMARY if name not in {'mission_id', 'mission_type', 'start_ns', 'end_ns'}]
+"""Columns of ``missions`` that are null for a mission that has not ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +302,7 @@ def _conditions(asked: Wanted) -> Iterator[str]:
 
 
 def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
-    """Which there are by their objects; how they ended by their summaries, which lie under the id of the run."""
+    """The missions that have objects among these, and how they ended."""
     asked, condition = _understood(lake, asked)
     if asked.chosen:
         rows = _objects(lake, asked, Shape())
@@ -313,21 +311,19 @@ def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
     else:
         with _opened(lake, asked) as ready:
             found = answer(ready, _MISSION_ROWS.format(ALL, condition))
-    runs = found['run_id'].to_pylist()
-    if None in runs:
+    columns = found.to_pydict()
+    if None in columns['run_id']:
         known = _runs(lake, asked)
-        runs = [run or known.get(mission) for mission, run in zip(found['mission_id'].to_pylist(), runs, strict=True)]
-        found = found.set_column(found.column_names.index('run_id'), 'run_id', pa.array(runs, pa.string()))
-    with ThreadPoolExecutor(THREADS) as pool:
-        told = list(pool.map(lambda pair: _summary(lake.source, *pair), zip(found['robot'].to_pylist(), runs, strict=True)))
-    types = found['mission_type'].to_pylist()
-    kinds = [kind or _value(one.get('mission_type'), pa.string()) for kind, one in zip(types, told, strict=True)]
-    found = found.set_column(found.column_names.index('mission_type'), 'mission_type', pa.array(kinds, pa.string()))
-    for column, (name, kind) in _SUMMARY.items():
-        found = found.append_column(column, pa.array([_value(one.get(name), kind) for one in told], kind))
-    policies = found['policy'].to_pylist()
-    datasets = {each: _dataset_of(lake.source, each) for each in {*policies} - {None}}
-    return found.append_column('policy_dataset', pa.array(map(datasets.get, policies), pa.string()))
+        columns['run_id'] = [run or known.get(name) for name, run in zip(columns['mission_id'], columns['run_id'], strict=True)]
+    runs = [*zip(columns[ROBOT], columns['run_id'], strict=True)]
+    by_run = ended(lake.source, {(robot, run) for robot, run in runs if run is not None}, Tables.of(lake.source), lake.as_of)
+    ends = [by_run.get(run, {}) for run in runs]
+    types = [kind or end.get('mission_type') for kind, end in zip(columns['mission_type'], ends, strict=True)]
+    columns |= {'mission_type': types, **{name: [end.get(name) for end in ends] for name in _OF_SUMMARY}}
+    datasets = {each: _dataset_of(lake.source, each) for each in {*columns['policy']} - {None}}
+    columns['policy_dataset'] = [datasets.get(each) for each in columns['policy']]
+    kinds = {**{field.name: field.type for field in MISSION_ROWS.schema}, **{field.name: field.type for field in found.schema}}
+    return pa.table({name: pa.array(values, kinds.get(name, pa.string())) for name, values in columns.items()})
 
 
 def _dataset_of(source: Bucket, policy: str) -> str | None:
@@ -398,23 +394,3 @@ def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     with _opened(lake, of_time) as ready:
         found = answer(ready, f'SELECT mission_id, max(run_id) AS run_id FROM {ALL} WHERE {where} GROUP BY mission_id')  # noqa: S608
     return dict(zip(found['mission_id'].to_pylist(), found['run_id'].to_pylist(), strict=True))
-
-
-def _summary(source: Bucket, robot: str, run_id: str | None) -> dict[str, Any]:
-    """What a mission's summary says; empty where there is none yet, or none that can be read."""
-    if run_id is None:
-        return {}
-    try:
-        told = from_json(source.get(f'{robot}/missions/{run_id}/summary.json', MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
-    except (ObjectRefused, ValueError):
-        return {}
-    return told if isinstance(told, dict) else {}
-
-
-def _value(value: Any, kind: pa.DataType) -> Any:
-    """Null for what is not of its kind: a summary may be of another version."""
-    if kind == pa.float64():
-        return float(value) if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max else None
-    if kind == pa.string():  # half a surrogate pair is not text
-        return value.encode(errors='replace').decode() if isinstance(value, str) else None
-    return value if isinstance(value, bool) else None

@@ -96,15 +96,28 @@ INGESTED: Final = Table(
     (PART, 'etag'), 'ingested', 'ingested', (DATE,),
 )  # fmt: skip
 """Which row files the other tables contain: a row here is committed after all rows of its file."""
+MISSION_ROWS: Final = Table(
+    'missions',
+    pa.schema([
+        (DATE, pa.string()), (ROBOT, pa.string()), ('mission_id', pa.string()), ('run_id', pa.string()),
+        ('mission_type', pa.string()), ('start_ns', pa.int64()), ('end_ns', pa.int64()), ('command', pa.string()),
+        ('started', pa.string()), ('ended', pa.string()), ('result', pa.string()), ('success', pa.bool_()),
+        ('distance_m', pa.float64()), ('duration_s', pa.float64()), ('battery_consumed_pct', pa.float64()),
+        ('policy', pa.string()), ('policies', pa.string()),
+    ]),
+    ('run_id',), 'start_ns', 'start_ns',
+)  # fmt: skip
+"""How missions ended (lake/summaries.py). No row file has its rows: ingest makes them of the missions' summaries."""
 TABLES: Final[Mapping[str, Table]] = {
     OBJECTS.folder: OBJECT_ROWS,
     KEPT.folder: _table('kept', KEPT, ('bucket', 'key', 'where', 'bytes'), 't_start_ns'),
     FORGOTTEN.folder: _table('forgotten', FORGOTTEN, ('bucket', 'key'), 't_start_ns'),
     GAPS.folder: _table('gaps', GAPS, ('id', 'revision', 'what', 'from_ns', 'to_ns'), 'to_ns', 't_to'),
     STATISTICS.folder: _table('statistics', STATISTICS, ('bucket', 'key', 't_start_ns', 'field'), 't_start_ns'),
+    MISSION_ROWS.name: MISSION_ROWS,
     LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns', 'made'),
 }
-"""By the folder of the row files in the store."""
+"""By the folder of the row files in the store; that of missions, which have none, by its name."""
 SCHEMAS: Final[Mapping[str, TableSchema]] = {
     each.folder: each for each in (OBJECTS, KEPT, FORGOTTEN, GAPS, STATISTICS, LABELS)
 }  # fmt: skip

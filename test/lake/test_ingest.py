@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -12,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from lake.gap_parts import lost, tell
-from lake.making import NOON_NS, add, add_part, fill, folder_store, keys, row
+from lake.making import FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill, folder_store, keys, row, watched
 
+from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.formats.rows import schema
@@ -22,7 +24,7 @@ from shadowhound_data_logger.lake import ingest as library
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.ingest import Scope, fresh, ingest, pending, row_files, tend
-from shadowhound_data_logger.lake.tables import INGESTED, OBJECT_ROWS, TABLES, Tables, answer, engine
+from shadowhound_data_logger.lake.tables import INGESTED, MISSION_ROWS, OBJECT_ROWS, TABLES, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:
@@ -102,6 +104,43 @@ def test_a_row_is_dated_by_its_own_time(tmp_path: Path, tables: Tables) -> None:
     with engine({'objects': tables.open(OBJECT_ROWS)}) as ready:
         dates = answer(ready, 'SELECT date FROM objects ORDER BY t_start_ns')['date'].to_pylist()
     assert dates == ['2026-10-28', '2026-10-29', '2026-10-29']
+
+
+def summary_reads(source: Watched) -> list[str]:
+    return [key for verb, key in source.asked if verb == 'get' and key.endswith('/summary.json')]
+
+
+def test_how_a_mission_ended_is_in_the_tables_and_never_changes(tmp_path: Path) -> None:
+    """A query reads only the summaries of missions that had not ended; a robot that replaces its summary changes nothing."""
+    settings = folder_store(tmp_path)
+    fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
+    source = watched(settings)
+    source.inner.delete(f'thor/missions/run-{FAILED}/summary.json')
+    assert lake.missions(source, success=True)['mission_id'].to_pylist() == [FINISHED]
+    source.inner.delete(f'thor/missions/run-{FINISHED}/summary.json')
+    late = {'success': False, 'result': 'FAILED', 'distance_m': 'far', 'start_ns': NOON_NS}
+    with closing(open_store(settings, UploadSettings())) as store:
+        forged = json.dumps({'success': False}).encode()
+        add(store, tmp_path / 'tmp', f'thor/missions/run-{FINISHED}/summary.json', forged)
+        add(store, tmp_path / 'tmp', f'thor/missions/run-{FAILED}/summary.json', json.dumps(late).encode())
+        source.asked.clear()
+        ends = {each['mission_id']: each for each in lake.missions(source).to_pylist()}
+        assert {name: (each['success'], each['distance_m']) for name, each in ends.items()} == {
+            FAILED: (False, None), FINISHED: (True, 12.5),
+        }  # fmt: skip
+        assert summary_reads(source) == [f'thor/missions/run-{FAILED}/summary.json'], 'that of a mission that had not ended'
+        named = {**row('camera', NOON_NS + 7 * SECOND), 'mission_id': FAILED, 'run_id': f'run-{FAILED}'}
+        add_part(store, [named], 'late', tmp_path / 'tmp')
+    lake.objects(source)
+    source.asked.clear()
+    assert sorted(lake.missions(source, success=False)['mission_id'].to_pylist()) == [FAILED]
+    assert summary_reads(source) == []
+    with engine({'missions': Tables.of(source.inner).open(MISSION_ROWS)}) as ready:
+        found = answer(ready, 'SELECT date, robot, run_id, success FROM missions ORDER BY date').to_pylist()
+    assert found == [
+        {'date': '1970-01-01', 'robot': 'thor', 'run_id': f'run-{FINISHED}', 'success': True},
+        {'date': '2026-10-28', 'robot': 'thor', 'run_id': f'run-{FAILED}', 'success': False},
+    ]
 
 
 def test_a_kill_between_the_rows_and_the_record_of_their_file_repeats_nothing(

@@ -12,7 +12,7 @@ from typing import Any
 import boto3
 import pytest
 from deltalake.exceptions import DeltaError
-from lake.making import DAY_NS, NOON_NS, add_part, fill, folder_store, keys, merge, row
+from lake.making import DAY_NS, FAILED, NOON_NS, add_part, fill, folder_store, keys, merge, row
 from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger import lake
@@ -96,6 +96,8 @@ def test_a_query_as_of_a_time_sees_what_the_tables_had_then(server: Tower, tmp_p
     assert found(owner, as_of=then) == keys(rows)
     assert found(owner) == keys([*rows, *more])
     assert lake.sql('SELECT count(*) AS n FROM objects', owner, as_of=then).to_pylist() == [{'n': len(rows)}]
+    owner.delete(f'thor/missions/run-{FAILED}/summary.json')
+    assert lake.missions(owner, as_of=then, success=False)['mission_id'].to_pylist() == [FAILED]
 
 
 def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower, tmp_path: Path) -> None:
