@@ -45,12 +45,13 @@ from shadowhound_data_logger.formats.mcap.format import CHUNK, RECORD, record, t
 from shadowhound_data_logger.formats.mcap.index import records
 from shadowhound_data_logger.formats.mcap.messages import unpack
 from shadowhound_data_logger.formats.rows import parts, schema
-from shadowhound_data_logger.lake import decode, query
+from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.fetch import FetchRequest
 from shadowhound_data_logger.lake.fetch import fetch as fetch_objects
 from shadowhound_data_logger.lake.samples import Near, Samples, Selection, Window
+from shadowhound_data_logger.lake.summaries import uploaded
 from shadowhound_data_logger.lake.tables import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -288,10 +289,9 @@ def summaries(shop: Shop) -> Round:
         source = Bucket(StoreSettings(directory=shop.input), schema.BUCKET)
         run = rng.choice(('run', 'run', 'run', *TEXTS))
         with shop.reading():
-            told = query._summary(source, rng.choice(('thor', 'thor', *TEXTS)), run)
-            for name, kind in query._SUMMARY.values():
-                query.pa.array([query._value(told.get(name), kind)], kind)
-        return 'answered' if told else 'nothing'
+            found = uploaded(source, [(rng.choice(('thor', 'thor', *TEXTS)), run)])
+        found.validate(full=True)
+        return 'answered' if len(found) else 'nothing'
 
     return one
 

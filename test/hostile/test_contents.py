@@ -28,7 +28,7 @@ from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.decode import table
 from shadowhound_data_logger.lake.prefetch import Prefetch
-from shadowhound_data_logger.lake.query import _summary
+from shadowhound_data_logger.lake.summaries import uploaded
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet
 
@@ -230,7 +230,7 @@ def test_a_summary_that_is_none_costs_its_own_figures_alone(tmp_path: Path, told
     path = settings.directory / schema.BUCKET / 'thor/missions/run/summary.json'
     path.parent.mkdir(parents=True)
     path.write_bytes(told)
-    assert _summary(Bucket(settings, schema.BUCKET), 'thor', 'run') == {}
+    assert len(uploaded(Bucket(settings, schema.BUCKET), [('thor', 'run')])) == 0
 
 
 def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path: Path) -> None:
