@@ -51,7 +51,7 @@ from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps, prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.forgotten import forgotten
+from shadowhound_data_logger.lake.prune import forgotten
 from shadowhound_data_logger.node.encoding.halving import Halving
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer

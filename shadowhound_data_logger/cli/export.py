@@ -413,7 +413,7 @@ def _date_of(key: str) -> str | None:
 def _forgotten() -> Mapping[tuple[str, str], str]:
     """(bucket, key) -> the date on which it was deleted from the store on purpose."""
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-    from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten  # noqa: PLC0415
+    from shadowhound_data_logger.lake.prune import dates_of_deletion, forgotten  # noqa: PLC0415
 
     return dates_of_deletion(forgotten(default_source(the_store_settings()), None, quietly()))
 

@@ -1,4 +1,4 @@
-"""The bucket of the lake: what is asked of it, as a value that another process may be given, and how a part is put into it."""
+"""The bucket with the data of robots: reads it, as a value that can be passed to another process, and puts row files into it."""
 
 from __future__ import annotations
 
@@ -26,24 +26,22 @@ from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of
 
 THREADS: Final = 16
-"""Requests on their way at a time; each waits, most of its time, for the server."""
+"""Requests at a time; each spends most of its time waiting for the server."""
 _Answer = TypeVar('_Answer')
 
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """Reads and lists one bucket, by the calls of ``stores/base.py``, each with some tries.
+    """Reads and lists one bucket with the calls of ``stores/base.py``, each with some tries.
 
-    Thread-safe; its repr shows no secret.
-
-    Nothing but a StoreError leaves, or SettingError for settings that no request can be sent with.
+    Thread-safe; its repr shows no secret. Raises only StoreError, or SettingError for settings that no request can be sent with.
     """
 
     settings: StoreSettings = field(repr=False)
     name: str
 
     def describe(self) -> str:
-        """Where it is, for a sentence; never a secret."""
+        """Where it is, for a message; contains no secret."""
         return f'the bucket {self.name} {"of" if self.settings.endpoint_url else "in"} {_reader(self.settings).describe()}'
 
     def folders(self, prefix: str) -> Sequence[str]:
@@ -69,14 +67,14 @@ class Bucket:
 
 
 def default_source(settings: StoreSettings | None = None) -> Bucket:
-    """The bucket with the catalogue in the store that the environment names."""
+    """The bucket with the row files of robots, in the store that the environment names."""
     return Bucket(settings or store_settings(os.environ, home(os.environ)), BUCKET)
 
 
 def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -> None:
-    """A part of the catalogue into the store; returns when it is there. Raises StoreError.
+    """Put a row file into the store; returns when it is there. Raises StoreError.
 
-    Its key says which rows are in it: who was there first wrote the same, and is not overwritten.
+    Its key follows from its rows: a file that is there already has the same rows, and is not overwritten.
     """
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
         path = Path(folder, 'part')
@@ -92,5 +90,5 @@ def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -
 
 @lru_cache(maxsize=16)
 def _reader(settings: StoreSettings) -> ObjectStore:
-    """One a process: it holds the connections."""
+    """One per process: it holds the connections."""
     return open_reader(settings)

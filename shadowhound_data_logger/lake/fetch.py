@@ -1,6 +1,6 @@
-"""Objects into a folder: parallel, each verified by its SHA-256, each file whole or not there, and never the same bytes twice.
+"""Downloads objects into a folder: in parallel, each verified by its SHA-256; a file is complete or absent, and is moved once.
 
-It may be killed at any moment and goes on where it was. A file's place is its key: ``DIR/thor/camera/20261121/120000_front.jpg``.
+It can be killed at any moment and continues there. The path of a file is its key: ``DIR/thor/camera/20261121/120000_front.jpg``.
 """
 
 from __future__ import annotations
@@ -28,40 +28,40 @@ from shadowhound_data_logger.stores.download import download
 
 THREADS: Final = 16
 AHEAD: Final = 8
-"""Objects that wait for each thread: enough that none is idle, few enough that an interrupt is prompt."""
+"""Objects queued per thread: enough to keep it busy, few enough to stop promptly on an interrupt."""
 NOTE_S: Final = 1.0
-"""What a kill can make it hash again."""
+"""At most so much is hashed again after a kill."""
 _NO_DISK: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 AWAY: Final = 8
-"""Objects after one another that the store does not answer for: it is away, and the others need not try."""
+"""Consecutive objects for which the store does not answer: it is unreachable, and the others are not tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class FetchRequest:
-    """An object that is to be in the folder."""
+    """An object that must be in the folder."""
 
     bucket: str
     key: str
     size: int
     sha256: str | None = None
-    """By the catalogue; None: what the object itself says."""
+    """From its row; None: that of the object's metadata."""
     etag: str = ''
-    """By a listing."""
+    """From a listing."""
 
 
 @dataclass(slots=True)
 class FetchResult:
-    """What became of the wishes, as it goes on: each is in one of the first three."""
+    """The outcome of the requests so far: each is in one of the first three."""
 
     moved: int = 0
     present: int = 0
-    """Were there already."""
+    """They were complete already."""
     failed: dict[str, str] = field(default_factory=dict)
     """``bucket/key`` -> why."""
     bytes: int = 0
-    """That were moved, in whole objects."""
+    """Of the objects that were moved."""
     unverified: int = 0
-    """Moved objects of which nobody knows the SHA-256: they have the right size."""
+    """Moved objects whose SHA-256 is unknown: only their sizes were compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class _Done:
 
 
 def under(source: Bucket, prefix: str) -> list[FetchRequest]:
-    """All whose keys start with the prefix, also those that ``fetch`` refuses because they are not paths. Raises StoreError."""
+    """All objects whose keys start with the prefix, also those whose keys are not paths. Raises StoreError."""
     odd: list[FetchRequest] = []
     found = source.list(prefix, lambda bucket, key: odd.append(FetchRequest(bucket, key, 0)))
     return [*(FetchRequest(source.name, entry.key, entry.size, etag=entry.etag) for entry in found), *odd]
@@ -82,16 +82,16 @@ def fetch(
     wishes: Sequence[FetchRequest], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
     tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
 ) -> FetchResult:  # fmt: skip
-    """Put them there; ``verify`` reads what is there already once more. ``tell`` hears of bytes and objects, from any thread.
+    """Download them; ``verify`` also reads the files that are there already. ``tell`` is called with the result, from any thread.
 
-    Raises StoreError where the store as a whole refuses or is away, LakeError where the folder cannot be written.
+    Raises StoreError if the store rejects all requests or is unreachable, LakeError if the folder cannot be written.
     """
     with Fetched(folder) as fetched, ThreadPoolExecutor(threads, 'fetch') as pool:
         return _Fetch(fetched, store, tell, verify=verify).run(wishes, pool, threads * AHEAD)
 
 
 class _Fetch:
-    """One run. The calling thread decides and notes; the pool moves."""
+    """One run. The calling thread decides and records; the pool downloads."""
 
     def __init__(self, fetched: Fetched, store: ObjectStore, tell: Callable[[int, int], None], *,
                  verify: bool) -> None:  # fmt: skip
@@ -125,7 +125,7 @@ class _Fetch:
         return self.result
 
     def _wanting(self, wishes: Sequence[FetchRequest]) -> Iterator[FetchRequest]:
-        """Those that are not known to be there."""
+        """Those that are not known to be in the folder."""
         seen: set[str] = set()
         for wish in dict.fromkeys(wishes):  # the rows of repeats name one object
             if (refusal := _refusal(wish)) or wish.key in seen:
@@ -140,7 +140,7 @@ class _Fetch:
                 yield wish
 
     def _settle(self, wish: FetchRequest, future: Future[_Done]) -> None:
-        """Account for one. Raises what concerns all of them."""
+        """Count one. Raises errors that concern all of them."""
         try:
             self._count(future.result())
         except (ObjectRefused, AccessDenied, BucketMissing) as error:
@@ -188,7 +188,7 @@ class _Fetch:
         return held
 
     def _held(self, wish: FetchRequest, path: Path) -> _Done | None:
-        """What is there already, if it is what was stored: left by a run that was killed, or by another program."""
+        """The file that is there already, if its content is the object's: from a run that was killed, or from another program."""
         if not path.is_file() or path.stat().st_size != wish.size:
             return None
         info = None if wish.sha256 else steadily(lambda: self._store.head(wish.bucket, wish.key), pause=self._pause)
@@ -221,20 +221,20 @@ class _Fetch:
         return _Done(file, moved=True, proved=found.is_proved)
 
     def _pause(self, seconds: float) -> None:
-        """Between two tries. Raises LakeError where the run is over: nobody waits for this object any more."""
+        """Wait between two tries. Raises LakeError if the run has ended."""
         if self._over.wait(seconds):
             raise LakeError('the fetch was broken off')
 
 
 def _refusal(wish: FetchRequest) -> str:
-    """Why an object can be no file below the folder; empty when it can. Anybody may have written to the bucket."""
+    """Why an object cannot be a file below the folder; empty if it can. The bucket may contain hostile keys."""
     if not is_path(wish.key):
         return 'its key is not a path'
     return 'its key is ours' if wish.key.split('/', maxsplit=1)[0] == FOLDER else ''
 
 
 def _is(known: Verified, wish: FetchRequest) -> bool:
-    """Whether a file that is as it was noted is what is wanted."""
+    """Whether a file that matches its record is the requested object."""
     same = (known.bucket, known.size) == (wish.bucket, wish.size)
     if wish.sha256 is not None:
         return same and known.sha256 == wish.sha256

@@ -1,7 +1,7 @@
-"""What lies in a folder of fetched objects: files that were verified, which a second run leaves alone, and their rows.
+"""A folder of fetched objects: files that were verified, which a second run skips, and their rows.
 
-``DIR/.fetch/`` holds a SQLite file, the lock of the one fetch at a time, and what is not whole yet. The rows lie in the folder as
-in the bucket, so it is a lake of its own: ``MissionDataset('DIR')`` needs no store.
+``DIR/.fetch/`` contains a SQLite file, a lock that admits one fetch at a time, and incomplete files. The row files have the same
+places as in the bucket, so the folder can be queried like a store: ``MissionDataset('DIR')``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from shadowhound_data_logger.lake.row_files import backfilled_key
 FOLDER: Final = '.fetch'
 UNWRITABLE: Final = 'name a folder of yours, on a disk that has room'
 PARTS: Final = f'{FOLDER}/parts'
-"""Of files that are not whole yet."""
+"""Of incomplete files."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS files (
     key TEXT PRIMARY KEY, bucket TEXT NOT NULL, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sha256 TEXT NOT NULL,
@@ -46,7 +46,7 @@ _KNOWN: Final = "SELECT key, bucket, size, mtime_ns, sha256, etag FROM files WHE
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """A file as it was when its content was compared with what was stored."""
+    """A file when its content was compared with the checksum of the object."""
 
     key: str
     bucket: str
@@ -59,10 +59,10 @@ class Verified:
 class Fetched:
     """Which files of a folder are known to be complete.
 
-    Enter once, leave once, on one thread. A file whose size or time differs from what was noted is unknown.
+    Lifecycle: enter once, exit once, on one thread. A file whose size or time differs from its record is unknown.
 
-    Files are not synced one by one, which would take longer than to move them. What was noted and not synced, because the process
-    was killed, is believed in the same boot and read again after the next: a power cut may have taken it.
+    Files are not synced one by one, which would take longer than downloading them. Records that were not synced, because the
+    process was killed, are trusted until the next boot; then the files are read again, because a power cut may have damaged them.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -74,7 +74,7 @@ class Fetched:
         self._db: sqlite3.Connection | None = None
 
     def __enter__(self) -> Self:
-        """Raises LakeError where another fetch is at work or the folder cannot be written."""
+        """Raises LakeError if another fetch is running or the folder cannot be written."""
         home = self.folder / FOLDER
         try:
             home.mkdir(parents=True, exist_ok=True)
@@ -115,7 +115,7 @@ class Fetched:
         return self.folder / key
 
     def verified(self, key: str) -> Verified | None:
-        """What is known of the file of this key, if it is as it was."""
+        """The record of the file of this key, if the file has not changed since."""
         known = self._known.get(key)
         if known is None:
             return None
@@ -132,7 +132,7 @@ class Fetched:
             self._db.executemany('INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?, ?, ?, ?)', rows)
 
     def _opened(self, path: Path) -> sqlite3.Connection:
-        """A file that SQLite cannot read is only a memory: it starts again."""
+        """A file that SQLite cannot read is replaced: it is only a cache."""
         for attempt in range(2):
             db = sqlite3.connect(path)
             try:
@@ -153,11 +153,9 @@ class Fetched:
 
 
 def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One part for each robot and date among rows as Daft gives them. Raises LakeError where it cannot be written.
+    """Write one row file per robot and date. Raises LakeError if it cannot be written.
 
-    Rows that two fetches brought are shown once, because these files count as backfilled parts.
-
-    A row whose robot is not a name is left out: anybody may have written it, and the name becomes a folder's.
+    Rows whose robot is not a valid name are ignored: the name becomes that of a folder.
     """
     plain = [
         {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
@@ -170,7 +168,7 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         if path.is_file():
             continue
         try:
-            part = folder / PARTS / f'rows-{os.getpid()}'  # where the next fetch clears away what a kill left
+            part = folder / PARTS / f'rows-{os.getpid()}'  # the next fetch deletes what is left there after a kill
             for place in (part.parent, path.parent):
                 place.mkdir(parents=True, exist_ok=True)
             with replacing(path, part=part) as file:
@@ -180,5 +178,5 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _micros(row: Mapping[str, Any], name: str) -> int | None:
-    """As a robot writes them: of what has no date there is none."""
+    """As in row files; None for an object without a date."""
     return None if row[name] is None else int(row[f'{name}_ns']) // 1000

@@ -1,4 +1,4 @@
-"""What an answer leaves out: invalid parts of the catalogue, and rows of another robot."""
+"""What an answer lacks: invalid row files, and rows that were rejected."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A part, or a folder of parts, that an answer lacks."""
+    """A row file, or a folder of them, that an answer lacks."""
 
     key: str
     why: str
     rows: int | None = None
-    """So many of its rows; None: all that is in it."""
+    """How many of its rows; None: all of them."""
 
     def __str__(self) -> str:
         return f'{visible(self.key)} is left out: {visible(self.why)}'
@@ -31,9 +31,9 @@ def warn(one: LeftOut) -> None:
 
 
 class Findings:
-    """Collects what an answer leaves out.
+    """Collects what an answer lacks.
 
-    Each is reported once, however many queries meet it. Thread-safe. In another process it starts anew, and warns.
+    Each is reported once, in however many queries it occurs. Thread-safe. In another process it starts empty, and warns.
     """
 
     def __init__(self, tell: Callable[[LeftOut], None] = warn) -> None:

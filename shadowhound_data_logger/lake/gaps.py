@@ -1,8 +1,8 @@
-"""What is known of a stream between two times: what the store has, what was lost and why, and where nobody knows.
+"""What is known about a topic between two times: what is stored, what was lost and why, and for which times losses are unknown.
 
-``known`` is the one question for everything that shows data or trains on it. It reads the statements of the gap journal
-(formats/rows/gaps.py): the newest about each gap counts, whatever else was said before and in whatever part it lies. No gap is
-known to be none only where a watermark reaches; a robot that is off, or out of reach, leaves the time open until it tells.
+Everything that shows data or trains on it calls ``known``. It reads the statements of the gap journal (formats/rows/gaps.py), of
+which the newest about each gap counts. Only within a watermark does the absence of a gap mean that nothing was lost; while a
+robot is off or unreachable, losses are unknown until it reports.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import home, store_settings
@@ -33,28 +31,25 @@ from shadowhound_data_logger.lake.views import views
 
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 SINKS: Final = (OBJECTS, BAGS, EVENTS)
-"""Where messages go, each with gaps of its own."""
+"""Where messages are stored; each has its own gaps."""
 HOUR_NS: Final = 3600 * SECOND
 OTHER_TYPE: Final = 'wrong_type'
-"""Rejected messages of another type than the topic's: nothing of the topic's own is missing."""
+"""Rejected messages of another type than the topic's: no message of the topic itself is missing."""
 RECEIVED_ONLY: Final = 'received-only'
 MOST_CAUSES: Final = 64
-"""Of a topic, by name; all further ones are one, ``MORE_CAUSES``. Ours are some twenty; a part may have one for each row."""
+"""Of a topic, by name; others are counted as ``MORE_CAUSES``. The node has about 20; a hostile file can have one per row."""
 MORE_CAUSES: Final = '(more)'
 _NEWEST: Final = (
     f'SELECT {", ".join(map(quoted, GAPS.columns))} FROM (SELECT *, row_number() OVER (PARTITION BY robot, id '  # noqa: S608
     'ORDER BY revision DESC, what ASC, to_ns DESC, from_ns DESC) AS _place FROM all_gaps WHERE {}) WHERE _place = 1 '
     'ORDER BY robot, id'
 )
-"""The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
-_ORDER: Final = [('robot', 'ascending'), ('id', 'ascending'), ('revision', 'descending'), ('what', 'ascending')]
-_FIRST: Final = [*_ORDER, *((name, 'descending') for name in GAPS.columns if name not in dict(_ORDER))]
-"""The newest statement first; a gap before the withdrawal of the same revision, with which it moved to another day."""
+"""The newest statement of each; a gap before a withdrawal of the same revision, which moved it to another day."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatedGap:
-    """A statement of the gap journal about messages that are not in the store; what is not known is None."""
+    """A statement of the gap journal about messages that are not in the store; unknown values are None."""
 
     robot: str
     sink: str
@@ -70,36 +65,36 @@ class StatedGap:
     """Stamp of the first message after."""
     count: int | None
     merged: int | None
-    """So many gaps within one second are one here."""
+    """How many gaps within one second are combined in this one."""
     grade: str | None
     mission_id: str | None
     clock: str | None
 
 
 class Stretch(NamedTuple):
-    """A time in which the same is known all along: from ``begin_ns`` until before ``end_ns``."""
+    """A time with the same state throughout: from ``begin_ns`` until before ``end_ns``."""
 
     begin_ns: int
     end_ns: int
     causes: tuple[str, ...]
-    """Why messages of this time are not in the store; empty where none is missing, or nobody knows."""
+    """Why messages of this time are not in the store; empty if none is missing, or if that is unknown."""
     grade: str
-    """How well it is known that no other message is missing: ``exact``, ``estimated``; '' where it is not known."""
+    """How it is known that no other message is missing: ``exact``, ``estimated``; '' if it is unknown."""
 
     @property
     def is_whole(self) -> bool:
-        """Whether all of it is in the store, as far as the robot's settings want it there."""
+        """Whether everything that the robot's settings select is in the store."""
         return bool(self.grade) and not self.causes
 
     @property
     def is_open(self) -> bool:
-        """Whether nobody knows what is missing: it may be nothing."""
+        """Whether it is unknown what is missing, if anything."""
         return not self.grade and not self.causes
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known of one sink and topic of a robot between two times."""
+    """What is known about one sink and topic of a robot between two times."""
 
     robot: str
     sink: str
@@ -107,24 +102,24 @@ class Known:
     begin_ns: int
     end_ns: int
     stretches: tuple[Stretch, ...]
-    """One after the other, all of the time."""
+    """Consecutive; together they are the whole time."""
     gaps: tuple[StatedGap, ...]
-    """Those that reach into the time, in its order; a gap that reaches beyond it is told whole."""
+    """Those that overlap the time, in order; they are not cut at its ends."""
     untimed: tuple[StatedGap, ...]
-    """Gaps of which nobody knows the time; they can lie anywhere."""
+    """Gaps at unknown times."""
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is known that nothing is missing in all of the time."""
+        """Whether nothing is missing in the whole time, and that is known."""
         return all(each.is_whole for each in self.stretches)
 
     @property
     def complete_ns(self) -> int:
-        """Up to here it is known what is missing: the watermark, as far as this time goes."""
+        """Up to here losses are known: the watermark, within this time."""
         return next((each.begin_ns for each in self.stretches if each.is_open), self.end_ns)
 
     def between(self, begin_ns: int, end_ns: int) -> Known:
-        """Of a part of the time, without reading again. Raises ValueError for a time that is not in it."""
+        """A part of the time, without reading the store again. Raises ValueError for a time outside of it."""
         if not self.begin_ns <= begin_ns <= end_ns <= self.end_ns:
             raise ValueError(f'{begin_ns} to {end_ns} is not within {self.begin_ns} to {self.end_ns}')
         first = max(0, bisect_right(self.stretches, begin_ns, key=lambda each: each.begin_ns) - 1)
@@ -141,12 +136,12 @@ class Known:
 
 def known(robot: str, topic: str, since: str | datetime | int, until: str | datetime | int = 'now', *, sink: str = OBJECTS,
           source: Bucket | None = None, findings: Findings | None = None) -> Known:  # fmt: skip
-    """What is known of a topic from ``since`` until before ``until``: in words as of ``query``, or in ns since 1970.
+    """What is known about a topic from ``since`` until before ``until``: times as in ``query``, or in ns since 1970.
 
-    Three answers, stretch by stretch: it is whole; messages are missing, with the gaps; or nobody knows. Without numbers or a
-    rhythm (``received-only``) nobody knows. Ask once for a long time, and ``Known.between`` for its parts. Without a source it
-    asks the store that the environment names. Parts that are none are left out: ``findings`` has them, else the log warns.
-    Raises SettingError, StoreError.
+    Each stretch is complete, or has gaps, or is unknown. Without sequence numbers or a regular rate (``received-only``) losses
+    are unknown. For several times, call it once for all of them, and then ``Known.between``. Without a source, it reads the store
+    that the environment names. Invalid row files are ignored: they are in ``findings``, or the log warns. Raises SettingError,
+    StoreError.
     """
     now_ns = time.time_ns()
     if sink not in SINKS:
@@ -165,7 +160,7 @@ def moment_ns(name: str, given: str | datetime | int, now_ns: int) -> int:
 
 def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str | None = None, sink: str | None = None,
            since_ns: int | None = None, findings: Findings | None = None) -> pa.Table:  # fmt: skip
-    """The statements that count, about times from then on or none, with the columns of ``catalogue.gaps.GAPS``.
+    """The statements that count, about times from then on or unknown ones, with the columns of ``GAPS``.
 
     Raises StoreError, LakeError.
     """
@@ -180,22 +175,8 @@ def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str
         return answer(ready, _NEWEST.format(' AND '.join(conditions) or 'true'))
 
 
-def folded(rows: pa.Table) -> pa.Table:
-    """The newest statement about each thing, withdrawals among them: in whatever order and how often they are given.
-
-    Whatever is folded again, alone or with others, gives what all at once would have given.
-    """
-    if not len(rows):
-        return rows
-    found = rows.take(pc.sort_indices(rows, sort_keys=_FIRST)).combine_chunks()
-    is_first = np.ones(len(found), bool)
-    same = [pc.equal(found[name][1:], found[name][:-1]).to_numpy() for name in ('robot', 'id')]
-    is_first[1:] = ~(same[0] & same[1])
-    return found.filter(pa.array(is_first))
-
-
 def of_rows(robot: str, sink: str, topic: str, begin_ns: int, end_ns: int, rows: Iterable[Mapping[str, Any]]) -> Known:
-    """As ``known``, of newest statements of that robot, sink and topic."""
+    """As ``known``, from the newest statements of that robot, sink and topic."""
     rows = list(rows)
     told = [_gap(row) for row in rows if row['what'] == GAP]
     gaps = sorted((gap for gap in told if _reaches(gap.from_ns, gap.to_ns, begin_ns, end_ns)), key=_by_time)
@@ -206,7 +187,7 @@ def of_rows(robot: str, sink: str, topic: str, begin_ns: int, end_ns: int, rows:
 
 
 def watermarks(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The newest ``complete`` statement of each session, sink and topic: it speaks of ``from_ns`` to ``to_ns``."""
+    """The newest ``complete`` statement of each session, sink and topic: it covers ``from_ns`` to ``to_ns``."""
     best: dict[tuple[Any, ...], Mapping[str, Any]] = {}
     for row in rows:
         if row['what'] == COMPLETE and row['from_ns'] is not None and row['to_ns'] is not None and row['clock'] != 'unset':
@@ -236,7 +217,7 @@ def _reaches(from_ns: int | None, to_ns: int | None, begin_ns: int, end_ns: int)
 def _stretches(
     begin_ns: int, end_ns: int, marks: Sequence[tuple[int, int, str | None]], gaps: Sequence[StatedGap]
 ) -> Iterator[Stretch]:
-    """One pass over all times at which something begins or ends."""
+    """One pass over all times at which the state changes."""
     changes: defaultdict[int, list[tuple[Counter[str], str, int]]] = defaultdict(list)
     causes, grades = Counter[str](), Counter[str]()
     words: dict[str, str] = {}
@@ -280,17 +261,17 @@ class Coverage:
 
     known: Known
     hours: tuple[tuple[int, Mapping[str, float]], ...]
-    """Begin of each UTC hour -> seconds of ``stored``, ``downsampled``, ``not known yet``, and of each cause of gaps.
+    """Start of each UTC hour -> seconds of ``stored``, ``downsampled``, ``not known yet``, and of each cause of gaps.
 
-    Where several causes hold at a time, it counts for the first of them by name.
+    A time with several causes counts for the first of them by name.
     """
     downsampled: tuple[tuple[int, int], ...]
-    """Times from which messages were left out on purpose, since the rate of the topic is set lower than it comes."""
+    """Times of which messages were skipped on purpose, because the sensor's rate is lower than the topic's."""
 
 
 def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: str | None = None, sink: str = OBJECTS,
              source: Bucket | None = None, findings: Findings | None = None) -> list[Coverage]:  # fmt: skip
-    """Of each robot and topic of which anything is known, or of the one that is named. Raises StoreError."""
+    """Of each robot and topic with statements, or of the named one. Raises StoreError."""
     found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=since_ns, findings=findings)
     grouped: defaultdict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in found.to_pylist():
@@ -306,7 +287,7 @@ def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: s
 
 
 def downsampled_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
-    """Between two watermarks of a session by which more messages were skipped."""
+    """Times between two watermarks of a session between which messages were skipped."""
     sessions: defaultdict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         if row['what'] == COMPLETE and row['from_ns'] is not None and row['to_ns'] is not None:
@@ -331,7 +312,7 @@ def _hours(of: Known, downsampled: Sequence[tuple[int, int]]) -> Iterator[tuple[
 
 
 def named(of: Known, downsampled: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, str]]:
-    """(begin, end, word) of all of the time: ``stored``, ``downsampled``, ``not known yet`` or the cause of a gap."""
+    """(begin, end, state) of the whole time: ``stored``, ``downsampled``, ``not known yet`` or the cause of a gap."""
     marks = sorted(downsampled)
     for each in of.stretches:
         if not each.is_whole:

@@ -1,8 +1,8 @@
-"""Labels: what people say of a time, of an object, or of a box in a picture, in layers that are never changed.
+"""Labels that people give to a time, to an object, or to a box in an image, in layers that are never changed.
 
-A layer is a Parquet part at ``<robot>/_labels/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<digest>.parquet``; the date is the one
-on which it was made, UTC. Each of its rows adds a label or removes one. What a label says gives its ``id``, so the same label is
-there once however often it is imported, and of several rows about it the newest counts: a removal is a row, too.
+A layer is a row file, ``<robot>/_labels/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<digest>.jsonl.zst``; the date is that of its
+creation, UTC. Each of its rows adds a label or removes one. The ``id`` of a label is a hash of its content, so that the same
+label exists once however often it is imported. The newest row about a label counts: a removal is a row, too.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CSV: Final = frozenset({'label', 'since', 'until', 'robot', 'bucket', 'key', 'n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """What somebody says of a time of a robot, both ends included; of an object where it has a key, of a box in it in pixels."""
+    """A label of a time of a robot, both ends included; of an object if it has a key; of a box in it, in pixels."""
 
     robot: str
     label: str
@@ -50,24 +50,24 @@ class Label:
     key: str | None = None
     x: float | None = None
     y: float | None = None
-    """Of the left upper corner, from that of the picture."""
+    """Of the upper left corner, from that of the image."""
     width: float | None = None
     height: float | None = None
     note: str = ''
     by: str = ''
     made_ns: int = 0
     id: str = ''
-    """Follows from what it says; who says so, when and why are not in it."""
+    """A hash of the label, without its author, time and note."""
 
     @property
     def box(self) -> tuple[float, float, float, float] | None:
-        """x, y, width and height; None where it is about all of the object."""
+        """x, y, width and height; None if it is about the whole object."""
         if self.x is None or self.y is None or self.width is None or self.height is None:
             return None
         return self.x, self.y, self.width, self.height
 
     def checked(self) -> Label:
-        """With its id. Raises SettingError, NameRefused for what is no label."""
+        """With its id. Raises SettingError, NameRefused for an invalid label."""
         check_name(self.robot, 'the robot name')
         if not self.label.strip() or len(self.label) > MOST_TEXT or not self.label.isprintable():
             raise SettingError('label', self.label[:80], f'a text on one line, of at most {MOST_TEXT} letters')
@@ -111,7 +111,7 @@ def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is
 
 
 def read(source: Bucket, robot: str | None = None, *, label: str | None = None, findings: Findings | None = None) -> list[Label]:
-    """The labels that stand, of one robot or of all, in the order of their times. Raises StoreError."""
+    """The labels that were not removed, of one robot or of all, in the order of their times. Raises StoreError."""
     findings = Findings() if findings is None else findings
     newest: dict[tuple[str, str], Row] = {}
     for row in rows_of(source, LABELS, findings, robot=robot).to_pylist():
@@ -124,7 +124,7 @@ def read(source: Bucket, robot: str | None = None, *, label: str | None = None, 
 
 
 def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]]:
-    """What is labelled: times, and (bucket, key) of objects."""
+    """The labeled times, and (bucket, key) of labeled objects."""
     times, keys = [], []
     for each in found:
         if each.key is None:
@@ -135,7 +135,7 @@ def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]
 
 
 def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
-    """What is asked, with the times and objects that bear its label instead of that. Raises StoreError."""
+    """The query with the times and objects that have its label, instead of the label. Raises StoreError."""
     if asked.label is None:
         return asked
     found = read(source, asked.robot, label=asked.label, findings=findings)
@@ -145,9 +145,9 @@ def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
 
 
 def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
-    """For each row of the catalogue the labels of its object: those of its key, and of times into which it reaches.
+    """For each row the labels of its object: those of its key, and of times that it overlaps.
 
-    The columns that it needs are ``robot bucket key t_start_ns t_end_ns``.
+    It needs the columns ``robot bucket key t_start_ns t_end_ns``.
     """
     of_keys: dict[tuple[str, str], set[str]] = {}
     said: list[set[str]] = [set() for _ in range(len(rows))]
@@ -177,9 +177,9 @@ def with_column(rows: pa.Table, found: Sequence[Label]) -> pa.Table:
 
 
 def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
-    """Rows with the columns ``label since until`` and maybe ``robot bucket key x y width height note``; times as of ``query``.
+    """Rows with the columns ``label since until`` and optionally ``robot bucket key x y width height note``.
 
-    Of a row with a key the times may be empty: ``timed`` fills them in. Raises LakeError.
+    Times are written as for ``query``; those of a row with a key can be empty: ``timed`` adds them. Raises LakeError.
     """
     try:
         check_size(len(body), MOST_DOCUMENT_BYTES)
@@ -212,9 +212,9 @@ def _of_csv(row: Mapping[str, str], robot: str, now_ns: int) -> Label:
 
 
 def from_coco(body: bytes, robot: str) -> list[Label]:
-    """The boxes of a COCO file whose ``file_name`` are keys, as ``fetch`` lays pictures out; without times. Raises LakeError.
+    """The boxes of a COCO file whose ``file_name`` are keys, as ``fetch`` arranges images; without times. Raises LakeError.
 
-    https://cocodataset.org/#format-data: ``bbox`` is x, y, width, height from the left upper corner, in pixels.
+    https://cocodataset.org/#format-data: ``bbox`` is x, y, width, height from the upper left corner, in pixels.
     """
     try:
         told = from_json(body)
@@ -234,7 +234,7 @@ def from_coco(body: bytes, robot: str) -> list[Label]:
 
 
 def timed(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[list[Label], list[str]]:
-    """Labels of objects with the times of those, and the keys that the catalogue does not have. Raises StoreError."""
+    """Labels of objects with the times of these objects, and the keys of objects without a row. Raises StoreError."""
     from shadowhound_data_logger.lake import query  # noqa: PLC0415 - which asks for labels, too
 
     wanted_keys = {(each.bucket, each.key) for each in found if each.key is not None}

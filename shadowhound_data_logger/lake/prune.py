@@ -26,7 +26,7 @@ import pyarrow as pa
 
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.core import metadata_words as words
-from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter
@@ -44,24 +44,24 @@ from shadowhound_data_logger.lake.gaps import HOUR_NS, OBJECTS
 from shadowhound_data_logger.lake.ingest import ingest, pending
 from shadowhound_data_logger.lake.row_files import RowFile, Scope, read, robots, row_files
 from shadowhound_data_logger.lake.tables import INGESTED, Tables, answer, literal, quoted
-from shadowhound_data_logger.lake.views import views
+from shadowhound_data_logger.lake.views import rows_of, views
 from shadowhound_data_logger.stores.base import ObjectStore
 
 FOREVER: Final = 'forever'
 BAGS, EVENTS = 'bags', 'events'
-"""What recordings are called in a rule: those of events apart, as their manifest tells them."""
+"""Names of recordings in a rule; the manifest of a recording shows whether an event started it."""
 BAG_SENSORS: Final = frozenset({'bag', 'rosbags'})
 MISSIONS: Final = 'missions'
 EXPORT, LABEL, REQUEST, UNTOLD = 'data set', 'label', 'request', 'no manifest'
-"""Why something stays that a rule names."""
+"""Why an object that a rule names is kept."""
 MOST_ROWS: Final = 10_000
-"""Of a part."""
+"""Of a row file."""
 MOST_NAMES: Final = 20
-"""Of what refers to objects of a sensor, in an answer."""
+"""Listed per sensor."""
 REPEATS: Final = '_repeats'
-"""In the names of parts whose rows name the objects of other parts: only those are deleted by."""
+"""In the names of row files about repeats: their objects are named in other files, by which they are deleted."""
 DELETED: Final = '.deleted'
-"""Follows the key of a part whose objects are deleted."""
+"""Appended to the key of a row file whose objects are deleted."""
 KIND, CAUSE = 'forgotten', 'retention'
 """Of the gaps."""
 RULES: Final = "a text such as 'camera 90d, lidar 14d, events forever': a sensor and for how long to keep it, as often as needed"
@@ -74,16 +74,16 @@ _COLUMNS: Final = ('robot', 'sensor', 'topic', 'bucket', 'key', 'bytes', 't_star
 
 
 class RetentionRule(NamedTuple):
-    """For how long the objects of a sensor stay."""
+    """For how long the objects of a sensor are kept."""
 
     sensor: str
     text: str
     since_ns: int | None
-    """Those that ended before it go; None: never."""
+    """Objects that ended before it are deleted; None: none."""
 
 
 def keep_rules(text: str, now_ns: int) -> tuple[RetentionRule, ...]:
-    """Raises SettingError for what are no rules."""
+    """Raises SettingError for invalid rules."""
     found: dict[str, RetentionRule] = {}
     for part in text.split(','):
         match = _RULE.fullmatch(part.strip())
@@ -109,7 +109,7 @@ def size_of(text: str) -> int:
 
 @dataclass(slots=True)
 class PrunedSensor:
-    """What the store has of a sensor, and what of it goes."""
+    """What the store has of a sensor, and what of it will be deleted."""
 
     sensor: str
     rule: str = ''
@@ -118,18 +118,18 @@ class PrunedSensor:
     going: int = 0
     going_bytes: int = 0
     protected: Counter[str] = field(default_factory=Counter)
-    """Why -> how many objects stay that the rules would let go."""
+    """Reason -> how many objects are kept that the rules would delete."""
     referrers: set[str] = field(default_factory=set)
-    """Which data sets, labels and requests refer to those, the first of them."""
+    """The first of the datasets, labels and requests that refer to those."""
 
     @property
     def is_all(self) -> bool:
-        """Whether nothing of it would be left."""
+        """Whether nothing of it will be left."""
         return 0 < self.objects == self.going
 
 
 class Protection:
-    """What must stay, whatever the rules say: objects and times by what refers to them."""
+    """What must be kept, whatever the rules are: objects and times to which something refers."""
 
     def __init__(self, exported: Mapping[tuple[str, str], str] | None = None, labelled: Iterable[labels.Label] = (),
                  requests: Mapping[str, Sequence[tuple[str, KeptFilter]]] | None = None) -> None:  # fmt: skip
@@ -149,7 +149,7 @@ class Protection:
             self._latest[robot] = [latest := max(latest, until_ns) for _, until_ns, _ in spans]
 
     def why(self, row: Row) -> tuple[str, str] | None:
-        """Why an object stays, and what refers to it; None where nothing does."""
+        """Why an object is kept, and what refers to it; None if nothing does."""
         name = row['bucket'], row['key']
         if (data_set := self._exported.get(name)) is not None:
             return EXPORT, data_set
@@ -165,11 +165,11 @@ class Protection:
         return None
 
     def any_of(self, row: Row) -> tuple[str, str] | None:
-        """The same of an object with its repeats."""
+        """The same for an object with its repeats."""
         return next((found for each in (row, *row['repeats']) if (found := self.why(each)) is not None), None)
 
     def _label_of(self, row: Row) -> str | None:
-        """Of a time into which the object reaches."""
+        """The label of a time that the object overlaps."""
         spans, latest = self._spans.get(row['robot'], []), self._latest.get(row['robot'], [])
         first = bisect_left(latest, row['t_start_ns'])
         end_ns = _end_ns(row)
@@ -183,7 +183,7 @@ class Protection:
 
 @dataclass(slots=True)
 class PrunePlan:
-    """What a prune would do; ``apply`` does it."""
+    """What a prune will do; ``apply`` does it."""
 
     rules: tuple[RetentionRule, ...]
     robots: tuple[str, ...]
@@ -191,11 +191,11 @@ class PrunePlan:
     is_forced: bool
     protection: Protection = field(repr=False)
     cut_ns: int = 0
-    """Because of the size, what ended before goes as well, of sensors that a rule does not keep forever."""
+    """To reach the size, objects that ended before this are deleted as well, of sensors whose rule is not ``forever``."""
     over_bytes: int = 0
-    """So much is left beyond the size that was asked for."""
+    """How much the requested size is exceeded afterwards."""
     unfinished: int = 0
-    """Parts with rows of forgotten objects that an earlier run put there, and of which it may not have deleted all."""
+    """Row files of an earlier run, which may not have deleted all of their objects."""
     groups: dict[str, _Group] = field(repr=False, default_factory=dict)
 
     @property
@@ -207,16 +207,16 @@ class PrunePlan:
         return sum(each.going_bytes for each in self.sensors.values())
 
     def known_sensors(self) -> tuple[str, ...]:
-        """What a rule may name: the sensors that have objects, and those that every robot and store may have."""
+        """What a rule can name: the sensors with objects, and those that every robot and store can have."""
         there = [name for name, each in self.sensors.items() if each.objects]
         return (*there, *DEFAULT_SENSORS, BAGS, EVENTS, MISSIONS) if there else ()
 
     def lets_go(self, why: tuple[str, str] | None) -> bool:
-        """Whether an object goes if the rules say so, and this protects it."""
+        """Whether an object that the rules name is deleted although this protects it."""
         return why is None or (self.is_forced and why[0] != UNTOLD)
 
     def since_ns(self, sensor: str) -> int | None:
-        """What of a sensor ended before goes; None where nothing does."""
+        """Objects of a sensor that ended before this are deleted; None: none."""
         found = next((rule.since_ns for rule in self.rules if rule.sensor == sensor), None)
         return None if found is None else max(found, self.cut_ns)
 
@@ -228,13 +228,13 @@ class Pruned:
     objects: int = 0
     bytes: int = 0
     mended: int = 0
-    """Objects that an earlier run had a row for and that it may not have deleted."""
+    """Objects of an earlier run that it may not have deleted."""
 
 
 def protection(source: Bucket, named: Sequence[str], exported: Mapping[tuple[str, str], str]) -> Protection:
-    """What the store says of these robots, with (bucket, key) -> data set of what was exported.
+    """What refers to data of these robots; ``exported`` maps (bucket, key) to the dataset that has values of it.
 
-    Raises LakeError where a label or a mailbox cannot be read: what it refers to is not known then. Raises StoreError.
+    Raises LakeError if a label or a mailbox cannot be read, because it is unknown what it refers to. Raises StoreError.
     """
     left_out = Findings(lambda _: None)
     found = [one for name in named for one in labels.read(source, name, findings=left_out)]
@@ -246,7 +246,7 @@ def protection(source: Bucket, named: Sequence[str], exported: Mapping[tuple[str
 
 @dataclass(slots=True)
 class _Group:
-    """Objects that go together: those of a bag, or of a mission."""
+    """Objects that are deleted together: those of a bag, or of a mission."""
 
     sensor: str
     robot: str
@@ -262,7 +262,7 @@ class _Group:
 def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = None, exported: Mapping[tuple[str, str], str],  # noqa: PLR0913
          most_bytes: int | None = None, is_forced: bool = False, findings: Findings,
          tell: Callable[[str], None] = lambda _: None) -> PrunePlan:  # fmt: skip
-    """What goes by these rules and, where that leaves more than ``most_bytes``, the oldest days of what they name beside.
+    """What these rules delete and, if more than ``most_bytes`` is left, also the oldest days of the sensors that they name.
 
     Raises LakeError, StoreError.
     """
@@ -291,7 +291,7 @@ def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = 
 
 
 class _Counts:
-    """Adds up what of each sensor there is, and what of it goes."""
+    """Adds up what each sensor has, and what of it will be deleted."""
 
     def __init__(self, made: PrunePlan) -> None:
         self._made = made
@@ -321,7 +321,7 @@ class _Counts:
             day[1] += size
 
     def cut(self, most_bytes: int) -> None:
-        """Let the oldest days go as well, until so much is left."""
+        """Also delete the oldest days, until so much is left."""
         left = self.total - self._made.going_bytes
         for day in sorted(self._younger):
             if left <= most_bytes:
@@ -336,7 +336,7 @@ class _Counts:
 
 def apply(source: Bucket, store: ObjectStore, made: PrunePlan, *, now_ns: int, findings: Findings,
           tell: Callable[[str], None] = lambda _: None) -> Pruned:  # fmt: skip
-    """Do what was planned, after what an earlier run left undone. Raises LakeError, StoreError: a later run goes on."""
+    """Finish an earlier run, then do what was planned. Raises LakeError, StoreError: a later run continues."""
     done = Pruned()
     try:
         for robot in made.robots:
@@ -367,7 +367,7 @@ def _put_rows(store: ObjectStore, made: PrunePlan, robot: str, rows: Iterable[Ro
 def _goes(made: PrunePlan, row: Row) -> bool:
     group = None if row['group'] is None else made.groups.get(row['group'])
     if row['group'] is not None and group is None:
-        return False  # it came after the plan was made
+        return False  # it was added after the plan was made
     sensor, end_ns = (row['name'], row['end_ns']) if group is None else (group.sensor, max(group.end_ns, row['end_ns']))
     since_ns = made.since_ns(sensor)
     if since_ns is None or end_ns >= since_ns:
@@ -376,7 +376,7 @@ def _goes(made: PrunePlan, row: Row) -> bool:
 
 
 def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Callable[[str], None]) -> Iterator[list[Row]]:
-    """The rows of what the store has, the newest day of a robot first; no object twice.
+    """The rows of what the store has, the newest day of a robot first; each object once.
 
     Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and as ``repeats`` the other rows that name it as
     their content: it is as old as the youngest of them.
@@ -395,9 +395,9 @@ def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Call
 
 
 def _rows_of(found: pa.Table, robot: str, date: str, later: defaultdict[tuple[str, str], list[Row]]) -> Iterator[Row]:
-    """``later`` has the rows of younger days whose key has another date than theirs, and gets those of this one.
+    """``later`` has the rows of younger days whose key has another date than theirs; those of this day are added to it.
 
-    Such a row is a repeat of what is older, or somebody's invention: by itself it lets nothing go.
+    Such a row is a repeat of an older object, or forged: nothing is deleted because of it alone.
     """
     day = date.replace('-', '')
     own: dict[tuple[str, str], Row] = {}
@@ -440,7 +440,7 @@ def _grouped(made: PrunePlan, row: Row) -> None:
 
 
 def _tell_events_apart(source: Bucket, group: _Group) -> None:
-    """By the manifest. Of a bag without one nobody knows whether an event made it, or whether it still grows: it stays."""
+    """By the manifest. A bag without one is kept: an event may have started it, or it may still be recorded."""
     if group.sensor != BAGS:
         return
     try:
@@ -458,7 +458,7 @@ def _end_ns(row: Row) -> int:
 
 
 def _key_ns(key: str) -> int:
-    """The latest date in a key, 0 where it has none: a robot may write a row with an older one, but not another key."""
+    """The latest date in a key, 0 without one: a robot can write a row with an older time, but not another key."""
     return max((_begin_ns(date) for date in _DATE.findall(key)), default=0)
 
 
@@ -484,7 +484,18 @@ def _digest(rows: Iterable[Row]) -> str:
     return hashlib.sha256('\n'.join(names).encode()).hexdigest()[:16]
 
 
-# -- what was begun ------------------------------------------------------------------------------------------------------------
+def forgotten(source: Bucket, robot: str | None, findings: Findings) -> pa.Table:
+    """What was deleted, with the columns of ``FORGOTTEN``, by time; each object once. Raises StoreError, LakeError."""
+    return rows_of(source, FORGOTTEN, findings, robot=robot, order='t_start_ns, forgotten_ns')
+
+
+def dates_of_deletion(rows: pa.Table) -> dict[tuple[str, str], str]:
+    """(bucket, key) -> the UTC date on which it was deleted."""
+    names = zip(rows['bucket'].to_pylist(), rows['key'].to_pylist(), strict=True)
+    return dict(zip(names, (f'{utc(stamp_ns):%Y-%m-%d}' for stamp_ns in rows['forgotten_ns'].to_pylist()), strict=True))
+
+
+# -- objects that are listed as deleted -----------------------------------------------------------------------------------------
 
 
 def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
@@ -509,14 +520,14 @@ def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, 
 
 
 def _begun(source: Bucket, robot: str, findings: Findings) -> tuple[list[RowFile], list[RowFile]]:
-    """The row files that name what is forgotten, and those of them of which not all is known to be deleted."""
+    """The row files about deleted objects, and those of them that are not marked: some of their objects may still exist."""
     marks = {entry.key for entry in source.list(FORGOTTEN.prefix(robot)) if entry.key.endswith(DELETED)}
     files = row_files(source, findings, Scope((FORGOTTEN,), robot))
     return files, [file for file in files if file.entry.key + DELETED not in marks]
 
 
 def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFile], findings: Findings) -> None:
-    """Statements of the gap journal about all of a date that is forgotten, one for each topic and hour; the last one counts."""
+    """Statements of the gap journal about the deleted objects of a date, one per topic and hour; the newest one counts."""
     hours: defaultdict[tuple[str, int], dict[tuple[str, str, int], Row]] = defaultdict(dict)
     for found_in in read(source, files, findings):
         for row in found_in.rows:
@@ -537,7 +548,7 @@ def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFi
 
 
 def _state_bags(store: ObjectStore, made: PrunePlan, going: Iterable[Row]) -> None:
-    """Of each bag that goes, one statement for each topic: what was in it only its manifest tells, which goes as well."""
+    """For each bag that is deleted, one statement per topic, from its manifest, which is deleted as well."""
     for name in sorted({row['group'] for row in going if row['group'] is not None}):
         group = made.groups[name]
         if group.manifest is None:

@@ -1,6 +1,6 @@
-"""Asks a robot for what it keeps: which objects those are, the mailbox that it polls, and the answers that it gives.
+"""Requests what a robot keeps: which objects it keeps, the mailbox that it polls, and its answers.
 
-Requesters share a mailbox (mailbox.py): each reads it, and replaces it on the condition that nobody else did meanwhile.
+Requesters share a mailbox (core/mailbox.py): each reads it, and replaces it only if it has not changed since.
 """
 
 from __future__ import annotations
@@ -54,32 +54,32 @@ from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
 
 FINAL: Final = frozenset({'done', 'expired', 'cancelled', 'refused'})
-"""States after which a request gets no answer any more."""
+"""States after which a request gets no further answer."""
 TRIES: Final = 60
-"""To be the one who replaces the mailbox: with a hundred at it, one in a hundred wins each time."""
+"""To replace the mailbox: of a hundred requesters at a time, one succeeds in each round."""
 PAUSE_S: Final = 0.2
 """The longest pause between two tries; it doubles ten times."""
 MOST_OF_ONE: Final = 128
-"""Open requests of one requester: others need room in the mailbox, too."""
+"""Open requests per requester, so that others have room in the mailbox."""
 ANSWERS_TRIED: Final = 8
-"""Of what is no answer, the newest ones first."""
+"""Invalid answers that are skipped, from the newest one on."""
 MOST_ANSWER_BYTES: Final = 1 << 20
 LOOK_S: Final = 2.0
 LOOKS: Final = 90
-"""For the rows of what has come."""
+"""For the rows of what the robot sent."""
 _OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'mission', 'mission_type')
-"""What of a query a robot can be asked for; the rest chooses among what has come."""
+"""Flags that a request can have; the others select among what the robot sent."""
 _DAY_NS: Final = 24 * 3600 * 10**9
 
 
 @dataclass(frozen=True, slots=True)
 class PullState:
-    """A request, as the mailbox and the answers have it."""
+    """A request, from the mailbox and the answers."""
 
     id: str
     by: str
     state: str
-    """``asked`` until the robot has answered; then what its newest answer says."""
+    """``asked`` until the robot has answered; then that of its newest answer."""
     priority: int | None
     want: dict[str, Any]
     answer: dict[str, Any] | None
@@ -87,38 +87,28 @@ class PullState:
 
 
 def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
-    """Rows of what a robot keeps and the filter takes, with the columns of ``catalogue.schema.KEPT``. Raises StoreError."""
+    """Rows of what a robot keeps and the filter selects, with the columns of ``KEPT``. Raises StoreError."""
     rows = known(source, robot, want, findings)
     return rows.filter(pc.equal(rows['where'], ON_ROBOT))
 
 
 def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
-    """The same, and rows of what it has lost. Raises StoreError."""
+    """The same, with rows of what it has lost. Raises StoreError."""
     early = Wanted(robot=robot, since_ns=None if want.since_ns is None else want.since_ns - _DAY_NS, until_ns=want.until_ns)
     has_date = early.has_date if early.since_ns is not None or early.until_ns is not None else None
-    columns = ', '.join(f'k.{quoted(name)}' for name in KEPT.columns)
+    columns = ', '.join(map(quoted, KEPT.columns))
     stored = 'SELECT 1 FROM all_objects o WHERE o.robot = k.robot AND o.bucket = k.bucket AND o.key = k.key'
+    newest = (
+        'row_number() OVER (PARTITION BY bucket, key ORDER BY "where", bytes) AS _place'  # lost before robot, thinned before full
+    )
+    of_robot = f'SELECT k.*, {newest} FROM all_kept k WHERE robot = {literal(robot)} AND NOT EXISTS ({stored})'  # noqa: S608
     with views(source, [KEPT, OBJECTS], findings, robot=robot, has_date=has_date) as ready:
-        rows = answer(ready, f'SELECT {columns} FROM all_kept k WHERE robot = {literal(robot)} AND NOT EXISTS ({stored})')  # noqa: S608
-    rows = superseding(rows)
+        rows = answer(ready, f'SELECT {columns} FROM ({of_robot}) WHERE _place = 1 ORDER BY bucket, key')  # noqa: S608
     return rows.filter(pa.array([takes(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 
-def superseding(rows: pa.Table) -> pa.Table:
-    """One row for each kept object: its ``lost`` row if it has one, and the row of what is left of it rather than of all.
-
-    Whatever is given again, alone or with others, gives what all at once would have given.
-    """
-    ordered = rows.sort_by(
-        [('bucket', 'ascending'), ('key', 'ascending'), ('where', 'ascending'), ('bytes', 'ascending')]
-    )  # lost before robot, thinned before whole
-    numbered = ordered.append_column('_row', pa.array(range(len(ordered)), pa.int64()))
-    first = numbered.group_by(['bucket', 'key']).aggregate([('_row', 'min')])['_row_min']
-    return ordered if len(first) == len(ordered) else ordered.take(first.combine_chunks().sort())
-
-
 def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:
-    """Whether an object is wanted, by its row."""
+    """Whether a filter selects an object, by its row."""
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
     if row['x'] is not None and row['y'] is not None:
         metadata['pose'] = f'{row["x"]} {row["y"]} 0 odom'
@@ -128,7 +118,7 @@ def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:
 
 def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by: str, priority: int = DEFAULT_PRIORITY,
         expiry_ns: int = DEFAULT_EXPIRY_NS) -> PullRequest:  # fmt: skip
-    """Put a request into the mailbox of a robot; the same one is put there once. Raises StoreError, LakeError."""
+    """Put a request into the mailbox of a robot, each request once. Raises StoreError, LakeError."""
     now_ns = time.time_ns()
     request = PullRequest(robot=robot, by=by, made_ns=now_ns, expires_ns=now_ns + expiry_ns, want=want, priority=priority)
     _checked(robot, request.to_json())
@@ -149,7 +139,7 @@ def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by:
 
 
 def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: str) -> None:
-    """Take a request back. Raises StoreError, LakeError."""
+    """Cancel a request. Raises StoreError, LakeError."""
 
     def add(entries: list[Any]) -> list[Any]:
         left = _unanswered(source, robot, entries)
@@ -162,7 +152,7 @@ def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: 
 
 
 def listed(source: Bucket, robot: str) -> list[PullState]:
-    """What is asked of a robot, and how far that is: the mailbox's entries. Raises StoreError, LakeError."""
+    """The requests in the mailbox of a robot, and their states. Raises StoreError, LakeError."""
     requests = _requests(robot, _entries(source, robot))
     with ThreadPoolExecutor(THREADS) as pool:
         answers = pool.map(lambda request: newest_answer(source, robot, request.id), requests)
@@ -176,12 +166,12 @@ def listed(source: Bucket, robot: str) -> list[PullState]:
 
 
 def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
-    """The requests in the mailbox of a robot that have no last answer yet. Raises StoreError, LakeError."""
+    """The requests in the mailbox of a robot without a final answer. Raises StoreError, LakeError."""
     return _requests(robot, _unanswered(source, robot, _entries(source, robot)))
 
 
 def _entries(source: Bucket, robot: str) -> list[Any]:
-    """Of the mailbox of a robot; none where it has none."""
+    """Of the mailbox of a robot; none without a mailbox."""
     try:
         return decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
     except ObjectRefused as error:
@@ -195,7 +185,7 @@ def _entries(source: Bucket, robot: str) -> list[Any]:
 
 
 def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | None:
-    """The newest answer to a request; None before the first one. What is none is left out. Raises StoreError."""
+    """The newest valid answer to a request; None before the first one. Raises StoreError."""
     numbers = []
     for entry in source.list(answers_prefix(robot, request)):
         name = entry.key.rpartition('/')[2].removesuffix('.json')
@@ -213,7 +203,7 @@ def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | 
 
 def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[dict[str, Any] | None], None] = lambda _: None,
          made_ns: int = 0) -> dict[str, Any]:  # fmt: skip
-    """The last answer to a request that was made then, once there is one; ``tell`` hears of the newest. Raises StoreError."""
+    """Wait for the final answer to a request made at that time; ``tell`` gets the newest answer. Raises StoreError."""
     while True:
         answer = newest_answer(source, robot, request)
         tell(answer)
@@ -229,10 +219,10 @@ def requester() -> str:
 
 def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] | None = None,
           say: Callable[[str], None] = lambda _: None, findings: Findings | None = None) -> int:  # fmt: skip
-    """Ask every robot for what it keeps of these sensors (None: all but bags), and wait until that is in the catalogue.
+    """Request what every robot keeps of these sensors (None: all but bags), and wait until the store has it.
 
-    ``flags`` are those of a query; ``near`` holds for the first of the sensors alone, since few others know a place. Returns how
-    many objects were asked for. Raises LakeError where a robot refuses or a request expires, SettingError, StoreError.
+    ``flags`` are those of a query; ``near`` applies only to the first of the sensors, because few others have a place. Returns
+    the number of requested objects. Raises LakeError if a robot refuses or a request expires, SettingError, StoreError.
     """
     asked = wanted(time.time_ns(), **{name: flags[name] for name in _OF_ROBOT if flags.get(name) is not None})
     findings = Findings() if findings is None else findings
@@ -258,21 +248,21 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
 
 def await_rows(source: Bucket, robot: str, want: KeptFilter, rows: Iterable[Mapping[str, Any]], findings: Findings,
                say: Callable[[str], None] = lambda _: None) -> None:  # fmt: skip
-    """Until the catalogue says that the store has these objects, which a robot has sent; three minutes at most.
+    """Wait until the store has rows of these objects, which a robot has sent; three minutes at most.
 
-    Slices of which a part was sent stay where they are. Raises StoreError.
+    Slices that were sent in part are not awaited. Raises StoreError.
     """
     names = {row['key'] for row in rows if row['where'] == ON_ROBOT and size_of(want, row) == (row['bytes'] or 0)}
     for _ in range(LOOKS):
         if names.isdisjoint(kept(source, robot, want, findings)['key'].to_pylist()):
             return
-        say(f'waiting for the catalogue of {robot}: {want.sensor or "what it sent"}')
+        say(f'waiting for the rows of {robot}: {want.sensor or "what it sent"}')
         time.sleep(LOOK_S)
 
 
 def _await(source: Bucket, request: PullRequest, rows: Sequence[Mapping[str, Any]], say: Callable[[str], None],
            findings: Findings) -> None:  # fmt: skip
-    """Until a request is done, and the catalogue knows of what came."""
+    """Wait until a request is done, and the store has rows of its objects."""
 
     def tell(answer: Mapping[str, Any] | None) -> None:
         say(f'waiting for {request.robot}: {request.want.sensor}, {visible(_how_far(answer))}')
@@ -292,18 +282,18 @@ def _how_far(answer: Mapping[str, Any] | None) -> str:
 
 
 class RequestFigures(NamedTuple):
-    """What an answer says of a request; 0 for what says no number."""
+    """The numbers of an answer; 0 for invalid ones."""
 
     objects: int
-    """That it found."""
+    """That the request found."""
     bytes: int
     sent: int
-    """Of them the store has so many."""
+    """Of them, the store has so many."""
     sent_bytes: int
 
 
 def told_by(answer: Mapping[str, Any]) -> RequestFigures:
-    """The figures of an answer, which anything may be in."""
+    """The numbers of an answer, which can contain anything."""
     outcomes = answer.get('outcomes')
     delivered = outcomes.get('delivered') if isinstance(outcomes, dict) else None
     sent = delivered if isinstance(delivered, dict) else {}
@@ -312,7 +302,7 @@ def told_by(answer: Mapping[str, Any]) -> RequestFigures:
 
 
 def _is_last(answer: dict[str, Any], made_ns: int) -> bool:
-    """Whether it ends a request that was made then; one that ended may be made again."""
+    """Whether it ends a request made at that time; a request that ended can be made again."""
     answered = answer.get('made_ns')
     return answer['state'] in FINAL and type(answered) is int and answered >= made_ns
 
@@ -337,7 +327,7 @@ def _checked(robot: str, entry: dict[str, Any]) -> None:
 
 
 def _unanswered(source: Bucket, robot: str, entries: Sequence[Any]) -> list[Any]:
-    """Without requests that have their last answer, or expired a day ago, and what takes those back."""
+    """Without requests that have a final answer or expired a day ago, and without their cancellations."""
     requests = _requests(robot, entries)
     with ThreadPoolExecutor(THREADS) as pool:
         answers = list(pool.map(lambda request: newest_answer(source, robot, request.id), requests))
@@ -351,13 +341,13 @@ def _unanswered(source: Bucket, robot: str, entries: Sequence[Any]) -> list[Any]
 
 
 def _id_of(entry: Mapping[str, Any]) -> str:
-    """What an entry asks for or takes back; it may be anything."""
+    """The request that an entry makes or cancels; it can be anything."""
     found = entry.get('id', entry.get('cancel'))
     return found if isinstance(found, str) else ''
 
 
 def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
-    """The entries of the mailbox, which is made where it is not there, and its version."""
+    """The entries of the mailbox, which is created if it does not exist, and its version."""
     try:
         found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
     except ObjectRefused as error:
@@ -374,7 +364,7 @@ def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
 
 
 def make(store: ObjectStore, robot: str) -> None:
-    """The empty mailbox of a robot, where there is none. Raises StoreError."""
+    """Create the empty mailbox of a robot, if it does not exist. Raises StoreError."""
     body = encode_inbox([])
     with tempfile.TemporaryDirectory(prefix='shadowhound-inbox-') as folder:
         path = Path(folder, 'inbox.json')
@@ -386,7 +376,7 @@ def make(store: ObjectStore, robot: str) -> None:
 
 
 def _change(store: ObjectStore, robot: str, change: Callable[[list[Any]], list[Any] | None]) -> None:
-    """Replace the entries by what ``change`` makes of them, None for nothing, however many others do so at once."""
+    """Replace the entries by those that ``change`` returns, or by none if it returns None, also while others do the same."""
     for attempt in range(TRIES):
         entries, version = _read(store, robot)
         changed = change(entries)

@@ -1,6 +1,6 @@
 """What is stored, as Arrow tables: by flags, or by SQL over ``objects missions topics gaps watermarks labels forgotten``.
 
-The engine is that of the tables (lake/tables.py): what a query restricts by flags or in SQL is never read into this process.
+The engine is that of the tables (lake/tables.py): only the selected rows and columns are read into this process.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ _LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
 _FORGOTTEN: Final = re.compile(r'\bforgotten\b', re.IGNORECASE)
 _GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
 _OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'policy', 'where', 'label')
-"""Flags that gaps know nothing of."""
+"""Flags that do not apply to gaps."""
 _UNSEEN: Final = {'what', 'id', 'revision', 'received', 'skipped', 'format_version'}
 _GAP_COLUMNS: Final = [name for name in GAPS.columns if name not in _UNSEEN]
 _OF_WATERMARKS: Final = {
@@ -85,16 +85,16 @@ _OF_WATERMARKS: Final = {
 _UNSEEN_OF_LABELS: Final = {'what', 'made', 'format_version'}
 _WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
 LONGEST_NS: Final = 24 * 3600 * SECOND
-"""For so long after a time that is asked for a mission may go on before one of its objects knows its run."""
+"""For so long after the requested time, the objects of a mission are searched for the id of its run."""
 _TIMES: Final = ('robot', 'bucket', 'key', 't_start_ns', 't_end_ns')
-"""What says whether an object is in a time that was chosen."""
+"""The columns that decide whether an object overlaps a chosen time."""
 _OF_SUMMARY: Final = [name for name in SUMMARY if name not in {'mission_id', 'mission_type', 'start_ns', 'end_ns'}]
 """Columns of ``missions`` that are null for a mission that has not ended."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """A query, where it reports what it leaves out, and the time as of which it sees the tables."""
+    """The store that is queried, where invalid files are reported, and the time as of which the tables are read."""
 
     source: Bucket
     findings: Findings
@@ -102,7 +102,7 @@ class _Asked:
 
     @classmethod
     def of(cls, source: Bucket | None, findings: Findings | None, as_of: str | datetime | None = None) -> _Asked:
-        """Raises SettingError for what is not a time."""
+        """Raises SettingError for an invalid time."""
         found = Findings() if findings is None else findings
         if isinstance(as_of, str):
             as_of = datetime.fromtimestamp(moment('as_of', as_of, time.time_ns()) / SECOND, timezone.utc)
@@ -131,9 +131,9 @@ def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLU
     """One row per object, with the columns of ``formats/rows/schema.py``.
 
     ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``;
-    ``order`` is SQL, such as ``t_start_ns DESC``. Without a source, of the store that the environment names. With ``as_of`` it
-    answers from the tables as of that time. Rows and files that are invalid are left out: ``findings`` names them; without it
-    the log warns. Raises SettingError, LakeError for an invalid query, StoreError.
+    ``order`` is SQL, such as ``t_start_ns DESC``. Without a source, it queries the store that the environment names. With
+    ``as_of`` it answers from the tables as of that time. Invalid rows and files are ignored: they are in ``findings``, or the log
+    warns. Raises SettingError, LakeError for an invalid query, StoreError.
     """
     lake = _Asked.of(source, findings, as_of)
     return _objects(lake, wanted(time.time_ns(), **flags), Shape(columns, order, limit, distinct))
@@ -141,7 +141,7 @@ def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLU
 
 def object_batches(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLUMNS), findings: Findings | None = None,
                    as_of: str | datetime | None = None, **flags: Any) -> Iterator[pa.Table]:  # fmt: skip
-    """The rows of ``objects`` piece by piece, for more of them than memory should hold."""
+    """The rows of ``objects`` in batches, for more rows than fit into memory."""
     lake = _Asked.of(source, findings, as_of)
     asked, condition = _understood(lake, wanted(time.time_ns(), **flags))
     with _opened(lake, asked) as ready:
@@ -152,7 +152,7 @@ def object_batches(source: Bucket | None = None, *, columns: Sequence[str] = tup
 
 def missions(source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
              **flags: Any) -> pa.Table:  # fmt: skip
-    """One row per mission that has objects among the wanted ones, and how it ended."""
+    """One row per mission with selected objects, and how it ended."""
     return _missions(_Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags))
 
 
@@ -163,7 +163,7 @@ def topics(source: Bucket | None = None, *, findings: Findings | None = None, **
 
 def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
         **flags: Any) -> pa.Table:  # fmt: skip
-    """SQL over the views, each restricted by the flags. Raises LakeError for what is not SQL or names no column."""
+    """SQL over the views, each restricted by the flags. Raises LakeError for invalid SQL or an unknown column."""
     lake, asked = _Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags)
     more: dict[str, pa.Table] = {}
     if _MISSIONS.search(query):
@@ -188,20 +188,20 @@ def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | Non
 
 
 def chosen(rows: pa.Table, where: str) -> pa.Table:
-    """The rows for which a condition holds. Raises LakeError for what is not SQL or names no column."""
+    """The rows for which a condition is true. Raises LakeError for invalid SQL or an unknown column."""
     with engine({'rows': rows}) as ready, answering(where, rows.column_names):
         return answer(ready, f'SELECT * FROM rows WHERE ({where}\n)')  # noqa: S608 - the condition is the caller's own SQL
 
 
 def ordered(rows: pa.Table, order: str | None, limit: int | None) -> pa.Table:
-    """The first rows of an answer in an order, such as ``t_start DESC``. Raises LakeError for a column that it does not have."""
+    """The first rows of an answer in an order, such as ``t_start DESC``. Raises LakeError for an unknown column."""
     with engine({'rows': rows}) as ready, answering(order or '', rows.column_names):
         return answer(ready, Shape(rows.column_names, order, limit).sql('rows'))
 
 
 @contextmanager
 def answering(query: str, known: Iterable[str]) -> Iterator[None]:
-    """A LakeError about a name gets the nearest of the known names as its remedy."""
+    """A LakeError about an unknown name gets the most similar of the known names as its remedy."""
     try:
         yield
     except LakeError as error:
@@ -230,7 +230,7 @@ def _objects(lake: _Asked, asked: Wanted, shape: Shape) -> pa.Table:
 
 
 def within_chosen(table: pa.Table, asked: Wanted) -> pa.Table:
-    """The rows that are in all that was chosen."""
+    """The rows that are in every one of the query's ranges."""
     if not asked.chosen:
         return table
     first = pc.fill_null(table['t_start_ns'], -1).to_numpy()
@@ -252,11 +252,11 @@ def within_chosen(table: pa.Table, asked: Wanted) -> pa.Table:
 
 
 def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, str]:
-    """What is asked for as the tables can tell it, and the condition for a row in SQL."""
+    """The query without labels and missions, which are replaced by times and ids; and the condition for a row in SQL."""
     asked = labels.labelled(lake.source, asked, lake.findings)
     conditions = list(_conditions(asked))
     if asked.mission is not None:
-        runs = {} if '_' in asked.mission else _runs(lake, asked)  # no id of a run has one, every one of a mission
+        runs = {} if '_' in asked.mission else _runs(lake, asked)  # ids of runs have no underscore, ids of missions have
         of_run = [mission for mission, run in runs.items() if run.startswith(asked.mission)]
         begins = f'starts_with(mission_id, {literal(asked.mission)})'
         conditions.append(f'({begins} OR {among("mission_id", of_run)})' if of_run else begins)
@@ -266,7 +266,7 @@ def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, str]:
 
 
 def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
-    """The missions that ended so, and in which that policy was active."""
+    """The missions with that result, and in which that policy was active."""
     columns = ('mission_id', 'success', 'policy', 'policies')
     found = _missions(lake, replace(asked, success=None, policy=None)).select(columns).to_pydict()
     return [mission for mission, success, policy, policies in zip(*(found[name] for name in columns), strict=True)
@@ -275,7 +275,7 @@ def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
 
 
 def _has_policy(names: str, wanted: str) -> bool:
-    """Whether one of ids such as ``go2_patrol@7#0123456789abcdef`` is meant: by its name, name and version, or as it begins."""
+    """Whether one of ids such as ``go2_patrol@7#0123456789abcdef`` matches: by name, by name and version, or by its start."""
     for name in names.split(', '):
         version, is_one, _ = name.partition('#')
         if is_one and (wanted in {version, version.partition('@')[0]} or ('#' in wanted and name.startswith(wanted))):
@@ -293,12 +293,12 @@ def _conditions(asked: Wanted) -> Iterator[str]:
         yield f't_start IS NOT NULL AND t_start_ns < {asked.until_ns} AND date <= {literal(date_of(asked.until_ns - 1))}'
     if asked.near is not None:
         x, y, radius = asked.near
-        for name, middle in (('x', x), ('y', y)):  # a box first: statistics can rule parts of a file out by it
+        for name, middle in (('x', x), ('y', y)):  # a box first: by statistics, parts of a file can be skipped
             yield f'{name} BETWEEN {middle - radius!r} AND {middle + radius!r}'
         east, north = f'(x - {x!r})', f'(y - {y!r})'
         yield f'{east} * {east} + {north} * {north} <= {radius * radius!r}'
     if asked.where is not None:
-        yield f'({asked.where}\n)'  # what a comment in it hides ends with its line
+        yield f'({asked.where}\n)'  # a comment at its end must not hide the parenthesis
 
 
 def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
@@ -327,9 +327,9 @@ def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
 
 
 def _dataset_of(source: Bucket, policy: str) -> str | None:
-    """The digest of the data set that a policy was trained on, by its manifest in the store; None where that is not there.
+    """The digest of the dataset that a policy was trained on, from its manifest in the store; None without a manifest.
 
-    The id has the beginning of the manifest's hash: a mission cannot name another one.
+    The id contains the start of the manifest's hash: a mission cannot name another one.
     """
     name, version, sha256 = split_id(policy) or ('', 0, '')
     models = Bucket(source.settings, POLICIES)
@@ -344,7 +344,7 @@ def _dataset_of(source: Bucket, policy: str) -> str | None:
 
 
 def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
-    """Those that reach into the time."""
+    """Those that overlap the time."""
     found = labels.read(lake.source, asked.robot, label=asked.label, findings=lake.findings)
     since_ns, until_ns = asked.since_ns or 0, (1 << 63) - 1 if asked.until_ns is None else asked.until_ns
     rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
@@ -353,7 +353,7 @@ def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
 
 
 def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:
-    """What was deleted on purpose, by its own time."""
+    """What was deleted on purpose, by the time of the data."""
     if refused := [name for name in (*_OF_OBJECTS, 'mission') if getattr(asked, name) is not None]:
         raise LakeError(f'forgotten cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since or until')  # fmt: skip
@@ -367,7 +367,7 @@ def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:
 
 
 def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
-    """The newest statements about gaps that reach into the time, and how far they are complete. Reads the journal at once."""
+    """The newest statements about gaps that overlap the time, and the watermarks."""
     if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
         raise LakeError(f'gaps and watermarks cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
@@ -387,7 +387,7 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
 
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
-    """The run of each mission of that time, by whichever object knows it: one that came before there was a run does not."""
+    """The run of each mission of that time, from any of its objects: those delivered before the run existed do not name it."""
     until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
     of_time = Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns)
     where = ' AND '.join((*_conditions(of_time), 'mission_id IS NOT NULL', 'run_id IS NOT NULL'))

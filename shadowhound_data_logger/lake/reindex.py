@@ -1,7 +1,7 @@
-"""``lake reindex``: the rows that the catalogue lacks, made from the store alone: a listing, and what each object says of itself.
+"""``lake reindex``: adds missing rows, from a listing of the store and the metadata of its objects.
 
-It adds parts and changes none. A robot's own part may come later than what is added here: the names of these parts tell readers
-to look for rows that come twice. So it may run at any time and die at any moment; the next run goes on.
+It adds row files and changes none. A robot can deliver the same rows later: ingest adds each row once. So it can run at any time
+and be killed at any moment; the next run continues.
 """
 
 from __future__ import annotations
@@ -30,30 +30,27 @@ from shadowhound_data_logger.stores.base import ObjectStore
 KEY: Final = ('bucket', 'key')
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000
-"""Objects that are asked for at a time, and then written down."""
+"""Objects whose metadata are read before their rows are written."""
 STATISTICS_PAGE: Final = 1000
-"""Objects that are opened, of which a part a day is made."""
+"""Objects that are opened before their rows are written."""
 
 
 @dataclass(slots=True)
 class Reindexed:
-    """What a reindex has found so far."""
+    """The result of a reindex so far."""
 
     listed: int = 0
     added: int = 0
     parts: int = 0
     gone: int = 0
-    """Rows whose objects are not there any more, beside those that were forgotten; they stay."""
+    """Rows whose objects are neither in the store nor deleted by ``lake prune``; they are kept."""
 
 
 def reindex(
     source: Bucket, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
     tell: Callable[[Reindexed], None] = lambda _: None, findings: Findings | None = None,
 ) -> Reindexed:  # fmt: skip
-    """Add what is missing of one robot, and what stands only in parts that are left out.
-
-    Raises StoreError, NameRefused; what was added until then stays.
-    """
+    """Add the missing rows of one robot. Raises StoreError, NameRefused; rows that were added until then are kept."""
     check_name(robot, 'the robot name')
     found = Reindexed()
     findings = Findings() if findings is None else findings
@@ -83,7 +80,7 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
                    findings: Findings | None = None) -> Reindexed:  # fmt: skip
     """Open the objects of one robot that have no statistics, and add those. Raises StoreError, NameRefused.
 
-    What was added until then stays. Objects that are gone or damaged are in the ``findings``.
+    Rows that were added until then are kept. Objects that are missing or damaged are in the ``findings``.
     """
     from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - the extra lake
 
@@ -124,7 +121,7 @@ def _keys(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJE
 
 
 def _rows(place: Bucket, entries: list[ObjectInfo]) -> Iterator[Row]:
-    """An object that is gone meanwhile has none."""
+    """The rows of those that still exist."""
 
     def row(entry: ObjectInfo) -> Row | None:
         info = place.head(entry.key)

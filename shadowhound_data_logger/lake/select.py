@@ -1,6 +1,6 @@
-"""What a query selects: which objects, from when, from where; and the dates whose parts can hold them.
+"""What a query selects: which objects, of which time and place; and the dates that can have them.
 
-An object belongs to the moment at which it begins (``t_start``, UTC), as its row belongs to the folder of that date.
+The time of an object is its start (``t_start``, UTC), which is also the date of its row.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from shadowhound_data_logger.formats.rows.schema import UNDATED
 
 DAY: Final = timedelta(days=1)
 LONGEST_BATCH_NS: Final = 3600 * SECOND
-"""A batch that began so long before a time can reach into it (``sensor.batch_s``)."""
+"""A batch that started so long before a time can overlap it (``sensor.batch_s``)."""
 RANGES: Final = 'the ranges of `shadowhound-data query --when ... --json`: since_ns and until_ns in ns since 1970, and robot'
 MOST_FOLDERS: Final = 400
 """Dates that are asked for by name; for a longer time the folders that there are are listed first."""
 
 
 class TimeSpan(NamedTuple):
-    """A time of one robot, or of all (None); both ends are in it."""
+    """A time of one robot, or of all (None), both ends included."""
 
     robot: str | None
     since_ns: int
@@ -33,17 +33,17 @@ class TimeSpan(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Objects that reach into one of some times, or are named."""
+    """Objects that overlap one of some times, or are named."""
 
     spans: tuple[TimeSpan, ...]
-    """By robot, in the order of their times; none meets the next."""
+    """By robot, in the order of their times, without overlap."""
     keys: frozenset[tuple[str, str]] = frozenset()
     """(bucket, key)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """What a query selects: everything that is given must hold; None means any."""
+    """What a query selects: all given conditions must be true; None means any."""
 
     robot: str | None = None
     sensor: str | None = None
@@ -52,25 +52,25 @@ class Wanted:
     until_ns: int | None = None
     """Exclusive."""
     near: tuple[float, float, float] | None = None
-    """x, y and radius in metres, in the odometry's frame."""
+    """x, y and radius in meters, in the odometry frame."""
     mission: str | None = None
-    """How the id of a mission or of its run begins."""
+    """The start of the id of a mission or of its run."""
     mission_type: str | None = None
     success: bool | None = None
-    """How the mission ended by its ``summary.json``; of one that goes on, neither is true."""
+    """Whether the mission succeeded, by its ``summary.json``; a mission that has not ended is neither."""
     policy: str | None = None
-    """Of missions in which this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
+    """Missions in which this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
     where: str | None = None
     """SQL, such as ``battery_pct < 30``."""
     label: str | None = None
-    """Objects that bear this label, or reach into a time that bears it."""
+    """Objects that have this label, or overlap a time that has it."""
     chosen: tuple[Chosen, ...] = ()
     """An object must be in each of these."""
     bounds: tuple[tuple[str, Any, Any], ...] = ()
     """Further columns with the least and the greatest value of what is wanted: row groups without are left out."""
 
     def has_date(self, date: str) -> bool:
-        """Whether a row under this date can be wanted."""
+        """Whether a row with this date can match."""
         if self.since_ns is None and self.until_ns is None:
             return True
         if date == UNDATED:
@@ -97,7 +97,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
     label: str | None = None, policy: str | None = None,
 ) -> Wanted:  # fmt: skip
-    """The query with these flags. Raises SettingError for an invalid one.
+    """The query with these flags. Raises SettingError for an invalid flag.
 
     ``ranges`` are those of an answer about values or labels: mappings with ``since_ns``, ``until_ns`` and maybe ``robot``.
     """
@@ -111,7 +111,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
 
 
 def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
-    """Raises SettingError for what are no ranges."""
+    """Raises SettingError for invalid ranges."""
     found = []
     for each in ranges:
         try:
@@ -126,7 +126,7 @@ def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
 
 
 def within(asked: Wanted, spans: Iterable[TimeSpan], keys: Iterable[tuple[str, str]] = (), all_ns: Iterable[int] = ()) -> Wanted:
-    """Of what is asked what reaches into these times, or is one of these objects; where there are none, nothing.
+    """The query, restricted to objects that overlap these times or are named; to none if there are none of either.
 
     ``all_ns`` are the times of the objects.
     """

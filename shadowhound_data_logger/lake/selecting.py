@@ -1,4 +1,4 @@
-"""From a question to the tracks of a data set: the only part of data sets that asks the catalogue."""
+"""From a query to the tracks of a dataset: the only part of datasets that reads the tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
-    """Where contents come from, and where the catalogue is. Raises LakeError for a folder without one."""
+    """Where contents and rows are read from. Raises LakeError for a folder without rows."""
     if isinstance(source, (str, Path)):
         if not any(Path(source).glob(f'*/{SENSOR}')):
             raise LakeError(
@@ -43,7 +43,7 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
 
 
 def fetched(folder: Path) -> Bucket:
-    """A folder of fetched objects as a lake: their rows lie in it as well (``fetched.keep_rows``)."""
+    """A folder of fetched objects as a bucket: it has their rows as well (``fetched.keep_rows``)."""
     whole = folder.absolute()
     return Bucket(StoreSettings(directory=whole.parent), whole.name)
 
@@ -51,7 +51,7 @@ def fetched(folder: Path) -> Bucket:
 def pull(
     lake: Bucket, source: Bucket | Path | str | None, sensors: Sequence[str], flags: Mapping[str, Any], findings: Findings
 ) -> None:
-    """Have robots send what they keep of these sensors. Raises SettingError for a folder, and as ``bring``."""
+    """Request what robots keep of these sensors. Raises SettingError for a folder, and the errors of ``bring``."""
     if isinstance(source, (str, Path)):
         raise SettingError('pull', True, 'a store as the source: robots are asked through one')
     bring(lake, flags, sensors=sensors, say=log.info, findings=findings)
@@ -71,7 +71,7 @@ def labels_of(lake: Bucket, objects: Sequence[tuple[Track, int]], findings: Find
 
 def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
            flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
-    """Raises SettingError for what is not a question, LakeError where nothing is known of an aligned sensor, StoreError."""
+    """Raises SettingError for an invalid query, LakeError if an aligned sensor has no objects, StoreError."""
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
@@ -90,7 +90,7 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     if not aligned:
         return {}
     reach = max(max(how.reach_ns) for how in aligned.values()) + SECOND
-    longest_ns = 3600 * SECOND  # a batch that began so long before can reach into the time (sensor.batch_s)
+    longest_ns = 3600 * SECOND  # a batch that started so long before can overlap the time (sensor.batch_s)
     since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
     until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
     where = among('sensor', aligned)
@@ -108,7 +108,7 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
 
 
 def _near(track: Track, anchors: list[Track], reach: int) -> Track:
-    """Of a side only what is about the time of an anchor of its robot: months can lie between two of them."""
+    """The rows near the time of an anchor of the same robot: there can be months between two anchors."""
     same = [anchor for anchor in anchors if anchor.robot == track.robot]
     first = min((int(anchor.start_ns[0]) for anchor in same), default=0) - reach
     last = max((int(anchor.latest_ns[-1]) for anchor in same), default=0) + reach
@@ -116,13 +116,13 @@ def _near(track: Track, anchors: list[Track], reach: int) -> Track:
 
 
 def _rows(batches: Iterable[pa.Table]) -> pa.Table:
-    """Packed batch by batch: unpacked, a million rows take 0.5 GB."""
+    """Packed batch by batch: a million rows would take 0.5 GB."""
     found = [packed(batch.filter(pc.is_valid(batch['t_start']))) for batch in batches]
     return pa.concat_tables([packed(narrow(NEEDED).empty_table()), *found])
 
 
 def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
-    """An object counts as many samples as its row says: one that says more than there is room for would be all of them."""
+    """Without objects whose row claims more samples than its size allows: they would dominate the dataset."""
     counts = pc.fill_null(rows['count'], 0)
     is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MOST_MEMBERS))
     for row in rows.filter(pc.invert(is_possible)).select(['key', 'count']).to_pylist():
@@ -131,7 +131,7 @@ def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
 
 
 def _kept(rows: pa.Table, mask: pa.ChunkedArray) -> pa.Table:
-    """A filter copies: not where all are kept."""
+    """The filtered rows; unchanged, without a copy, if all are kept."""
     return rows if pc.all(mask).as_py() else rows.filter(mask)
 
 
@@ -139,7 +139,7 @@ def tracks_of(rows: pa.Table) -> dict[tuple[str, str], Track]:
     """By robot and sensor."""
     robots, sensors = (pc.fill_null(rows[name], '') for name in ('robot', 'sensor'))
     names = {(robot, sensor) for robot in pc.unique(robots).to_pylist() for sensor in pc.unique(sensors).to_pylist()}
-    if len(names) == 1:  # the largest ones: nothing has to be copied
+    if len(names) == 1:  # the largest tables: without a copy
         return {names.pop(): Track.of(rows)}
     found = {}
     for robot, sensor in sorted(names):

@@ -1,9 +1,10 @@
-"""What a catalogue says that a store holds: every object that has a row, for ``shipping/audit.py`` to ask for.
+"""The objects that a store must have: every object with a row, for ``shipping/audit.py`` to check.
 
-A store that lost a part of its own catalogue does not know what else it lost. So the catalogue of another store, fetched into a
-folder, can be laid beside it.
+A store that lost rows does not know which objects it lost with them. Therefore the rows of another store, fetched into a folder,
+can be added.
 
-An audit that is cut short, by a kill or a store that is away, goes on where it stopped: what it found sound is noted in a file.
+An audit that was interrupted, by a kill or because the store was unreachable, continues where it stopped: a file records which
+objects were valid.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PAGE: Final = 1_000
-"""Objects asked for between two notes of what was sound: what an interruption costs."""
+"""Objects checked between two records; at most so many are checked again after an interruption."""
 DIGEST_BYTES: Final = 16
 KEEP_S: Final = 7 * 86_400.0
-"""How long what an audit found sound counts, if nobody goes on with it."""
+"""For so long an interrupted audit can be continued."""
 _KEY: Final = ('bucket', 'key')
 _SAID: Final = (*_KEY, 'bytes', 'sha256')
 
 
 def rows(source: Bucket, findings: Findings, **flags: Any) -> Rows:
-    """Of one catalogue; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
+    """The rows of one store; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
     return Rows(query.objects(source, findings=findings, columns=_SAID, distinct=True, **flags))
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Objects as catalogues have them, in the order of their keys: some 200 bytes of memory each.
+    """Objects as their rows describe them, in the order of their keys: some 200 bytes of memory each.
 
-    An object of which two rows say different things is asked for as each of them says.
+    An object with two contradicting rows is checked against both.
     """
 
     table: pa.Table
@@ -65,11 +66,11 @@ class Rows:
             yield list(enumerate(_infos(ordered.slice(start, PAGE)), start))
 
     def unproved(self) -> int:
-        """Of how many no SHA-256 is known: of these the size alone is compared."""
+        """How many have no SHA-256: only their sizes are compared."""
         return int(self.table['sha256'].null_count)
 
     def joined(self, other: Rows) -> Rows:
-        """What stands in either."""
+        """The rows of either."""
         return Rows(pa.concat_tables([self.table, other.table]).group_by(list(_SAID)).aggregate([]).select(_SAID))
 
     def lacking(self, other: Rows) -> list[ObjectInfo]:
@@ -79,14 +80,14 @@ class Rows:
 
 
 class Unfinished:
-    """The rows that no earlier run of the same question found sound, and a file of those that were: 16 bytes a row.
+    """The rows of objects that no earlier run of the same query found valid, and a file of the others: 16 bytes per row.
 
-    Life: New; enter once; read by one thread; ``finish`` where it came to its end; leave once. Without a folder that can be
-    written nothing is noted.
+    Lifecycle: enter once; read by one thread; ``finish`` when all are checked; exit once. Without a writable folder nothing is
+    recorded.
     """
 
     def __init__(self, rows: Rows, folder: Path, question: str, *, again: bool = False) -> None:
-        """``question`` is what was asked of whom; ``again`` forgets what an earlier run found."""
+        """``question`` identifies the store and the query; ``again`` discards the results of an earlier run."""
         self._rows = rows
         self._path = folder / f'{hashlib.sha256(question.encode()).hexdigest()[:32]}.sound'
         self._again = again
@@ -95,7 +96,7 @@ class Unfinished:
         self._page: dict[int, bytes] = {}
 
     def __enter__(self) -> Self:
-        """Raises LakeError where another process asks the same."""
+        """Raises LakeError if another process runs the same query."""
         try:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             for path in self._path.parent.glob('*.sound'):
@@ -103,7 +104,7 @@ class Unfinished:
                     path.unlink()
             file = self._path.open('a+b', buffering=0)
         except OSError as error:
-            log.warning('an interruption will cost what was asked so far: %s', error)
+            log.warning('after an interruption all objects will be checked again: %s', error)
             return self
         if not lock(file, wait=False):
             file.close()
@@ -121,7 +122,7 @@ class Unfinished:
             self._file.close()
 
     def earlier(self) -> int:
-        """How many of the rows an earlier run found sound."""
+        """How many of the rows an earlier run found valid."""
         return sum(_digest(info) in self._known for page in self._rows.pages() for _, info in page) if self._known else 0
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
@@ -131,17 +132,17 @@ class Unfinished:
                 yield left
 
     def note(self, ids: Iterable[int]) -> None:
-        """These are sound."""
+        """Record that these are valid."""
         if self._file is not None:
             try:
                 self._file.write(b''.join(self._page[number] for number in ids))
             except OSError as error:
-                log.warning('an interruption will cost what is asked from here on: %s', error)
+                log.warning('after an interruption the objects from here on will be checked again: %s', error)
                 self._file.close()
                 self._file = None
 
     def finish(self) -> None:
-        """The audit came to its end: the next one starts again."""
+        """The audit is complete: the next one starts from the beginning."""
         if self._file is not None:
             self._path.unlink(missing_ok=True)
 

@@ -34,7 +34,7 @@ def test_status_before_and_after_ingest(home: Path) -> None:
     assert (before['robot'], before['objects'], before['waiting'], before['first']) == ('thor', 0, 24, None)
     run(home, 'ingest')
     (after,) = json.loads(run(home, 'status', '--json').output)
-    assert after == {'robot': 'thor', 'days': 2, 'first': '2026-10-28', 'last': '2026-10-29', 'objects': 192, 'rows': 192,
+    assert after == {'robot': 'thor', 'days': 2, 'first': '2026-10-28', 'last': '2026-10-29', 'objects': 192, 'rows': 194,
                      'waiting': 0, 'rejected': 0}  # fmt: skip
     assert 'thor' in run(home, 'status').output
     (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.jsonl.zst').write_bytes(b'hello')

@@ -25,7 +25,7 @@ from shadowhound_data_logger.formats.rows.parts import encode
 from shadowhound_data_logger.lake import gaps, labels, prune, pull, verify
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.forgotten import dates_of_deletion, forgotten
+from shadowhound_data_logger.lake.prune import dates_of_deletion, forgotten
 from shadowhound_data_logger.lake.reindex import reindex
 from shadowhound_data_logger.shipping.audit import audit
 from shadowhound_data_logger.stores import open_store

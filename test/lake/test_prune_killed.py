@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.forgotten import forgotten
+from shadowhound_data_logger.lake.prune import forgotten
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

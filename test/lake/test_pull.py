@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import random
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pytest
 from click.testing import CliRunner
-from lake.making import merge
+from lake.making import add, folder_store, merge
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger.bags.kept import KeptCut
@@ -22,11 +22,12 @@ from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pull import _sentence
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings
+from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter, PullRequest
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.core.untrusted import visible
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake import labels, link
 from shadowhound_data_logger.lake import pull as lake
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -36,6 +37,7 @@ from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 NOON = '2025-10-18T12:00:00Z'
@@ -130,16 +132,19 @@ def test_a_pull_from_asking_to_arrival(field: Field) -> None:
     assert_whole(field.spool.root)
 
 
-def test_what_was_thinned_is_known_as_it_is_now() -> None:
-    """The robot tells of it again, with fewer bytes, and in any order that row counts; of what is lost the row that says so."""
-    rows = [('a', 'robot', 100), ('a', 'robot', 50), ('b', 'robot', 10), ('a', 'robot', 80), ('b', 'lost', 10)]
-    for order in permutations(rows):
-        columns = zip(*order, strict=True)
-        table = pa.table(dict(zip(('key', 'where', 'bytes'), columns, strict=True))).append_column(
-            'bucket', pa.array(['x'] * len(rows))
-        )
-        found = lake.superseding(table).select(['key', 'where', 'bytes']).to_pylist()
-        assert [tuple(row.values()) for row in found] == [('a', 'robot', 50), ('b', 'lost', 10)]
+@pytest.mark.parametrize('seed', range(4))
+def test_what_was_thinned_is_known_as_it_is_now(tmp_path: Path, seed: int) -> None:
+    """The robot reports it again, with fewer bytes, and in any order that row counts; of what is lost the row that says so."""
+    found = [('a', 'robot', 100), ('a', 'robot', 50), ('b', 'robot', 10), ('a', 'robot', 80), ('b', 'lost', 10)]
+    random.Random(seed).shuffle(found)
+    settings = folder_store(tmp_path)
+    with closing(open_store(settings, UploadSettings())) as store:
+        for number, (name, where, size) in enumerate(found):
+            row = {**schema.row_of(schema.BUCKET, f'thor/{name}', size, '', {}), 'where': where}
+            key = schema.KEPT.part_key('thor', schema.UNDATED, str(number))
+            add(store, tmp_path / 'tmp', key, parts.encode([row], schema.KEPT))
+    rows = lake.known(Bucket(settings, schema.BUCKET), 'thor', KeptFilter(), Findings()).to_pylist()
+    assert [(row['key'], row['where'], row['bytes']) for row in rows] == [('thor/a', 'robot', 50), ('thor/b', 'lost', 10)]
 
 
 def test_waiting_ends_with_the_last_answer(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:

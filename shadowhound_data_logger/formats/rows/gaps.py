@@ -1,13 +1,13 @@
-"""The gap journal as it is delivered: statements of what was lost and of how far that is known, in row files.
+"""The gap journal in the store: statements of what was lost, and of the time for which losses are known, in row files.
 
-A row is a statement, and nothing is ever changed in the store: a later statement about the same thing has the same ``id`` and a
-higher ``revision``. The newest counts; ``withdrawn`` says that there is no such gap any more (a late message filled it, an object
-was retried). So statements may arrive in any order, twice, or be merged in any order: the answer is the same.
+A row is a statement and never changes: a later statement about the same gap has the same ``id`` and a higher ``revision``. The
+newest counts; ``withdrawn`` means that the gap does not exist any more (a late message filled it, an object was retried). So
+statements can arrive in any order, or twice: the answer is the same.
 
-``complete`` statements are the watermark of a sink and topic: whatever was lost between their two times is stated, and the rest
-is in the store. After the last such statement, losses are unknown. Parts are at
+``complete`` statements are the watermark of a sink and topic: all losses between their two times have statements, and everything
+else is in the store. After the last such statement, losses are unknown. Row files are at
 ``<robot>/_gaps/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``to_ns``, UTC: a query for a
-time looks at its own date and at the later ones.
+time reads its own date and the later ones.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FORMAT_VERSION: Final = 1
 """Of the statements. Columns are only ever added, at the end."""
 GAP, WITHDRAWN, COMPLETE = 'gap', 'withdrawn', 'complete'
 STATEMENT_KINDS: Final = (GAP, WITHDRAWN, COMPLETE)
-"""What a statement can be (``what``)."""
+"""Values of ``what``."""
 GAPS: Final = TableSchema(
     folder=GAPS_FOLDER,
     columns={
@@ -57,20 +57,20 @@ GAPS: Final = TableSchema(
 """``sink topic publisher session kind cause count merged grade mission_id`` are those of ``shadowhound-data ledger --gaps``.
 
 Of a gap, ``from_ns`` is the stamp of the last message before it and ``to_ns`` that of the first one after it;
-``received_from_ns`` and ``received_to_ns`` are when these two messages arrived. Of a ``complete`` statement, ``from_ns`` to
-``to_ns`` is the time that it covers. All are null where the time is not known. ``clock`` is ``unset`` where they
-count from the robot's boot: ``t_from`` and ``t_to`` are null then. ``received`` and ``skipped`` (downsampled) are messages of the
-session until ``to_ns``, in ``complete`` statements alone.
+``received_from_ns`` and ``received_to_ns`` are when these two messages arrived. A ``complete`` statement covers ``from_ns`` to
+``to_ns``. All are null if the time is unknown. ``clock`` is ``unset`` if they count from the robot's boot: then ``t_from`` and
+``t_to`` are null. ``received`` and ``skipped`` (downsampled) are the messages of the session until ``to_ns``; only ``complete``
+statements have them.
 """
 WATERMARK_NS: Final = 600 * SECOND
-"""Of the ``complete`` statements of a session within so much time, the newest counts."""
+"""The newest ``complete`` statement of a session in each period of this length counts."""
 
 Statement = dict[str, Any]
 """Column -> value; a time as an int of microseconds."""
 
 
 def statement(robot: str, what: str, name: str, revision: int, **columns: Any) -> Statement:
-    """A row; what is not given is null. ``name`` tells what it speaks of from all else of the robot."""
+    """A row; columns that are not given are null. ``name`` identifies the gap among all of the robot."""
     found: Statement = dict.fromkeys(GAPS.columns)
     found.update(columns, robot=robot, what=what, id=name, revision=revision, format_version=FORMAT_VERSION)
     is_dated = found['clock'] != 'unset'
@@ -81,7 +81,7 @@ def statement(robot: str, what: str, name: str, revision: int, **columns: Any) -
 
 
 def name_of(*parts: object) -> str:
-    """What tells a gap from all others of a robot, by whatever names it in the journal."""
+    """The id of a gap: a hash of everything that identifies it in the journal."""
     return hashlib.blake2b('\0'.join(map(str, parts)).encode(errors='replace'), digest_size=10).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""The table of labels (lake/labels.py): what people say of times, objects and boxes in them."""
+"""The table of labels (lake/labels.py) of times, objects and boxes in them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from shadowhound_data_logger.formats.rows.schema import DOUBLE, INT32, INT64, LA
 
 LABEL, REMOVED = 'label', 'removed'
 LABEL_KINDS: Final = (LABEL, REMOVED)
-"""What a row can be (``what``)."""
+"""Values of ``what``."""
 MOST_TEXT: Final = 200
 LABELS: Final = TableSchema(
     folder=LABELS_FOLDER,
@@ -34,5 +34,5 @@ LABELS: Final = TableSchema(
     required=('robot', 'what', 'id', 'label', 'since_ns', 'until_ns', 'made_ns', 'format_version'),
     about={'shadowhound.labels': '1'},
 )
-"""``since_ns`` to ``until_ns``, both included, of all labels; ``bucket key`` of those of an object; ``x y width height``, in
-pixels, of those of a box in it. ``by`` whom and when it was ``made``; an ``id`` counts by its newest row."""
+"""Every label has ``since_ns`` to ``until_ns``, both included; that of an object has ``bucket key``, and that of a box in it
+``x y width height``, in pixels. ``by`` is the author and ``made`` the time; the newest row of an ``id`` counts."""

@@ -1,8 +1,8 @@
-"""Statistics of the numbers in each object, in Parquet parts of their own: whoever asks for no value reads none of them.
+"""Statistics of the numbers in each object, in separate row files: only queries by value read them.
 
-A row is one field of one object (formats/statistics.py). Parts lie at
-``<robot>/_stats/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.parquet``; the date is that of ``t_start``, UTC, as in the
-catalog. A row may be in two parts: a robot whose power failed tells the last ones again.
+A row is one field of one object (formats/statistics.py). The files are
+``<robot>/_stats/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``t_start``, UTC, as in the
+catalog. A row can be in two files: a robot writes the last ones again after a power cut.
 """
 
 from __future__ import annotations
