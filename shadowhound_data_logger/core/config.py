@@ -261,8 +261,14 @@ def _check_fields(mission: MissionSettings) -> None:
     """Raises SettingError for what is no topic with a field."""
     for name in ('battery', 'temperature'):
         given = getattr(mission, name)
-        if given and not _FIELD.fullmatch(given):
+        if given and not all(map(_FIELD.fullmatch, given.split('|'))):
             raise SettingError(f'mission.{name}', given, "empty, or 'topic:field' such as lowstate:bms_state.soc")
+
+
+def fields_of(given: str) -> list[tuple[str, list[str]]]:
+    """(topic, path of the field) of each alternative of a mission's setting, the preferred one first."""
+    pairs = (each.partition(':') for each in given.split('|') if each)
+    return [(topic, field.split('.')) for topic, _, field in pairs]
 
 
 def _check_expressions(prefix: str, group: BagSettings | EventSettings, names: Sequence[str]) -> None:

@@ -194,7 +194,10 @@ class MissionSettings:
     capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
     join: bool = _setting(True, "Log the robot's state to the mission's run beside the agent.")
     period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
-    battery: str = _setting('lowstate:bms_state.soc', 'Topic and field of battery_pct; empty for none.')
+    battery: str = _setting(
+        'lowstate:bms_state.soc|battery_state:percentage',
+        'Topic and field of battery_pct, alternatives separated by | (the first that is published); empty for none.',
+    )
     temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
     odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
     frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')

@@ -12,7 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from shadowhound_data_logger.core.config import NOT_SETTINGS, Settings
+from shadowhound_data_logger.core.config import NOT_SETTINGS, Settings, fields_of
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import GROUPS
@@ -173,8 +173,8 @@ def _check_topics(node: Node, settings: Settings) -> None:
     owners: dict[str, str] = {}
     mission = settings.mission
     for name, given in (('odometry', mission.odometry), ('battery', mission.battery), ('temperature', mission.temperature)):
-        if given:
-            _resolve(node, f'mission.{name}', given.partition(':')[0], given)
+        for topic, _ in fields_of(given):
+            _resolve(node, f'mission.{name}', topic, given)
     for topic in settings.events.topics:
         if topic:
             _resolve(node, 'events.topics', topic, list(settings.events.topics))

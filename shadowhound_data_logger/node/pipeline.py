@@ -171,7 +171,7 @@ class Pipeline:
         )
         self._stages = stages = Stages(self.spool, self.intake, queue, self.pool, self.writer, self.uploader, self.mission,
                                        self.recorder, bags, self.event_buffer, self._control, self._ros.middleware,
-                                       self._ros.front, self._make_unheard(), self._requests)  # fmt: skip
+                                       self._ros.front, self._make_unheard(), self._requests, self._rules)  # fmt: skip
         self._status = Status(stages, settings, self._clock, self._store.describe())
         acts = ActRecord(settings.spool_path, settings.robot, self._clock.wall_ns)
         self._commands = Commands(stages, self._parameters, self._status, acts, settings.robot, self._ros.name)

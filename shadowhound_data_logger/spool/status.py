@@ -42,7 +42,8 @@ _SECTIONS: Final[dict[str, dict[str, Any]]] = {
               'kept': 0, 'kept_bytes': 0, 'unkept': 0,
               'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
     'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
-              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'waits_for': {}, 'left_s': None},
+              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'waits_for': {}, 'left_s': None,
+              'stuck': {}},
     'requests': {'open': 0, 'bytes': 0, 'mbps': None, 'left_s': None},
     'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
                    'unheard': None},
@@ -188,6 +189,7 @@ def _findings(found: Mapping[str, Any]) -> Iterator[str]:
         yield f'the clock of this machine is not set: {what}'
     if store['state'] not in FINE_STORE:
         yield f'delivery: {str(store["state"]).replace("_", " ")}'
+    yield from store['stuck'].values()
     yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())
     yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
     yield from (f'{name}: {text}' for name, text in found['stalls'].items())

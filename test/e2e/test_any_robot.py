@@ -85,6 +85,8 @@ def test_everything_is_stored_by_its_type(node: Node, stored: Callable[..., Obje
         'imu', 'odom', 'joints', 'tb4_scan', 'tb4_battery_state', 'tb4_fix', 'tb4_front_image_raw', 'tb4_cmd_vel_out',
         'tb4_health', 'tb4_map', 'tb4_robot_description',
     }  # fmt: skip
+    charges = {info.metadata.get('battery_pct') for key, info in objects.infos.items() if key.split('/')[1] == 'tb4_scan'}
+    assert '50' in charges, 'BatteryState says 0.5'
     assert len(objects.samples('imu')) == 50 * SECONDS
     assert len(objects.samples('tb4_scan')) == 10 * SECONDS
     assert {key.rpartition('.')[2] for key in objects.sensor('tb4_front_image_raw')} == {'jpg'}

@@ -12,10 +12,11 @@ import threading
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import MissionSettings
+from shadowhound_data_logger.core.config import MissionSettings, fields_of
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.metadata_words import BATTERY, POSE
 from shadowhound_data_logger.core.model import DataObject
@@ -112,10 +113,10 @@ class RobotTrack(Consumer):
         """The topics are those of missions; ``resolve`` makes their full names."""
         self._types = types
         self.odometry = resolve(settings.odometry) if settings.odometry else ''
-        topic, _, field = settings.battery.partition(':')
-        self._battery, self._field = resolve(topic) if topic else '', field.split('.')
+        self._batteries = {resolve(topic): path for topic, path in fields_of(settings.battery)}
         self._poses: KeptMessages | None = None
-        self._charges: KeptMessages | None = None
+        self._charges: dict[str, KeptMessages] = {}
+        """Topic of a battery -> its messages."""
 
     def take(self, drained: Drained) -> None:
         kept = self.of(drained.topic, drained.type)
@@ -129,11 +130,13 @@ class RobotTrack(Consumer):
             if self._poses is None:
                 self._poses = KeptMessages(POSE_EVERY_NS, type_name, self._pose)
             return self._poses
-        if topic == self._battery:
-            if self._charges is None or self._charges.type != type_name:
-                self._charges = KeptMessages(BATTERY_EVERY_NS, type_name, self._charge)
-            return self._charges
-        return None
+        path = self._batteries.get(topic)
+        if path is None:
+            return None
+        charges = self._charges.get(topic)
+        if charges is None or charges.type != type_name:
+            charges = self._charges[topic] = KeptMessages(BATTERY_EVERY_NS, type_name, partial(self._charge, path))
+        return charges
 
     def mark(self, item: DataObject) -> DataObject:
         """The object with what is known of the middle of its time."""
@@ -146,10 +149,11 @@ class RobotTrack(Consumer):
         found = self._poses.around(stamp_ns) if self._poses is not None else []
         if found and (pose := _between(found, stamp_ns)) is not None:
             marks[POSE] = f'{_plain(pose.x, 3)} {_plain(pose.y, 3)} {_plain(pose.yaw, 4)} {pose.frame}'
-        if self._charges is not None:
-            near = min(self._charges.around(stamp_ns), key=lambda found: abs(found[0] - stamp_ns), default=None)
+        for charges in filter(None, map(self._charges.get, self._batteries)):
+            near = min(charges.around(stamp_ns), key=lambda found: abs(found[0] - stamp_ns), default=None)
             if near is not None and abs(near[0] - stamp_ns) <= BATTERY_AGE_NS:
                 marks[BATTERY] = f'{near[1]:g}'
+                break
         return marks
 
     def _pose(self, type_name: str, cdr: bytes) -> _Pose | None:
@@ -162,9 +166,9 @@ class RobotTrack(Consumer):
             return None
         return _Pose(at.x, at.y, yaw, _NO_WORD.sub('_', message.header.frame_id)[:64] or '_')
 
-    def _charge(self, type_name: str, cdr: bytes) -> float | None:
+    def _charge(self, path: list[str], type_name: str, cdr: bytes) -> float | None:
         try:
-            return battery_pct(self._types.deserialize(type_name, cdr), self._field)
+            return battery_pct(self._types.deserialize(type_name, cdr), path)
         except Rejected:
             return None
 

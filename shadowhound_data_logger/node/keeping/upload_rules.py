@@ -71,6 +71,9 @@ class UploadRules:
         topics = {node.resolve_topic_name(topic) for rule in self._rules.values() for topic in rule.topics()}
         self._messages = NewestMessages(topics) if topics else None
         self._closed: Mapping[str, str] = dict.fromkeys(self._rules, 'it has not been judged yet')
+        self._unpublished_since_s: dict[str, float] = {}
+        self.stuck: Mapping[str, str] = {}
+        """Rules that do not hold since nobody has published what they ask for a while: what to do. Replaced as a whole."""
 
     @property
     def consumers(self) -> Sequence[Consumer]:
@@ -92,7 +95,19 @@ class UploadRules:
             if holds is (name in self._closed):
                 log.info('%s %s: %s', name, 'holds' if holds else 'does not hold', why)
         self._closed = closed
+        self.stuck = {name: text for name in closed if (text := self._stuck(name, now_s))}
         return closed
+
+    def _stuck(self, rule: str, now_s: float) -> str:
+        """Why a rule that does not hold never will: its topics without a publisher for ``STALE_S``; empty if it may."""
+        topics = sorted(map(self._node.resolve_topic_name, self._rules[rule].topics()))
+        for topic in topics:
+            if self._node.count_publishers(topic):
+                self._unpublished_since_s.pop(topic, None)
+        silent = [topic for topic in topics if now_s - self._unpublished_since_s.setdefault(topic, now_s) >= STALE_S]
+        if not silent:
+            return ''
+        return f'{rule} waits for {", ".join(silent)}, which nobody publishes: start what publishes it, or change {rule}'
 
     # -- what rules ask ----------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import MissionSettings, SensorSettings
+from shadowhound_data_logger.core.config import MissionSettings, SensorSettings, fields_of
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.core.options import POINT_CLOUD
@@ -53,10 +53,12 @@ class MissionObserver:
         self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
         self._odometry = resolve(settings.odometry) if settings.odometry else ''
         self._fields: dict[str, dict[str, list[str]]] = {}
+        self._choices: dict[str, list[str]] = {}
+        """Metric -> its topics, the preferred one first; without those after one that was heard."""
         for key, given in ((BATTERY, settings.battery), (TEMPERATURE, settings.temperature)):
-            if given:
-                topic, _, field = given.partition(':')
-                self._fields.setdefault(resolve(topic), {})[key] = field.split('.')
+            for topic, path in fields_of(given):
+                self._fields.setdefault(resolve(topic), {})[key] = path
+                self._choices.setdefault(key, []).append(resolve(topic))
         self._periods: dict[tuple[str, int], int] = {}
         self._told: set[str] = set()
 
@@ -65,8 +67,10 @@ class MissionObserver:
         try:
             if batch.topic == self._odometry and batch.type == ODOMETRY:
                 yield from (self._pose(sample) for sample in batch.samples)
-            fields = self._fields.get(batch.topic)
+            fields = {key: path for key, path in self._fields.get(batch.topic, {}).items() if batch.topic in self._choices[key]}
             if fields:
+                for key in fields:
+                    self._choices[key] = self._choices[key][: self._choices[key].index(batch.topic) + 1]
                 for sample in self._some(batch, self._period_ns):
                     yield from self._readings(batch.type, sample, fields)
             if batch.type == POINT_CLOUD:

@@ -27,6 +27,7 @@ from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.node.intake.subscriber import SubscriberStatus
 from shadowhound_data_logger.node.intake.unheard import Unheard
+from shadowhound_data_logger.node.keeping.upload_rules import UploadRules
 from shadowhound_data_logger.node.recording.bags import BagConsumer
 from shadowhound_data_logger.node.recording.events import EventBuffer
 from shadowhound_data_logger.node.recording.mission import MissionWatch
@@ -72,6 +73,7 @@ class Stages:
     """None where the node listens through the RMW of the robot."""
     requests: RequestServer | None = None
     """None where nothing is kept until somebody asks for it."""
+    rules: UploadRules | None = None
 
     @property
     def workers(self) -> Sequence[Worker]:
@@ -212,7 +214,8 @@ class Status:
         figures = _fields(upload)
         del figures['sent_bytes'], figures['worker_failures']
         left_s = round(8e-6 * waiting / mbps) if upload.state == 'shipping' and mbps > 0 else None
-        return {'target': self._target, **figures, 'mbps': round(mbps, 3), 'left_s': left_s}
+        stuck = dict(self._stages.rules.stuck) if self._stages.rules is not None else {}
+        return {'target': self._target, **figures, 'mbps': round(mbps, 3), 'left_s': left_s, 'stuck': stuck}
 
 
 def _fields(of: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The names of WiFi networks, as the system tells them."""
+"""Rules that uploads wait for: networks as the system tells them, and topics that nobody publishes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import array
 import ctypes
 import struct
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from shadowhound_data_logger.node.keeping.upload_rules import wifi_networks
+from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.keeping import upload_rules
+from shadowhound_data_logger.node.keeping.upload_rules import STALE_S, UploadRules, wifi_networks
 
 
 class Kernel:
@@ -56,3 +61,21 @@ def test_a_system_that_does_not_tell(interfaces: Path) -> None:
 
 def test_this_machine_tells_or_says_why() -> None:
     assert wifi_networks() is not None
+
+
+def test_a_rule_about_a_topic_that_nobody_publishes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a minute, with what to do; not before, and not once somebody publishes it."""
+    now_s, publishers = [1000.0], {'/lowstate': 0}
+    monkeypatch.setattr(upload_rules, 'time', SimpleNamespace(monotonic=lambda: now_s[0]))
+    node: Any = SimpleNamespace(resolve_topic_name=lambda topic: f'/{topic}', count_publishers=publishers.__getitem__)
+    settings = Settings.load({'upload.when': 'lowstate:bms_state.soc > 30'}, {})
+    rules = UploadRules(node, settings, MessageTypes([]), SimpleNamespace(is_set=True), dict)  # type: ignore[arg-type]
+    for passed_s, is_told in ((0.0, False), (STALE_S - 1, False), (STALE_S, True), (STALE_S + 1, True)):
+        now_s[0] = 1000.0 + passed_s
+        assert 'upload.when' in rules.look()
+        assert bool(rules.stuck) is is_told
+    text = rules.stuck['upload.when']
+    assert text == ('upload.when waits for /lowstate, which nobody publishes: start what publishes it, or change upload.when')
+    publishers['/lowstate'] = 1
+    rules.look()
+    assert rules.stuck == {}
