@@ -32,9 +32,19 @@ from shadowhound_data_logger.cli.common import (
     the_store_settings,
 )
 from shadowhound_data_logger.cli.export import all_datasets
-from shadowhound_data_logger.cli.output import counted, duration, number, plain, plain_table, print_json, print_page, volume
+from shadowhound_data_logger.cli.output import (
+    counted,
+    duration,
+    number,
+    plain,
+    plain_table,
+    print_json,
+    print_page,
+    shown_by,
+    volume,
+)
 from shadowhound_data_logger.cli.progress import progress
-from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
+from shadowhound_data_logger.cli.question import asking, by_option, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.times import moment
@@ -376,12 +386,13 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
     '--since', metavar='TIME', default='1d', show_default=True, help='From TIME on: yesterday, 2h, 2026-11-20T12:30 (UTC).'
 )
 @click.option('--until', metavar='TIME', default='now', show_default=True, help='Before TIME.')
+@by_option
 @click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
 @click.option('--wifi', type=click.Path(path_type=Path), metavar='FILE.png',
               help='Draw instead how fast uploads went where the robot was: where to dock.')  # fmt: skip
 @as_json
-def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, chart: Path | None,  # noqa: PLR0913 - one an option
-                  wifi: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
+def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, by: str,  # noqa: PLR0913 - one an option
+                  chart: Path | None, wifi: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Show which hours of a topic are stored or lost.
 
     By topic and hour, with the causes, and what is not known yet.
@@ -404,16 +415,17 @@ def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str
         if wifi is not None:
             return _wifi(wifi, robot, since_ns, until_ns, left_out, as_json=as_json)
         found = library.coverage(since_ns, until_ns, robot=robot, topic=topic, sink=sink, findings=left_out,
-                                 source=default_source(the_store_settings()))  # fmt: skip
+                                 source=default_source(the_store_settings()), by=by)  # fmt: skip
         if chart and found:
             from shadowhound_data_logger.lake import pictures  # noqa: PLC0415
 
-            pictures.coverage(found, f'{sink}, {utc(since_ns):%Y-%m-%d %H:%M} to {utc(until_ns):%Y-%m-%d %H:%M} UTC', chart)
+            span = f'{utc(since_ns):%Y-%m-%d %H:%M} to {utc(until_ns):%Y-%m-%d %H:%M} UTC'
+            pictures.coverage(found, f'{sink}, {span}, by {by}', chart)
             click.echo(f'Wrote {chart}', err=True)
     if as_json:
-        print_json([_told(each) for each in found])
+        print_json([_told(each, by) for each in found])
     else:
-        print_page(*_covered(found))
+        print_page(*_covered(found, by))
     return report_skipped(left_out)
 
 
@@ -431,16 +443,16 @@ def _wifi(target: Path, robot: str | None, since_ns: int, until_ns: int, left_ou
     return report_skipped(left_out)
 
 
-def _told(each: Coverage) -> dict[str, Any]:
+def _told(each: Coverage, by: str) -> dict[str, Any]:
     known = each.known
     return {
         'robot': known.robot, 'sink': known.sink, 'topic': known.topic, 'since_ns': known.begin_ns, 'until_ns': known.end_ns,
-        'complete_ns': known.complete_ns, 'gaps': len(known.gaps), 'untimed': len(known.untimed),
+        'complete_ns': known.complete_ns, 'gaps': len(known.gaps), 'untimed': len(known.untimed), 'by': by,
         'hours': [{'begin': f'{utc(begin_ns):%Y-%m-%dT%H:%MZ}', 'seconds': seconds} for begin_ns, seconds in each.hours],
     }  # fmt: skip
 
 
-def _covered(found: Sequence[Coverage]) -> Iterator[RenderableType]:
+def _covered(found: Sequence[Coverage], by: str) -> Iterator[RenderableType]:
     """A line an hour; hours one after the other of which nothing is known are one line."""
     from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED  # noqa: PLC0415
 
@@ -467,6 +479,7 @@ def _covered(found: Sequence[Coverage]) -> Iterator[RenderableType]:
                 table.add_row(*map(plain, (each.known.robot, each.known.topic, hour)), *(_share(part, whole) for part in shares),
                               plain(why))  # fmt: skip
     yield table
+    yield plain(shown_by(by))
     for each in (each for each in found if each.known.untimed):
         count = sum(gap.count or 0 for gap in each.known.untimed)
         yield plain(f'{each.known.robot} {each.known.topic}: {number(count)} messages were lost at unknown times.')

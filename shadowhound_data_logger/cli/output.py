@@ -15,6 +15,7 @@ from rich.text import Text
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.stamps import BY_RECEIVED
 from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED
@@ -142,6 +143,11 @@ def duration(seconds: float) -> str:
     size, unit, part, smaller = next(units for units in UNITS if left >= units[0])
     rest = left % size // part
     return f'{left // size} {unit} {rest} {smaller}' if rest else f'{left // size} {unit}'
+
+
+def shown_by(by: str) -> str:
+    """Which of the two times of messages is shown."""
+    return 'Times are when messages arrived.' if by == BY_RECEIVED else 'Times are the stamps of messages.'
 
 
 def shown_time(time_ns: int | None) -> str:

@@ -24,14 +24,16 @@ from shadowhound_data_logger.cli.output import (
     plain_table,
     print_json,
     print_page,
+    shown_by,
     shown_time,
     volume,
     with_dates,
 )
-from shadowhound_data_logger.cli.question import asking, question, question_text, quietly, report_skipped
+from shadowhound_data_logger.cli.question import asking, by_flag, question, question_text, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.expression import STORED, parse
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.core.untrusted import csv_cell, visible
 from shadowhound_data_logger.lake.bucket import default_source
 
@@ -60,6 +62,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 )
 @click.argument('sql', required=False)
 @question
+@by_flag
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
 @click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
@@ -130,7 +133,14 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
     with asking():
         if sheet or ground:
             _pictures(source, found.to_pylist(), flags, left_out, sheet, ground)
-    _print(found, 'json' if as_json else kind, source.describe(), is_objects=not sql, is_limited=limit is not None)
+    _print(
+        found,
+        'json' if as_json else kind,
+        source.describe(),
+        is_objects=not sql,
+        is_limited=limit is not None,
+        by=flags.get('by', BY_STAMP),
+    )
     return report_skipped(left_out)
 
 
@@ -203,7 +213,7 @@ def _about_times(found: ValueAnswer) -> Iterator[RenderableType]:
         yield plain(f'{each.robot} {each.topic}: fresh {until}.')
 
 
-def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: bool) -> None:
+def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: bool, by: str) -> None:
     if kind == 'keys':
         for bucket, key in zip(found['bucket'].to_pylist(), found['key'].to_pylist(), strict=True):
             click.echo(visible(f'{bucket}/{key}'))
@@ -214,10 +224,10 @@ def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: b
         writer.writerow(map(csv_cell, found.column_names))
         writer.writerows(map(csv_cell, _told(row).values()) for row in found.to_pylist())
     else:
-        print_page(*_table(found, where, is_objects=is_objects, is_limited=is_limited))
+        print_page(*_table(found, where, is_objects=is_objects, is_limited=is_limited, by=by))
 
 
-def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Iterator[RenderableType]:
+def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool, by: str) -> Iterator[RenderableType]:
     columns = [name for name in COLUMNS if name in found.column_names] if is_objects else found.column_names
     rows = found.select(columns).slice(0, len(found) if is_limited else SHOWN).to_pylist()
     left = {name for name in columns if any(isinstance(row[name], (str, datetime)) for row in rows)}
@@ -229,6 +239,8 @@ def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool) -> Ite
         yield table
         yield ''
     yield plain(_verdict(found, len(rows), where, is_objects=is_objects))
+    if rows and (is_objects or by == BY_RECEIVED):
+        yield plain(shown_by(by))
 
 
 def _verdict(found: Any, shown: int, where: str, *, is_objects: bool) -> str:

@@ -12,6 +12,7 @@ import click
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
 from shadowhound_data_logger.core.errors import LakeError, SettingError, UnknownName
+from shadowhound_data_logger.core.stamps import BY_STAMP, CLOCKS
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_json
 
 if TYPE_CHECKING:
@@ -25,6 +26,10 @@ ranges_option = click.option(
     callback=lambda _, __, file: _ranges(file),
     help='In one of these times: the answer of `query --when ... --json`; - is stdin.',
 )
+by_option = click.option(
+    '--by', type=click.Choice(CLOCKS), default=BY_STAMP, show_default=True,
+    help='Which time of the messages counts: measured, or arrived.',
+)  # fmt: skip
 FLAGS: Final = {
     'robot': click.option('--robot', metavar='NAME', help='Only of this robot.'),
     'sensor': click.option('--sensor', metavar='NAME', help='Only of this sensor: camera, lidar, odom, ...'),
@@ -77,6 +82,16 @@ def question(command: _Command) -> _Command:
     for flag in reversed(FLAGS.values()):
         asked = flag(asked)
     return asked  # type: ignore[return-value]
+
+
+def by_flag(command: _Command) -> _Command:
+    """Adds ``--by`` to the flags."""
+
+    @functools.wraps(command)
+    def asked(*, by: str, flags: Mapping[str, Any], **given: Any) -> Any:
+        return command(flags=flags if by == BY_STAMP else {**flags, 'by': by}, **given)
+
+    return by_option(asked)  # type: ignore[return-value]
 
 
 def _ranges(file: Any) -> list[Any] | None:

@@ -52,6 +52,9 @@ class Times(NamedTuple):
 
 
 NO_TIMES: Final = Times()
+BY_STAMP, BY_RECEIVED = 'stamp', 'received'
+CLOCKS: Final = (BY_STAMP, BY_RECEIVED)
+"""By which of the two times data is placed where it is read: query, coverage, export, MissionDataset and the live page's past."""
 
 
 def by_arrival(received_ns: int) -> Times:

@@ -21,6 +21,7 @@ import pyarrow as pa
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
 from shadowhound_data_logger.formats.rows.schema import BUCKET, UNDATED
@@ -134,8 +135,9 @@ class Known:
         return Known(self.robot, self.sink, self.topic, begin_ns, end_ns, tuple(found), gaps, self.untimed)
 
 
-def known(robot: str, topic: str, since: str | datetime | int, until: str | datetime | int = 'now', *, sink: str = OBJECTS,
-          source: Bucket | None = None, findings: Findings | None = None) -> Known:  # fmt: skip
+def known(robot: str, topic: str, since: str | datetime | int, until: str | datetime | int = 'now', *,  # noqa: PLR0913 - parts of a query
+          sink: str = OBJECTS, source: Bucket | None = None, findings: Findings | None = None,
+          by: str = BY_STAMP) -> Known:  # fmt: skip
     """What is known about a topic from ``since`` until before ``until``: times as in ``query``, or in ns since 1970.
 
     Each stretch is complete, or has gaps, or is unknown. Without sequence numbers or a regular rate (``received-only``) losses
@@ -149,7 +151,7 @@ def known(robot: str, topic: str, since: str | datetime | int, until: str | date
     begin_ns, end_ns = moment_ns('since', since, now_ns), moment_ns('until', until, now_ns)
     if end_ns < begin_ns:
         raise SettingError('until', until, f'a time after {since}')
-    found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=begin_ns, findings=findings)
+    found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=begin_ns, findings=findings, by=by)
     return of_rows(robot, sink, topic, begin_ns, end_ns, found.to_pylist())
 
 
@@ -159,19 +161,21 @@ def moment_ns(name: str, given: str | datetime | int, now_ns: int) -> int:
 
 
 def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str | None = None, sink: str | None = None,
-           since_ns: int | None = None, findings: Findings | None = None) -> pa.Table:  # fmt: skip
+           since_ns: int | None = None, findings: Findings | None = None, by: str = BY_STAMP) -> pa.Table:  # fmt: skip
     """The statements that count, about times from then on or unknown ones, with the columns of ``GAPS``.
+
+    With ``by`` ``received``, ``from_ns``, ``to_ns``, ``t_from`` and ``t_to`` are times of arrival, null where these are unknown.
 
     Raises StoreError, LakeError.
     """
     source = source or Bucket(store_settings(os.environ, home(os.environ)), BUCKET)
     findings = Findings() if findings is None else findings
-    first = '' if since_ns is None else f'{utc(max(since_ns, 0)):%Y-%m-%d}'
+    first = '' if since_ns is None or by == BY_RECEIVED else f'{utc(max(since_ns, 0)):%Y-%m-%d}'
     conditions = [f'(date >= {literal(first)} OR date = {literal(UNDATED)})'] if first else []
     conditions += [f'{name} = {literal(value)}' for name, value in (('topic', topic), ('sink', sink)) if value is not None]
     conditions += [] if robot is None else [f'robot = {literal(robot)}']
     has_date = (lambda date: date >= first or date == UNDATED) if first else None
-    with views(source, [GAPS], findings, robot=robot, has_date=has_date) as ready:
+    with views(source, [GAPS], findings, robot=robot, has_date=has_date, by=by) as ready:
         return answer(ready, _NEWEST.format(' AND '.join(conditions) or 'true'))
 
 
@@ -269,10 +273,11 @@ class Coverage:
     """Times of which messages were skipped on purpose, because the sensor's rate is lower than the topic's."""
 
 
-def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: str | None = None, sink: str = OBJECTS,
-             source: Bucket | None = None, findings: Findings | None = None) -> list[Coverage]:  # fmt: skip
+def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: str | None = None,  # noqa: PLR0913 - as above
+             sink: str = OBJECTS, source: Bucket | None = None, findings: Findings | None = None,
+             by: str = BY_STAMP) -> list[Coverage]:  # fmt: skip
     """Of each robot and topic with statements, or of the named one. Raises StoreError."""
-    found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=since_ns, findings=findings)
+    found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=since_ns, findings=findings, by=by)
     grouped: defaultdict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in found.to_pylist():
         grouped[row['robot'], row['topic']].append(row)

@@ -22,6 +22,7 @@ from deltalake import QueryBuilder
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, PolicyRefused, StoreError
 from shadowhound_data_logger.core.keys import is_name
+from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
@@ -212,7 +213,8 @@ def answering(query: str, known: Iterable[str]) -> Iterator[None]:
 @contextmanager
 def _opened(lake: _Asked, asked: Wanted, more: Mapping[str, pa.Table] | None = None) -> Iterator[QueryBuilder]:
     has_date = asked.has_date if asked.since_ns is not None or asked.until_ns is not None else None
-    with views(lake.source, [OBJECTS], lake.findings, robot=asked.robot, has_date=has_date, as_of=lake.as_of, more=more) as ready:
+    with views(lake.source, [OBJECTS], lake.findings, robot=asked.robot, has_date=has_date, as_of=lake.as_of, more=more,
+               by=asked.by) as ready:  # fmt: skip
         yield ready
 
 
@@ -288,9 +290,13 @@ def _conditions(asked: Wanted) -> Iterator[str]:
         if (value := getattr(asked, name)) is not None:
             yield f'{name} = {literal(value)}'
     if asked.since_ns is not None:
-        yield f't_start IS NOT NULL AND t_start_ns >= {asked.since_ns} AND date >= {literal(date_of(asked.since_ns))}'
+        yield f't_start IS NOT NULL AND t_start_ns >= {asked.since_ns}'
+        if asked.by == BY_STAMP:
+            yield f'date >= {literal(date_of(asked.since_ns))}'
     if asked.until_ns is not None:
-        yield f't_start IS NOT NULL AND t_start_ns < {asked.until_ns} AND date <= {literal(date_of(asked.until_ns - 1))}'
+        yield f't_start IS NOT NULL AND t_start_ns < {asked.until_ns}'
+        if asked.by == BY_STAMP:
+            yield f'date <= {literal(date_of(asked.until_ns - 1))}'
     if asked.near is not None:
         x, y, radius = asked.near
         for name, middle in (('x', x), ('y', y)):  # a box first: by statistics, parts of a file can be skipped
@@ -371,7 +377,8 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
     if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
         raise LakeError(f'gaps and watermarks cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
-    rows = newest(lake.source, robot=asked.robot, topic=asked.topic, since_ns=asked.since_ns, findings=lake.findings)
+    rows = newest(lake.source, robot=asked.robot, topic=asked.topic, since_ns=asked.since_ns, findings=lake.findings,
+                  by=asked.by)  # fmt: skip
     if asked.sensor is not None:
         topics = _objects(lake, asked, Shape(['topic'], is_distinct=True))['topic'].to_pylist()
         rows = rows.filter(pc.is_in(rows['topic'], value_set=pa.array(topics, pa.string())))
@@ -389,7 +396,7 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     """The run of each mission of that time, from any of its objects: those delivered before the run existed do not name it."""
     until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
-    of_time = Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns)
+    of_time = Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns, by=asked.by)
     where = ' AND '.join((*_conditions(of_time), 'mission_id IS NOT NULL', 'run_id IS NOT NULL'))
     with _opened(lake, of_time) as ready:
         found = answer(ready, f'SELECT mission_id, max(run_id) AS run_id FROM {ALL} WHERE {where} GROUP BY mission_id')  # noqa: S608

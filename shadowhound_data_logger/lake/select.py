@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.formats.rows.schema import UNDATED
 
@@ -64,6 +65,8 @@ class Wanted:
     """SQL, such as ``battery_pct < 30``."""
     label: str | None = None
     """Objects that have this label, or overlap a time that has it."""
+    by: str = BY_STAMP
+    """Which of the two times of its messages is the time of an object: ``stamp`` or ``received``."""
     chosen: tuple[Chosen, ...] = ()
     """An object must be in each of these."""
     bounds: tuple[tuple[str, Any, Any], ...] = ()
@@ -73,8 +76,8 @@ class Wanted:
         """Whether a row with this date can match."""
         if self.since_ns is None and self.until_ns is None:
             return True
-        if date == UNDATED:
-            return False
+        if date == UNDATED or self.by == BY_RECEIVED:  # dates are those of stamps
+            return date != UNDATED
         first = '' if self.since_ns is None else date_of(self.since_ns)
         return first <= date and (self.until_ns is None or date <= date_of(self.until_ns - 1))
 
@@ -95,17 +98,19 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     near: tuple[float, float, float] | str | None = None, robot: str | None = None, sensor: str | None = None,
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
     where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
-    label: str | None = None, policy: str | None = None,
+    label: str | None = None, policy: str | None = None, by: str = BY_STAMP,
 ) -> Wanted:  # fmt: skip
     """The query with these flags. Raises SettingError for an invalid flag.
 
     ``ranges`` are those of an answer about values or labels: mappings with ``since_ns``, ``until_ns`` and maybe ``robot``.
     """
+    if by not in CLOCKS:
+        raise SettingError('by', by, ' or '.join(CLOCKS))
     asked = Wanted(
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
         label=label, policy=policy, since_ns=None if since is None else moment('since', since, now_ns),
         until_ns=None if until is None else moment('until', until, now_ns),
-        near=None if near is None else _circle(near),
+        near=None if near is None else _circle(near), by=by,
     )  # fmt: skip
     return asked if ranges is None else within(asked, spans_of(ranges))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -80,13 +79,13 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
     found = _kept(found, pc.is_in(ends, value_set=pa.array(sorted(IMAGES | CLOUDS | ARCHIVES))))
     anchors = tracks_of(_possible(found, findings))
     del found, ends
-    sides = _sides(source, list(anchors.values()), aligned, findings, flags.get('as_of')) if anchors else {}
+    sides = _sides(source, list(anchors.values()), aligned, findings, flags) if anchors else {}
     pa.default_memory_pool().release_unused()  # of a million rows 1 GB
     return Selection(tuple(anchors.values()), dict(aligned), sides, size)
 
 
 def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Window], findings: Findings,
-           as_of: str | datetime | None) -> dict[tuple[str, str], Track]:  # fmt: skip
+           flags: Mapping[str, Any]) -> dict[tuple[str, str], Track]:  # fmt: skip
     if not aligned:
         return {}
     reach = max(max(how.reach_ns) for how in aligned.values()) + SECOND
@@ -94,9 +93,8 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
     until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
     where = among('sensor', aligned)
-    found = _rows(
-        query.object_batches(source, columns=NEEDED, findings=findings, as_of=as_of, since=since, until=until, where=where)
-    )
+    same = {name: flags[name] for name in ('as_of', 'by') if name in flags}
+    found = _rows(query.object_batches(source, columns=NEEDED, findings=findings, since=since, until=until, where=where, **same))
     for name in aligned:
         kinds = {*pc.unique(found.filter(pc.equal(found['sensor'], name))['type']).to_pylist()}
         if not kinds:

@@ -28,6 +28,7 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.errors import DataLoggerError, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.expression import MAX_SHOWN, STORED, Comparison, Expression, Joined, comparisons
 from shadowhound_data_logger.core.expression import parse as parse_expression
+from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
 from shadowhound_data_logger.formats.image import of_jpeg
 from shadowhound_data_logger.formats.pointcloud import of_points
@@ -148,6 +149,8 @@ def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, 
     sensor = comparisons(expression)[0].source
     if flags.get('sensor', sensor) != sensor:
         raise SettingError('sensor', flags['sensor'], f'{sensor}, of which the condition is; leave it out')
+    if flags.get('by', BY_STAMP) != BY_STAMP:
+        raise SettingError('by', flags['by'], f'{BY_STAMP}: statistics of values have no other time')
     findings = Findings() if findings is None else findings
     source = source or default_source()
     flags = {**flags, 'sensor': sensor}

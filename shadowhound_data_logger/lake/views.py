@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Any
+from typing import Any, Final
 
 import pyarrow as pa
 from deltalake import QueryBuilder
 
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
+from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -25,10 +27,12 @@ _TABLE, _FRESH = '_table', '_fresh'
 
 
 @contextmanager
-def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robot: str | None = None,
+def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robot: str | None = None,  # noqa: PLR0913 - parts of a query
           has_date: Callable[[str], bool] | None = None, as_of: datetime | None = None,
-          more: Mapping[str, pa.Table] | None = None) -> Iterator[QueryBuilder]:  # fmt: skip
+          more: Mapping[str, pa.Table] | None = None, by: str = BY_STAMP) -> Iterator[QueryBuilder]:  # fmt: skip
     """An engine with a view of each of these tables, such as ``all_objects``, and ``more`` tables.
+
+    With ``by`` ``received``, the times of objects and gaps (``t_start``, ``from_ns``, ...) are those of arrival.
 
     ``robot`` and ``has_date`` say which rows are needed: there may be others. ``all_objects`` omits what was deleted on purpose.
     Raises StoreError, LakeError.
@@ -49,18 +53,21 @@ def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robo
                 empty.discard(each)
     with engine({**found, **(more or {})}) as ready:
         for each in of:
-            answer(ready, _view(TABLES[each.folder].name, found, is_pruned=each is OBJECTS and FORGOTTEN not in empty))
+            is_pruned = each is OBJECTS and FORGOTTEN not in empty
+            answer(ready, _view(TABLES[each.folder].name, found, _ARRIVAL.get(each.folder, '*') if by == BY_RECEIVED else '*',
+                                is_pruned=is_pruned))  # fmt: skip
         yield ready
 
 
 def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str | None = None,  # noqa: PLR0913 - parts of a query
             has_date: Callable[[str], bool] | None = None, where: str = 'true',
-            columns: Sequence[str] = (), order: str = '', limit: int | None = None) -> pa.Table:  # fmt: skip
+            columns: Sequence[str] = (), order: str = '', limit: int | None = None,
+            by: str = BY_STAMP) -> pa.Table:  # fmt: skip
     """The rows of one table for which a condition holds, with the columns of its schema. Raises StoreError, LakeError."""
     table = TABLES[of.folder]
     names = ', '.join(f'"{name}"' for name in columns or of.columns)
     of_robot = 'true' if robot is None else f'robot = {literal(robot)}'
-    with views(source, [of], findings, robot=robot, has_date=has_date) as ready:
+    with views(source, [of], findings, robot=robot, has_date=has_date, by=by) as ready:
         query = f'SELECT {names} FROM all_{table.name} WHERE {of_robot} AND ({where})'  # noqa: S608 - our own words
         query += f' ORDER BY {order}' * bool(order) + ('' if limit is None else f' LIMIT {limit}')
         return answer(ready, query)
@@ -101,11 +108,33 @@ def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) 
     ingest(source, tables, findings, pending(opened, files))
 
 
-def _view(name: str, found: Mapping[str, Any], *, is_pruned: bool) -> str:
+def _view(name: str, found: Mapping[str, Any], columns: str, *, is_pruned: bool) -> str:
     parts = [f'SELECT * FROM {each}' for each in (f'{name}{_TABLE}', f'{name}{_FRESH}') if each in found]  # noqa: S608
     rows = ' UNION ALL '.join(parts)
     if is_pruned:
         same = ' AND '.join(f'f.{column} = o.{column}' for column in ('date', 'robot', 'bucket', 'key'))
         known = [f'SELECT 1 FROM {each} f WHERE {same}' for each in found if each.startswith('forgotten')]  # noqa: S608
         rows = f'SELECT * FROM ({rows}) o WHERE ' + ' AND '.join(f'NOT EXISTS ({each})' for each in known)  # noqa: S608
-    return f'CREATE VIEW all_{name} AS {rows}'
+    return f'CREATE VIEW all_{name} AS SELECT {columns} FROM ({rows})'  # noqa: S608
+
+
+def _utc_of(column: str) -> str:
+    return f"""arrow_cast({column} / 1000, 'Timestamp(Microsecond, Some("UTC"))')"""
+
+
+def _arrival_of(received: str, column: str) -> str:
+    return f'CASE WHEN {received} IS NULL THEN {column} ELSE {_utc_of(received)} END AS {column}'
+
+
+_ARRIVAL: Final = {
+    OBJECTS.folder: f"""* REPLACE (
+        coalesce(received_start_ns, t_start_ns) AS t_start_ns, coalesce(received_end_ns, t_end_ns) AS t_end_ns,
+        {_arrival_of('received_start_ns', 't_start')}, {_arrival_of('received_end_ns', 't_end')},
+        CASE WHEN received_start_ns IS NULL THEN clock_offset_ns
+          ELSE coalesce(clock_offset_ns, 0) + received_start_ns - t_start_ns END AS clock_offset_ns)""",
+    GAPS.folder: f"""* REPLACE (
+        received_from_ns AS from_ns, received_to_ns AS to_ns, {_utc_of('received_from_ns')} AS t_from,
+        {_utc_of('received_to_ns')} AS t_to)""",
+}
+"""Columns of a table in which its times are those of arrival; the times in the content of an object, with ``clock_offset_ns``
+added, are as well, to within the jitter of the batch. An object whose arrival is unknown was dated by the robot's own clock."""

@@ -220,7 +220,8 @@ class _GapParts:
             if mark.robot == self._robot and self._marks.get(name) != mark:
                 said = complete(
                     self._robot, f'{began_ns:x}', began_ns + newest, sink=mark.sink, topic=mark.topic, session=mark.session,
-                    from_ns=mark.since_ns, to_ns=mark.complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
+                    from_ns=mark.since_ns, to_ns=mark.complete_ns, received_from_ns=mark.received_since_ns,
+                    received_to_ns=mark.received_complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
                 )  # fmt: skip
                 if dates <= {date_of(said)}:  # else rows and watermark are in two parts, and either may be delivered first
                     self._marks[name] = mark

@@ -16,7 +16,8 @@ _SESSIONS: Final = """
 SELECT session, robot, started_ns, received = skipped + stored
     + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0)
     AND ifnull(json_extract(dropped, '$.restart'), 0) = 0,
-  topic, accounting, received, skipped, first_ns, heard_ns, complete_ns, ended_ns IS NOT NULL
+  topic, accounting, received, skipped, first_ns, heard_ns, heard_received_ns, complete_ns,
+  ended_ns IS NOT NULL
 FROM accounts JOIN sessions ON id = session
 WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
 ORDER BY robot, topic, session"""
@@ -202,15 +203,20 @@ class GapTable(Table):
             )
         }  # fmt: skip
         found = []
-        for (session, robot, started_ns, is_over, account, grade, received, skipped, first_ns, heard_ns, complete_ns,
-             has_ended) in self._db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
+        for (session, robot, started_ns, is_over, account, grade, received, skipped, first_ns, heard_ns, heard_received_ns,
+             complete_ns, has_ended) in self._db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
             sink, topic = split(account)
             if has_ended and sink == OBJECTS and is_over:
                 complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all
+            late_ns = heard_received_ns - heard_ns if heard_received_ns else 0
             end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
-            since_ns = max(first_ns, started_ns, forgotten.get((session, account), 0), forgotten.get((0, account), 0))
+            since_ns = max(first_ns, started_ns - late_ns, forgotten.get((session, account), 0), forgotten.get((0, account), 0))
             if since_ns <= end_ns:
-                found.append(Watermark(robot, sink, topic, session, since_ns, end_ns, grade, received, skipped))
+                arrived_ns = min(end_ns + late_ns, heard_received_ns) or None
+                found.append(Watermark(
+                    robot, sink, topic, session, since_ns, end_ns, arrived_ns and since_ns + late_ns, arrived_ns, grade, received,
+                    skipped,
+                ))  # fmt: skip
         return found
 
     def _waiting(self) -> dict[str, int]:

@@ -92,6 +92,9 @@ class Watermark(NamedTuple):
     since_ns: int
     """UTC stamp of a message, and so is the next one."""
     complete_ns: int
+    received_since_ns: int | None
+    """The same two by the arrival of messages; None if that is unknown."""
+    received_complete_ns: int | None
     grade: str
     """Whether losses are known by numbers or estimated; there is no watermark where only the received is known."""
     received: int

@@ -74,6 +74,25 @@ def test_a_window_is_the_messages_before_the_frame(tmp_path: Path) -> None:
     assert first['imu'][7] == pytest.approx(imu_reading(NOON_NS))
 
 
+def test_by_received_samples_are_what_had_arrived(tmp_path: Path) -> None:
+    """The IMU's messages arrive 2 s after their stamps: by stamp a frame has those of its time, by arrival older ones."""
+    settings = folder_store(tmp_path)
+    slow = Drive(settings, tmp_path)
+    slow.late_ns = {'imu': 2 * SECOND, 'camera': SECOND // 10}
+    slow.record(SECONDS)
+    source = Bucket(settings, BUCKET)
+    by_stamp = MissionDataset(source, align={'imu': Window(0.5, rows=8)})
+    by_received = MissionDataset(source, align={'imu': Window(0.5, rows=8)}, by='received')
+    at_ns = NOON_NS + 4 * SECOND
+    assert by_stamp[4]['imu'][-1] == pytest.approx(imu_reading(at_ns), abs=1e-6)
+    assert (by_received[4]['stamp_ns'], by_stamp[4]['stamp_ns']) == (at_ns + SECOND // 10, at_ns)
+    assert by_received[4]['imu'][-1] == pytest.approx(imu_reading(at_ns + SECOND // 10 - 2 * SECOND), abs=1e-6)
+    with pytest.raises(SettingError, match='stamp or received'):
+        MissionDataset(source, by='arrival')
+    by_stamp.close()
+    by_received.close()
+
+
 def test_a_causal_data_set_knows_nothing_later(tmp_path: Path) -> None:
     """Odometry comes a little after each frame: the nearest is that, the causal one is that of the second before."""
     dataset = MissionDataset(drive(tmp_path), align={'odom': 1.5, 'joints': 0.2}, causal=True)

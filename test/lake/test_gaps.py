@@ -50,6 +50,22 @@ def test_without_a_statement_nobody_knows(store: StoreSettings) -> None:
     assert (found.is_whole, found.stretches[0].is_open, found.complete_ns) == (False, True, NOON_NS)
 
 
+def test_by_received_a_gap_is_when_its_messages_would_have_arrived(store: StoreSettings, tmp_path: Path) -> None:
+    """What has no time of arrival is untimed on that clock, and no watermark reaches into it."""
+    late = {'received_from_ns': NOON_NS + 120 * SECOND, 'received_to_ns': NOON_NS + 123 * SECOND}
+    whole = {'received_from_ns': NOON_NS + 100 * SECOND, 'received_to_ns': NOON_NS + 160 * SECOND}
+    tell(store, tmp_path, mark(60, **whole), lost('1', 20, 23, **late), lost('2', 30, 31))
+    first_ns, last_ns = NOON_NS + 90 * SECOND, NOON_NS + 170 * SECOND
+    found = known('thor', '/imu', first_ns, last_ns, source=Bucket(store, BUCKET), by='received')
+    assert seconds(found) == [
+        (90, 100, (), ''), (100, 120, (), 'exact'), (120, 123, ('transport',), 'exact'), (123, 160, (), 'exact'),
+        (160, 170, (), ''),
+    ]  # fmt: skip
+    assert [gap.from_ns for gap in found.untimed] == [None]
+    (covered,) = coverage(first_ns, last_ns, source=Bucket(store, BUCKET), by='received')
+    assert covered.known.stretches == found.stretches
+
+
 def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: StoreSettings, tmp_path: Path) -> None:
     """Whole, a gap, whole, and then what is not told yet."""
     tell(store, tmp_path, mark(60), lost('1', 20, 23))

@@ -75,6 +75,26 @@ def test_flags_mean_what_they_say(
     assert bool(expected) != (flags == {'robot': 'tachi'}), 'a question that nothing answers proves nothing'
 
 
+def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:
+    """A frame that arrived on the next day is of that day by arrival, and of the day of its stamp otherwise."""
+    settings, late_ns = folder_store(tmp_path), 13 * 3600 * 10**9
+    told = {'received_start_ns': str(NOON_NS + late_ns), 'received_end_ns': str(NOON_NS + late_ns)}
+    rows = [row('camera', NOON_NS, **told), row('odom', NOON_NS)]
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, rows, '20261028T120000_boot', tmp_path / 'tmp')
+    source, next_day = Bucket(settings, schema.BUCKET), {'since': '2026-10-29', 'until': '2026-10-30'}
+    (camera,), (odom,) = (keys([each]) for each in rows)
+    assert (found(source, **DAY), found(source, **next_day)) == (sorted([camera, odom]), [])
+    assert found(source, **DAY, by='received') == [odom], 'it has no time of arrival: its robot dated it by its own clock'
+    assert found(source, **next_day, by='received') == [camera]
+    (one,) = lake.objects(source, by='received', sensor='camera').to_pylist()
+    assert (one['t_start_ns'], one['t_start'].day, one['clock_offset_ns']) == (NOON_NS + late_ns, 29, late_ns)
+    (told_topic,) = lake.sql("SELECT first FROM topics WHERE topic = '/camera/compressed'", source, by='received').to_pylist()
+    assert told_topic['first'].hour == 1
+    with pytest.raises(SettingError, match='stamp or received'):
+        found(source, by='arrival')
+
+
 def test_every_column_comes_back_as_it_was_written(world: tuple[StoreSettings, list[schema.Row]]) -> None:
     """Names, order and values; times in UTC."""
     settings, rows = world

@@ -72,6 +72,8 @@ class Drive:
         self._ros = _ros()
         self._folder = tmp / 'bodies'
         self.rows: list[schema.Row] = []
+        self.late_ns: dict[str, int] = {}
+        """Sensor -> how much later than their stamps its messages arrive."""
 
     def record(self, seconds: int, *, frames: str = 'jpeg', without: Sequence[str] = (), first: int = 0) -> None:
         """``frames``: jpeg, one a second; tar or zip, ``FRAMES_HZ`` of them in an archive a second."""
@@ -90,6 +92,10 @@ class Drive:
                 body = bytes(one.body) if isinstance(one.body, bytes) else b''
                 middle = seconds_of((one.t_start_ns + one.t_end_ns) // 2)
                 metadata = {**one.metadata, 'pose': f'{middle:.6f} {-middle:.6f} 0.5 odom', 'battery_pct': '77.5', **more}
+                late_ns = self.late_ns.get(one.sensor, 0)
+                metadata |= {
+                    'received_start_ns': str(one.t_start_ns + late_ns), 'received_end_ns': str(one.t_end_ns + late_ns),
+                }  # fmt: skip
                 add(store, self._folder, one.key, body, metadata, content_type=one.content_type)
                 told = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
                 rows.append(schema.row_of(one.bucket, one.key, len(body), one.content_type, told))
