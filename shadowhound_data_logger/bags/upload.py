@@ -30,6 +30,7 @@ from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.verify import compare
 
 SENDING: Final = 'sending'
 """The folder of bags on their way into the spool, in SHADOWHOUND_HOME."""
@@ -143,12 +144,8 @@ def deliver(
 
 
 def is_confirmed(store: ObjectStore, files: Sequence[tuple[str, int, str]]) -> bool:
-    """Whether the store says of every (key, size, SHA-256) that it holds it. Raises StoreError."""
-    for key, size, sha256 in files:
-        held = store.head(BUCKET, key)
-        if held is None or (held.size, held.sha256) != (size, sha256):
-            return False
-    return True
+    """Whether the store has every (key, size, SHA-256). Raises StoreError."""
+    return not any(compare(store.head(BUCKET, key), size, sha256) for key, size, sha256 in files)
 
 
 def _wait(spool: Spool, plan: UploadPlan, uploader: Uploader, end_s: float, progress: ProgressListener) -> Uploaded:

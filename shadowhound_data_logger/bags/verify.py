@@ -26,6 +26,7 @@ from shadowhound_data_logger.formats.mcap.index import DATA_END_BYTES, McapIndex
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.verify import CHECKSUM, SIZE, compare
 
 THREADS: Final = 4
 PIECE_BYTES: Final = 8 << 20
@@ -159,13 +160,14 @@ def _check_remote(
     store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, told: Telling
 ) -> FileCheck:
     held = store.head(BUCKET, file.key)
+    if held is not None and words.THINNED in held.metadata:  # thinned after the manifest was made; the gap journal has the rest
+        expected = _Expected(expected.name, None, held.sha256, None)
+    kind = compare(held, expected.size, expected.sha256)
     if held is None:
         return FileCheck(file.name, 'is not in the store', 'presence')
-    if words.THINNED in held.metadata:  # the robot ran out of room after the manifest was made; the gap journal has what went
-        expected = _Expected(expected.name, None, held.sha256, None)
-    if expected.size is not None and file.size != expected.size:
-        return FileCheck(file.name, f'has {file.size} bytes, {expected.size} were recorded', 'size')
-    if held.sha256 and expected.sha256 and held.sha256 != expected.sha256:
+    if kind == SIZE:
+        return FileCheck(file.name, f'has {held.size} bytes, {expected.size} were recorded', SIZE)
+    if kind == CHECKSUM:
         return FileCheck(file.name, f'has the SHA-256 {held.sha256}, {expected.sha256} was recorded', 'sha256')
     source = StoredFile(store, BUCKET, file.key, file.size, meter)
     if deep:

@@ -48,8 +48,9 @@ from shadowhound_data_logger.cli.question import asking, by_option, question, qu
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.shipping.audit import KINDS, Audit, audit
+from shadowhound_data_logger.shipping.audit import Audit, audit
 from shadowhound_data_logger.stores import open_reader
+from shadowhound_data_logger.stores.verify import KINDS
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.gaps import Coverage

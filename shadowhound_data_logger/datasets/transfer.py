@@ -20,6 +20,7 @@ from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, Lerobot
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import download
+from shadowhound_data_logger.stores.verify import compare
 
 SCHEME: Final = 's3://'
 BUCKET: Final = 'lerobot'
@@ -189,7 +190,7 @@ def _stray(folder: Path, remote: dict[str, ObjectInfo]) -> Iterator[Path]:
 
 def _is_there(store: ObjectStore, place: DatasetPlace, name: str, path: Path) -> bool:
     held = _ask(lambda: store.head(place.bucket, place.prefix + name))
-    return held is not None and held.size == path.stat().st_size and held.sha256 == fingerprint(path)[1]
+    return held is not None and not compare(held, *fingerprint(path))
 
 
 def _put(store: ObjectStore, place: DatasetPlace, name: str, path: Path) -> int:

@@ -5,7 +5,6 @@ And the other way round: which datasets, and which models, saw an object.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +31,7 @@ from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.training import INFO
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.verify import CHECKSUM, FOREIGN, MISSING, check_object
 
 THREADS: Final = 16
 FRAMES: Final = 5
@@ -107,17 +107,14 @@ def _sources(table: pa.Table, store: ObjectStore, found: VerifyResult, forgotten
 
     def wrong(row: dict[str, str]) -> str:
         name = f'{row["bucket"]}/{row["key"]}'
-        try:
-            held = store.head(row['bucket'], row['key'])
-            if held is None:
-                gone.append((row['bucket'], row['key']))
-                return ''
-            sha256 = held.sha256
-            if is_read and row['sha256']:
-                sha256 = _sha256_of(store, row['bucket'], row['key'])
-        except ObjectRefused as error:
-            return f'the source {name}: {error.what}'
-        return '' if not row['sha256'] or sha256 == row['sha256'] else f'the source {name} is not what it was'
+        finding = check_object(store, row['bucket'], row['key'], None, row['sha256'] or None, deep=is_read)
+        if finding is None:
+            return ''
+        if finding.kind == MISSING:
+            gone.append((row['bucket'], row['key']))
+            return ''
+        is_changed = finding.kind in {CHECKSUM, FOREIGN}
+        return f'the source {name} is not what it was' if is_changed else f'the source {name}: {finding.detail}'
 
     with ThreadPoolExecutor(THREADS, 'export-verify') as pool:
         found.wrong += [said for said in pool.map(wrong, rows) if said]
@@ -126,15 +123,6 @@ def _sources(table: pa.Table, store: ObjectStore, found: VerifyResult, forgotten
         said = f'was deleted on {dates[bucket, key]} (lake prune)' if (bucket, key) in dates else 'is gone'
         found.wrong.append(f'the source {bucket}/{key} {said}')
     found.sources = len(rows)
-
-
-def _sha256_of(store: ObjectStore, bucket: str, key: str) -> str:
-
-    digest = hashlib.sha256()
-    with store.content(bucket, key) as content:
-        for piece in content:
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: ObjectStore, most: int | None,

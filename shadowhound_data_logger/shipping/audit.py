@@ -1,42 +1,25 @@
-"""Checks whether the store still holds what it confirmed: asks for each delivered object by name; no right to list is needed.
+"""Checks whether the store still has the objects that it confirmed: requests each by name, so no right to list is needed.
 
-A finding is what the store itself says of an object. A store that does not answer is none: the audit then ends early, says
-so, and goes on from there the next time.
+A finding is about one object. If the store does not answer, the audit ends early, reports that, and continues from there the
+next time.
 """
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Final, Protocol
 
-from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, ObjectRefused, StoreError
+from shadowhound_data_logger.core.errors import AccessDenied, StoreError
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.stores.base import ObjectStore
+from shadowhound_data_logger.stores.verify import Finding, check_object
 
 THREADS: Final = 8
 KEYS: Final = 20
 """Keys listed of each kind of finding; all are counted."""
-MISSING: Final = 'missing'
-SIZE: Final = 'size'
-CHECKSUM: Final = 'checksum'
-FOREIGN: Final = 'foreign'
-DENIED: Final = 'denied'
-UNREADABLE: Final = 'unreadable'
-KINDS: Final = {
-    MISSING: 'not in the store',
-    SIZE: 'of another size',
-    CHECKSUM: 'of other content',
-    FOREIGN: 'without a checksum, so written by somebody else; --deep compares the content',
-    DENIED: 'denied by the store: it may be there or not',
-    UNREADABLE: 'refused by the store, such as an object that a client encrypted with its own key (SSE-C)',
-}
-"""What can be found, in words."""
 
 
 class Delivered(Protocol):
@@ -45,16 +28,6 @@ class Delivered(Protocol):
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]: ...
 
     def note(self, ids: Iterable[int]) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One object that is not what was delivered."""
-
-    kind: str
-    bucket: str
-    key: str
-    detail: str
 
 
 @dataclass(slots=True)
@@ -81,18 +54,20 @@ class Audit:
 
 def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
           tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
-    """Ask for everything that ``source`` has; ``deep`` reads each object back as well. ``tell`` is called after each one.
+    """Check every object of ``source``; ``deep`` also reads their content. ``tell`` is called after each one.
 
-    An object of which no SHA-256 is known is sound when its size is right.
-
-    What is found sound is noted; findings are not, so that the next run of an audit that ended early looks again.
+    Of an object without a known SHA-256 only the size is compared. Intact objects are noted; findings are not, so an audit that
+    ended early checks those again.
     """
     found = Audit(keys=keys)
-    judge = partial(_judge, store, deep=deep, pause=pause)
+
+    def check(expected: ObjectInfo) -> Finding | None:
+        return check_object(store, expected.bucket, expected.key, expected.size, expected.sha256, deep=deep, pause=pause)
+
     pool = ThreadPoolExecutor(threads, 'verify')
     try:
         for page in source.pages():
-            _audit_page(page, pool, judge, source, store, found, tell)
+            _audit_page(page, pool, check, source, store, found, tell)
     except StoreError as error:
         found.away = error
     finally:
@@ -100,11 +75,11 @@ def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads:
     return found
 
 
-def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor, judge: Callable[[ObjectInfo], Finding | None],
+def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor, check: Callable[[ObjectInfo], Finding | None],
                 source: Delivered, store: ObjectStore, found: Audit, tell: Callable[[], None]) -> None:  # fmt: skip
     sound: list[int] = []
     findings: list[Finding] = []
-    answers = pool.map(judge, [expected for _, expected in page])
+    answers = pool.map(check, [expected for _, expected in page])
     try:
         for (number, _), finding in zip(page, answers, strict=True):
             if finding is None:
@@ -129,36 +104,3 @@ def _confirm_store(store: ObjectStore) -> None:
         store.probe()
     except AccessDenied:
         return  # whoever may only read is answered all the same
-
-
-def _judge(store: ObjectStore, expected: ObjectInfo, *, deep: bool, pause: Callable[[float], object]) -> Finding | None:
-    """None when the store has it as it was delivered. Raises StoreError when that cannot be found out."""
-    make = partial(Finding, bucket=expected.bucket, key=expected.key)
-    try:
-        held = steadily(lambda: store.head(expected.bucket, expected.key), pause=pause)
-        if held is None:
-            return make(MISSING, detail=f'{expected.size} bytes were delivered')
-        if held.size != expected.size:
-            return make(SIZE, detail=f'{held.size} bytes, {expected.size} were delivered')
-        if deep and expected.sha256 is not None:
-            content = steadily(lambda: _sha256(store, expected), pause=pause)
-            if content != expected.sha256:
-                return make(CHECKSUM, detail=f'SHA-256 {content}, {expected.sha256} was delivered')
-    except (BucketMissing, ObjectRefused) as error:
-        is_missing = isinstance(error, BucketMissing) or error.data.get('reason') == 'missing'
-        return make(MISSING if is_missing else UNREADABLE, detail=str(error))
-    except AccessDenied as error:
-        return make(DENIED, detail=str(error))
-    if expected.sha256 in {None, held.sha256} or (deep and held.sha256 is None):
-        return None
-    if held.sha256 is None:
-        return make(FOREIGN, detail='no sha256 in its metadata')
-    return make(CHECKSUM, detail=f'sha256 {held.sha256} in its metadata, {expected.sha256} was delivered')
-
-
-def _sha256(store: ObjectStore, expected: ObjectInfo) -> str:
-    """Of the content, in bounded memory: a slice has hundreds of megabytes."""
-    digest = hashlib.sha256()
-    for piece in store.content(expected.bucket, expected.key):
-        digest.update(piece)
-    return digest.hexdigest()

@@ -22,8 +22,8 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, StoreUnavailable
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import verify
-from shadowhound_data_logger.shipping.audit import _judge
 from shadowhound_data_logger.stores import open_store
+from shadowhound_data_logger.stores.verify import check_object
 
 TIMES = [NOON_NS + second * SECOND for second in range(5)]
 KEYS = sorted(row(sensor, stamp_ns)['key'] for sensor in SENSORS for stamp_ns in TIMES)
@@ -142,13 +142,13 @@ def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch)
     def judge(*arguments: Any, **options: Any) -> Any:
         if len(answered) == 5:
             raise StoreUnavailable('the store is away')
-        answered.append(_judge(*arguments, **options))
+        answered.append(check_object(*arguments, **options))
         return answered[-1]
 
     monkeypatch.setattr(verify, 'PAGE', 2)
     monkeypatch.setattr('shadowhound_data_logger.cli.lake.THREADS', 1)
     with monkeypatch.context() as patched:
-        patched.setattr('shadowhound_data_logger.shipping.audit._judge', judge)
+        patched.setattr('shadowhound_data_logger.shipping.audit.check_object', judge)
         assert as_json(home)['unreachable']
     (notes,) = (home / 'verify').iterdir()
     assert notes.stat().st_size == 4 * verify.DIGEST_BYTES
