@@ -9,7 +9,7 @@ import pytest
 from bags.recording import journaled, missing
 from e2e.bag_reading import BUCKET, bags
 from e2e.processes import Processes, until
-from e2e.reading import STRING, TYPES, decode, texts
+from e2e.reading import STRING, TYPES, decode, stamp_ns, texts
 from e2e.session import DURATION_S, SLICE_S, Session
 from e2e.station import Station
 from shadowhound_tower.embedded import Tower
@@ -31,16 +31,18 @@ def test_the_bag_is_whole_to_every_reader(session: Session) -> None:
 
 @pytest.mark.parametrize('topic', TYPES)
 def test_every_message_is_there_as_it_was_published(session: Session, topic: str) -> None:
-    """Equal bytes in the same order, with the time of sending and, not before it, the time of arrival.
+    """Equal bytes in the same order, with the time of the header or of sending and, not before it, the time of arrival.
 
     The first ones beside another RMW come in any order: one of the two subscriptions with which a node begins gets what was sent
     before it knew the publisher, the other one meanwhile what is new.
     """
     found, heard = session.messages[topic], session.heard[topic]
+    decoded = [decode(TYPES[topic], message.cdr) for message in heard]
+    stamps = [stamp_ns(one) if hasattr(one, 'header') else message.source_ns for one, message in zip(decoded, heard, strict=True)]
     assert len(found) == session.said[topic]
     if session.node.is_beside:
         found = sorted(found, key=lambda message: message.publish_ns)
-    assert [message.publish_ns for message in found] == [message.source_ns for message in heard]
+    assert [message.publish_ns for message in found] == stamps
     assert [message.cdr for message in found] == [message.cdr for message in heard]
     assert all(0 <= message.log_ns - message.publish_ns < SOON_NS for message in found)
     assert len({message.sequence for message in found}) == len(found)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from lake.making import NOON_NS, add
 
 from shadowhound_data_logger.core.clock import SECOND
@@ -13,6 +15,8 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, Statement, complete, date_of, statement
+from shadowhound_data_logger.lake.gaps import _NEWEST
+from shadowhound_data_logger.lake.tables import answer, engine, narrow
 from shadowhound_data_logger.stores import open_store
 
 IMU = {'sink': 'objects', 'topic': '/imu', 'session': 1, 'grade': 'exact'}
@@ -39,3 +43,9 @@ def tell(store: StoreSettings, folder: Path, *rows: Statement, name: str = 'a') 
         for date in sorted({date_of(row) for row in rows}):
             found = [row for row in rows if date_of(row) == date]
             add(target, folder / 'tmp', GAPS.part_key('thor', date, name), parts.encode(found, GAPS), {'robot': 'thor'})
+
+
+def counting(rows: Sequence[Statement]) -> list[Statement]:
+    """The statements that count, as the lake selects them."""
+    with engine({'all_gaps': pa.Table.from_pylist(list(rows), schema=narrow(GAPS.columns, GAPS))}) as ready:
+        return list(answer(ready, _NEWEST.format('true')).to_pylist())

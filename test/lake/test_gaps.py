@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lake.gap_parts import IMU, lost, mark, tell
+from lake.gap_parts import IMU, counting, lost, mark, tell
 from lake.making import DAY_NS, MINUTE_NS, NOON_NS, folder_store, merge
 
 from shadowhound_data_logger import lake
@@ -19,12 +17,11 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, WITHDRAWN, Statement, statement
+from shadowhound_data_logger.formats.rows.gaps import GAP, WITHDRAWN, Statement, statement
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.gaps import _NEWEST, MOST_CAUSES, Stretch, coverage, known, of_rows
-from shadowhound_data_logger.lake.tables import answer, engine, narrow
+from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, known, of_rows
 from shadowhound_data_logger.stores import open_store
 
 
@@ -177,22 +174,16 @@ STATEMENTS = st.builds(
 )  # fmt: skip
 
 
-def newest(rows: Sequence[Statement]) -> list[Statement]:
-    """Those that count."""
-    with engine({'all_gaps': pa.Table.from_pylist(list(rows), schema=narrow(GAPS.columns, GAPS))}) as ready:
-        return list(answer(ready, _NEWEST.format('true')).to_pylist())
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.lists(STATEMENTS, max_size=14), st.randoms(use_true_random=False))
 def test_the_order_of_statements_does_not_matter(rows: list[Statement], random: Any) -> None:
     """Shuffled or repeated: what counts is the same."""
-    at_once = newest(rows)
+    at_once = counting(rows)
     shuffled = [*rows, *rows[:3]]
     random.shuffle(shuffled)
     of = 'thor', 'objects', '/imu', NOON_NS, NOON_NS + 100 * SECOND
-    assert newest(shuffled) == at_once
-    assert of_rows(*of, at_once) == of_rows(*of, newest(shuffled))
+    assert counting(shuffled) == at_once
+    assert of_rows(*of, at_once) == of_rows(*of, counting(shuffled))
 
 
 @settings(max_examples=60, deadline=None)

@@ -7,18 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow
 import pytest
+from lake.gap_parts import counting
 from spool.making import NOON_NS, FakeClock, abandon, make, new_spool
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.core.stamps import by_arrival
-from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.parts import read_rows
-from shadowhound_data_logger.lake.gaps import folded, of_rows
-from shadowhound_data_logger.lake.tables import arrow_schema
+from shadowhound_data_logger.lake.gaps import of_rows
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import gap_table
 from shadowhound_data_logger.spool.gaps import FORGOTTEN
@@ -139,8 +137,7 @@ def test_the_watermark_waits_for_what_is_not_delivered(spool: Spool, root: Path)
     assert retry(root).objects == 1
     again = told(catalog.parts())
     assert what(again) == [('withdrawn', 'AccessDenied', 0, 2.0), ('complete', None, None, 2.0)]
-    newest = folded(pyarrow.Table.from_pylist([*rows, *again], schema=arrow_schema(GAPS))).to_pylist()
-    known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, newest)
+    known = of_rows('thor', 'objects', CAMERA, NOON_NS + SECOND, NOON_NS + 4 * SECOND, counting([*rows, *again]))
     assert known.complete_ns == NOON_NS + 2 * SECOND
 
 
@@ -315,7 +312,7 @@ def test_the_time_of_a_boot_is_told_when_its_clock_is_known(spool: Spool, root: 
     (root / 'clock-thor.json').write_text(json.dumps(record), encoding='utf-8')
     (dated,) = told(catalog.parts())
     assert (dated['id'], dated['clock'], dated['from_ns']) == (row['id'], 'set_later', NOON_NS + 5 * SECOND)
-    (newest,) = folded(pyarrow.Table.from_pylist([dated, row], schema=arrow_schema(GAPS))).to_pylist()
+    (newest,) = counting([dated, row])
     assert newest['clock'] == 'set_later'
     assert catalog.parts() == []
 
