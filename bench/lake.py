@@ -124,7 +124,8 @@ class Counting:
 
     def get(self, key: str, most: int) -> bytes:
         date = key.split('/')[2]
-        self.dates[date] = self.dates.get(date, 0) + 1
+        if date.startswith('date='):  # not the summary of a mission
+            self.dates[date] = self.dates.get(date, 0) + 1
         return self._inner.get(key, most)
 
 

@@ -159,7 +159,8 @@ def _about_ingest(done: Ingested, root: str) -> str:
     if not done.files:
         return f'All row files are in the tables ({root}).'
     text = f'{counted(done.rows, "row")} of {counted(done.files, "file")} added to {root}'
-    return text + f'; {counted(done.rejected, "row")} rejected' * (done.rejected > 0) + '.'
+    text += f'; {counted(done.rejected, "row")} rejected' * (done.rejected > 0)
+    return text + f'; unknown columns of {counted(done.unknown, "row")} ignored' * (done.unknown > 0) + '.'
 
 
 @lake.command(

@@ -41,7 +41,6 @@ CREATE TABLE IF NOT EXISTS files (
     etag TEXT NOT NULL, boot TEXT NOT NULL
 ) WITHOUT ROWID
 """
-_KNOWN: Final = "SELECT key, bucket, size, mtime_ns, sha256, etag FROM files WHERE boot IN ('', ?)"
 
 
 @dataclass(frozen=True, slots=True)

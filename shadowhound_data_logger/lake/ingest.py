@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from datetime import datetime, timedelta, timezone
 from typing import Final, NamedTuple
 
@@ -42,6 +42,7 @@ from shadowhound_data_logger.lake.tables import (
     Conflict,
     Table,
     Tables,
+    among,
     answer,
     engine,
     literal,
@@ -73,11 +74,11 @@ class Ingested:
     repeated: int = 0
     """Rows that they already had."""
     rejected: int = 0
+    unknown: int = 0
+    """Rows with columns that this version does not know and ignored."""
 
     def __add__(self, other: Ingested) -> Ingested:
-        return Ingested(
-            self.files + other.files, self.rows + other.rows, self.repeated + other.repeated, self.rejected + other.rejected
-        )
+        return Ingested(*map(sum, zip(astuple(self), astuple(other), strict=True)))
 
 
 def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[RowFile] | None = None) -> Ingested:
@@ -93,14 +94,13 @@ def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[R
 
 def pending(opened: DeltaTable, files: Sequence[RowFile]) -> list[RowFile]:
     """Of these row files those that a version of ``ingested`` does not name. Raises LakeError."""
-    known = {(each.part, each.etag) for each in known_files(opened, {file.date for file in files})} if files else set()
-    return [file for file in files if (file.entry.key, file.entry.etag) not in known]
+    dates = {file.date for file in files}
+    return unknown_of(files, known_files(opened, Scope(has_date=dates.__contains__)) if files else ())
 
 
 class KnownFile(NamedTuple):
     """A row file that was ingested."""
 
-    date: str
     part: str
     """Its key."""
     etag: str
@@ -108,23 +108,26 @@ class KnownFile(NamedTuple):
     """Rows that were rejected; 1 for a file that is not one."""
     why: str | None
 
-    def is_in(self, scope: Scope) -> bool:
-        """Whether a query with this scope needs it."""
-        folders = self.part.split('/', 2)[:2]
-        return (
-            any(each.folder in folders for each in scope.tables)
-            and (scope.robot is None or scope.robot in folders)
-            and (scope.has_date is None or scope.has_date(self.date))
-        )
+
+def unknown_of(files: Sequence[RowFile], known: Iterable[KnownFile]) -> list[RowFile]:
+    """The row files that are not among the known ones."""
+    names = {(each.part, each.etag) for each in known}
+    return [file for file in files if (file.entry.key, file.entry.etag) not in names]
 
 
-def known_files(opened: DeltaTable, dates: Collection[str] = (), where: str = 'true') -> Iterator[KnownFile]:
-    """The row files that a version of ``ingested`` names. Raises LakeError."""
-    among_dates = f'date BETWEEN {literal(min(dates))} AND {literal(max(dates))}' if dates else 'true'
+def known_files(opened: DeltaTable, scope: Scope, where: str = 'true') -> list[KnownFile]:
+    """The row files of a scope that a version of ``ingested`` names. Raises LakeError."""
+    conditions = [where]
+    if scope.has_date is not None:
+        conditions.append(among(DATE, filter(scope.has_date, {each[DATE] for each in opened.partitions()})))
+    if scope.robot is not None:
+        conditions.append(f'{ROBOT} = {literal(scope.robot)}')
     columns = ', '.join(KnownFile._fields)
     with engine({'ingested': opened}) as ready:
-        found = answer(ready, f'SELECT {columns} FROM ingested WHERE {among_dates} AND {where}')  # noqa: S608
-    yield from map(KnownFile._make, zip(*(column.to_pylist() for column in found.columns), strict=True))
+        found = answer(ready, f'SELECT {columns} FROM ingested WHERE {" AND ".join(conditions)}')  # noqa: S608 - quoted literals
+    folders = {each.folder for each in scope.tables}
+    files = map(KnownFile._make, zip(*(column.to_pylist() for column in found.columns), strict=True))
+    return [each for each in files if not folders.isdisjoint(each.part.split('/', 2)[:2])]
 
 
 def fresh(source: Bucket, files: Sequence[RowFile], opened: DeltaTable, of: TableSchema, findings: Findings) -> pa.Table:
@@ -136,10 +139,10 @@ def fresh(source: Bucket, files: Sequence[RowFile], opened: DeltaTable, of: Tabl
 def _tables(of: TableSchema, found: Iterable[RowsOfFile], records: list[Row]) -> Iterator[pa.Table]:
     """The rows of files, some thousand at a time: in Arrow they take a tenth of the memory. Adds a record of each file."""
     rows: list[Row] = []
-    for file, of_file, rejected, why in found:
+    for file, of_file, rejected, why, unknown in found:
         records.append({
             DATE: file.date, ROBOT: file.robot, PART: file.entry.key, 'etag': file.entry.etag, 'rows': len(of_file),
-            'rejected': rejected, 'why': why,
+            'rejected': rejected, 'unknown': unknown, 'why': why,
         })  # fmt: skip
         rows += of_file
         if len(rows) >= ROWS_AT_A_TIME:
@@ -173,7 +176,8 @@ def _commit(source: Bucket, tables: Tables, files: Sequence[RowFile], findings: 
         done = replace(done, rows=done.rows + added, repeated=done.repeated + len(rows) - added)
     now = datetime.now(timezone.utc)
     _add(tables, INGESTED, pa.Table.from_pylist([{**each, 'ingested': now} for each in records], schema=INGESTED.schema))
-    return replace(done, rejected=sum(each['rejected'] for each in records))
+    counts = {name: sum(each[name] for each in records) for name in ('rejected', 'unknown')}
+    return replace(done, **counts)
 
 
 def _add_missions(source: Bucket, tables: Tables, rows: pa.Table) -> None:
@@ -241,7 +245,7 @@ def states(source: Bucket, findings: Findings, robot: str | None = None) -> list
                 state.objects, state.days = count, len(dates)
                 state.first, state.last = min(dates, default=None), max(dates, default=None)
         there = {file.entry.key: file.robot for file in listed}
-        for each in known_files(tables.open(INGESTED), where='rejected > 0'):
+        for each in known_files(tables.open(INGESTED), Scope(robot=robot), 'rejected > 0'):
             if each.part in there:
                 of(there[each.part]).rejected += each.rejected
     for file in waiting:
@@ -326,7 +330,7 @@ def _expire(source: Bucket, tables: Tables, findings: Findings, before: datetime
     """
     listed = row_files(source, findings, Scope(tuple(of for of in SCHEMAS.values() if of is not FORGOTTEN)))
     stamp = literal(before.strftime('%Y-%m-%dT%H:%M:%S.%fZ'))
-    known = known_files(tables.open(INGESTED), where=f'why IS NULL AND ingested < {stamp}')
+    known = known_files(tables.open(INGESTED), Scope(), f'rejected = 0 AND "unknown" = 0 AND ingested < {stamp}')
     parts = {each.part for each in known}
     old = [file for file in listed if file.entry.key in parts]
 

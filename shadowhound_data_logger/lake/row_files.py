@@ -55,7 +55,9 @@ class RowsOfFile(NamedTuple):
     rejected: int = 0
     """Rows that were rejected; 1 for a file that is not one."""
     why: str | None = None
-    """Also where nothing was rejected: of a file with columns that this version does not know."""
+    """Why rows were rejected."""
+    unknown: int = 0
+    """Rows with columns that this version does not know and ignored."""
 
 
 def robots(source: Bucket) -> list[str]:
@@ -148,6 +150,4 @@ def _contents(file: RowFile, body: bytes) -> RowsOfFile:
     if others := sum(map(len, found.rows.values())) - len(rows):
         rejected += others
         reasons.append(f'{rows_are(others)} rejected: of another table')
-    if found.extended:
-        reasons.append(f'columns that this version does not know are ignored in {found.extended:,} of its rows')
-    return RowsOfFile(file, rows, rejected, '; '.join(reasons) or None)
+    return RowsOfFile(file, rows, rejected, '; '.join(reasons) or None, found.unknown)

@@ -1,14 +1,14 @@
-"""The catalogue, the gap journal, missions, their events and the labels as documents of Elasticsearch or OpenSearch.
+"""Objects, gaps, missions, their events and labels as documents of Elasticsearch or OpenSearch.
 
-Requests are plain HTTP, because the clients of either refuse the servers of the other: ``PUT _index_template``, ``PUT INDEX`` and
-``POST _bulk``, which both have alike.
+Requests are plain HTTP, because the clients of each reject the servers of the other: ``PUT _index_template``, ``PUT INDEX`` and
+``POST _bulk``, which are the same in both.
 https://www.elastic.co/docs/api/doc/elasticsearch/operation/operation-bulk
 https://docs.opensearch.org/latest/api-reference/document-apis/bulk/
 
-What a document says gives its ``_id``, so the same is there once however often it is sent. A row of the catalogue never changes
-and is only created; statements of the gap journal and labels are replaced by newer ones (external versions) in any order.
-What the server took is noted in a file, part by part, after the server has said so: a run that is killed goes on there, and what
-it sends twice is there already.
+The ``_id`` of a document is a hash of its content, so it exists once however often it is sent. Rows of objects never change and
+are only created; statements of the gap journal and labels are replaced by newer ones (external versions) in any order. A file
+records up to which version of each table the server has confirmed the rows: a run that is killed continues there, and what is
+sent twice exists already.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ BULK_BYTES: Final = 4 << 20
 """Of one request; both servers take 100 MB by default (``http.max_content_length``)."""
 BULK_DOCUMENTS: Final = 4_000
 MISSIONS_AT_A_TIME: Final = 180
-"""Noted together: what a kill sends again, at most."""
+"""Recorded together: at most so many are sent again after a kill."""
 TRIES: Final = 8
 """Of a request, without ``--follow``: about a minute."""
 CAP_S: Final = 30.0
@@ -85,40 +85,40 @@ _OF_TYPE: Final = (
     ({'type': 'boolean'}, 'success'),
 )  # fmt: skip
 _FIELDS: Final = {name: mapping for mapping, names in _OF_TYPE for name in names.split()}
-"""Field -> its mapping. ``x y`` are metres in the odometry's frame, and no place on the Earth."""
+"""Field -> its mapping. ``x y`` are meters in the odometry frame, not a place on Earth."""
 _SUMMARY: Final = ('mission_type', 'result', 'success', 'distance_m', 'duration_s', 'battery_consumed_pct', 'policy')
 ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS = 'objects', 'gaps', 'missions', 'events', 'labels'
 INDEXES: Final = (ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS)
-"""Each is an index of its own, ``NAME-objects`` and so on."""
+"""Each is an index, ``NAME-objects`` and so on."""
 FORGOTTEN_ROWS: Final = 'forgotten'
-"""What is said later of documents of ``objects``."""
+"""Later additions to documents of ``objects``."""
 
 
 class SinkDocument(NamedTuple):
-    """What is sent of one thing."""
+    """A document to send."""
 
     kind: str
     """One of ``INDEXES``."""
     id: str
     fields: Mapping[str, Any]
     version: int | None = None
-    """None: it is only created. Else it replaces what has a lower one."""
+    """None: it is only created. Otherwise it replaces documents with a lower one."""
     is_update: bool = False
-    """Whether these fields are added to a document that is there."""
+    """Whether these fields are added to an existing document."""
 
 
 @dataclass(slots=True)
 class SinkTally:
-    """What became of the documents of a run."""
+    """The outcome of a run, in documents."""
 
     added: int = 0
-    """Created, or replaced by what is newer."""
+    """Created, or replaced by newer ones."""
     present: int = 0
-    """There already, as they are or newer."""
+    """They existed already, the same or newer."""
     refused: Counter[str] = field(default_factory=Counter)
-    """By the server's reason; which they are is in the file of the position."""
+    """By the server's reason; the position's file lists them."""
     restarted: list[str] = field(default_factory=list)
-    """Indexes that are not those of the run before: all was sent again."""
+    """Indexes that were replaced since the last run: everything was sent again."""
 
     def __iadd__(self, other: SinkTally) -> Self:
         self.added += other.added
@@ -132,10 +132,10 @@ class SinkTally:
 
 
 class SearchServer:
-    """Asks one Elasticsearch (7.8 or later) or OpenSearch. Its repr shows no secret.
+    """A client of one Elasticsearch (7.8 or later) or OpenSearch. Its repr shows no secret.
 
-    ``authorization`` is the value of that header, see ``authorization``. Raises SettingError for a URL that is none of ours,
-    SinkUnavailable without an answer or where the server asks to wait, LakeError for an answer that says no.
+    ``authorization`` is the value of that header, see ``authorization``. Raises SettingError for an invalid URL, SinkUnavailable
+    without an answer or if the server is overloaded, LakeError if the server rejects the request.
     """
 
     def __init__(self, url: str, authorization: str = '', ca: Path | None = None) -> None:
@@ -161,7 +161,7 @@ class SearchServer:
 
     def ask(self, method: str, path: str, body: bytes | None = None, kind: str = 'application/json',
             allowed: Sequence[int] = ()) -> tuple[int, Any]:  # fmt: skip
-        """The status and the JSON of an answer; other statuses than 2xx and those allowed are errors."""
+        """The status and the JSON of an answer; statuses other than 2xx and the allowed ones are errors."""
         try:
             answer = self._pool.request(method, f'{self.url}/{path}', body=body, redirect=False, preload_content=False,
                                         enforce_content_length=True, headers={**self._headers, 'Content-Type': kind})  # fmt: skip
@@ -171,7 +171,7 @@ class SearchServer:
                     raise LakeError(
                         f'{self.url} answers with more than {MOST_ANSWER_BYTES:,} bytes', remedy='is it the right server?'
                     )
-                answer.read()  # the rest: a body that broke off is an error here
+                answer.read()  # the rest: raises for an incomplete body
             finally:
                 answer.close()
         except urllib3.exceptions.HTTPError as error:
@@ -192,7 +192,7 @@ class SearchServer:
         return answer.status, told
 
     def prepare(self, name: str) -> dict[str, str]:
-        """Put the template, make the indexes that are not there yet; returns the UUID of each."""
+        """Put the template and create missing indexes; returns the UUID of each."""
         _, told = self.ask('GET', '')
         version = told.get('version') if isinstance(told, dict) else None
         if not isinstance(version, dict) or 'number' not in version:
@@ -211,7 +211,7 @@ class SearchServer:
             ) from error
 
     def bulk(self, documents: Sequence[bytes]) -> list[tuple[int, str]]:
-        """Send documents as ``encoded`` makes them; the status of each, and why it is so."""
+        """Send documents made by ``encoded``; the status and the error of each."""
         _, told = self.ask('POST', '_bulk', b''.join(documents), 'application/x-ndjson')
         try:
             items = [next(iter(item.values())) for item in told['items']]
@@ -237,7 +237,7 @@ def authorization(environ: Mapping[str, str]) -> str:
 
 
 def template(name: str, *, is_opensearch: bool) -> dict[str, Any]:
-    """The index template: types of the fields; a field that is not in it is kept, and cannot be searched."""
+    """The index template: types of the fields; other fields are stored but cannot be searched."""
     position = {'position': {'type': 'xy_point' if is_opensearch else 'point'}}
     return {
         'index_patterns': [f'{name}-{index}' for index in INDEXES],
@@ -253,7 +253,7 @@ def _cause(error: BaseException) -> str:
 
 
 def _reason(told: object) -> str:
-    """Why, in one line; '' where all is well."""
+    """The error, in one line; '' without one."""
     error = told.get('error') if isinstance(told, dict) else None
     if isinstance(error, dict):
         error = ': '.join(str(error[word]) for word in ('type', 'reason') if word in error)
@@ -264,7 +264,7 @@ def _reason(told: object) -> str:
 
 
 def of_object(row: Mapping[str, Any]) -> SinkDocument:
-    """Of a row of the catalogue; its ``_id`` is the SHA-256 of bucket, key and ``t_start_ns``, each on a line."""
+    """Of an object; its ``_id`` is the SHA-256 of bucket, key and ``t_start_ns``, each on a line."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 't_start', 't_end'}}
     if row['t_start'] is not None:
         found |= {'time': _iso(row['t_start_ns']), 't_start': _iso(row['t_start_ns']), 't_end': _iso(row['t_end_ns'])}
@@ -274,14 +274,14 @@ def of_object(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def of_forgotten(row: Mapping[str, Any]) -> SinkDocument:
-    """Of an object that ``lake prune`` deleted: its document stays, and says when and by which rule."""
+    """Of an object that ``lake prune`` deleted: its document is kept, with the time and the rule."""
     document = of_object({**row, 'x': None, 'y': None})
     fields = {name: value for name, value in document.fields.items() if name not in {'x', 'y', 'forgotten_ns'}}
     return document._replace(fields={**fields, 'forgotten': _iso(row['forgotten_ns'])}, is_update=True)
 
 
 def of_statement(row: Mapping[str, Any]) -> SinkDocument:
-    """Of a row of the gap journal: the newest statement about each thing stays, ``what`` says what it is."""
+    """Of a statement of the gap journal: the newest one about each gap is kept."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 't_from', 't_to'}}
     for stamp, name in (('from_ns', 't_from'), ('to_ns', 't_to')):
         found[name] = None if row[name] is None else _iso(row[stamp])
@@ -292,7 +292,7 @@ def of_statement(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def of_label(row: Mapping[str, Any]) -> SinkDocument:
-    """Of a row of a layer of labels: the newest stays, ``what`` says whether it adds or removes."""
+    """Of a row about a label: the newest one is kept; ``what`` is whether it adds or removes the label."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 'made'}}
     found |= {
         'time': _iso(row['since_ns']),
@@ -306,9 +306,9 @@ def of_label(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def _version(number: int, *, is_later: bool) -> int:
-    """Of a document: that of the higher number stays, and of two with the same one the later. Never more than 63 bits.
+    """Of a document: the higher number is kept, and of two equal ones the later. Never more than 63 bits.
 
-    A server refuses a whole request in which one version is larger, and a robot writes its numbers as it likes.
+    A server rejects a whole request if one version is larger, and a hostile robot can write any number.
     """
     return 2 * min(max(number, 0), (1 << 62) - 1) + is_later
 
@@ -360,7 +360,7 @@ def _digest(*parts: object) -> str:
 
 
 def _iso(stamp_ns: int | None) -> str | None:
-    """With all nanoseconds: both servers read up to the year 2262, as int64 does."""
+    """With nanoseconds: both servers read times until the year 2262, like int64."""
     if stamp_ns is None:
         return None
     seconds, rest = divmod(stamp_ns, SECOND)
@@ -379,7 +379,7 @@ PRAGMA user_version = 1;
 
 
 class Position:
-    """What one server has, in a SQLite file: of each table up to which version, missions by run, and what it refused."""
+    """What one server has, in a SQLite file: up to which version of each table, which missions, and what it rejected."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -399,14 +399,14 @@ class Position:
         self._db.close()
 
     def is_same(self, name: str, uuid: str) -> bool:
-        """Whether an index is that of before, or nothing was known of one; notes which it is."""
+        """Whether an index is the same as in the last run, or the first one; records it."""
         known = self._db.execute('SELECT uuid FROM indexes WHERE name = ?', (name,)).fetchone()
         with self._db:
             self._db.execute('INSERT OR REPLACE INTO indexes VALUES (?,?)', (name, uuid))
         return known in {None, (uuid,)}
 
     def forget(self, name: str) -> None:
-        """An index has nothing, whatever it took before."""
+        """Record that an index is empty."""
         with self._db:
             self._db.execute('DELETE FROM versions WHERE name = ?', (name,))
             self._db.execute('DELETE FROM refused WHERE name = ?', (name,))
@@ -422,7 +422,7 @@ class Position:
         return {run for (run,) in self._db.execute('SELECT run FROM missions WHERE robot = ?', (robot,))}
 
     def take(self, name: str, robot: str | None, version: TableVersion, refused: Iterable[tuple[str, int, str]]) -> None:
-        """Note what the server has, and (id, status, reason) of what it refused; durable on return."""
+        """Record what the server has, and (id, status, reason) of what it rejected; durable on return."""
         with self._db:
             self._db.execute('INSERT OR REPLACE INTO versions VALUES (?,?,?,?)', (name, robot or '', *version))
             self._db.executemany('INSERT OR REPLACE INTO refused VALUES (?,?,?,?)', ((name, *each) for each in refused))
@@ -433,12 +433,12 @@ class Position:
             self._db.executemany('INSERT OR REPLACE INTO refused VALUES (?,?,?,?)', ((MISSIONS, *each) for each in refused))
 
     def refused(self) -> list[tuple[str, str, int, str]]:
-        """Index, id, status and reason of each document that the server refused."""
+        """Index, id, status and reason of each document that the server rejected."""
         return list(self._db.execute('SELECT name, id, status, reason FROM refused ORDER BY name, id'))
 
 
 def position_path(home: Path, url: str, name: str) -> Path:
-    """Of one name on one server, in the home of who sends."""
+    """The file of one name on one server, in the sender's home."""
     return home / 'sink' / f'{hashlib.sha256(f"{url} {name}".encode()).hexdigest()[:16]}.db'
 
 
@@ -469,9 +469,9 @@ _TABLES: Final[Sequence[tuple[str, TableSchema, Callable[[Mapping[str, Any]], Si
 
 @dataclass(slots=True)
 class Sink:
-    """Sends what a server does not have yet, under one name, some megabytes at a time, until each document is taken or refused.
+    """Sends what a server does not have yet, some megabytes at a time, until each document is accepted or rejected.
 
-    A request is tried ``tries`` times, where the server gives no answer or asks to wait.
+    A request is tried ``tries`` times if the server does not answer or is overloaded.
     """
 
     source: Bucket
@@ -486,7 +486,7 @@ class Sink:
     _refused: list[tuple[str, int, str]] = field(default_factory=list)
 
     def send(self, robot: str | None = None) -> SinkTally:
-        """Of one robot, or of all. Raises StoreError, SinkUnavailable, LakeError; what was taken until then is noted."""
+        """Send the rows of one robot, or of all. Raises StoreError, SinkUnavailable, LakeError; what was sent is recorded."""
         self._sent = SinkTally()
         for kind, uuid in self._patiently(lambda: self.server.prepare(self.name)).items():
             if not self.position.is_same(kind, uuid):
@@ -536,7 +536,7 @@ class Sink:
         self._send_batch(batch)
 
     def _send_batch(self, batch: Sequence[tuple[str, bytes]]) -> None:
-        """Raises SinkUnavailable where the server took nothing in so many tries."""
+        """Raises SinkUnavailable if the server accepted nothing in ``tries`` requests."""
         failures = 0
         while batch:
             some = batch
@@ -555,7 +555,7 @@ class Sink:
             self.tell(f'{self.name}: {self._sent.added:,} sent, {self._sent.present:,} were there')
 
     def _bulk(self, batch: Sequence[tuple[str, bytes]]) -> list[tuple[int, str]] | None:
-        """What became of each; None where it is too much at a time."""
+        """The outcome of each; None if the request is too large."""
         try:
             return self.server.bulk([body for _, body in batch])
         except LakeError as error:
@@ -564,7 +564,7 @@ class Sink:
             return None if len(batch) > 1 else [(TOO_LARGE, 'the server takes no document of this size')]
 
     def _settled(self, batch: Sequence[tuple[str, bytes]], found: Sequence[tuple[int, str]]) -> list[tuple[str, bytes]]:
-        """Count; returns those that the server asks to send later."""
+        """Count them; returns those that must be sent again."""
         left = []
         for each, (status, reason) in zip(batch, found, strict=True):
             if status in _RETRIED:
@@ -579,13 +579,13 @@ class Sink:
         return left
 
     def _patiently(self, ask: Callable[[], _Answer]) -> _Answer:
-        """The answer, after so many tries. Raises what the last one raised."""
+        """The answer, after up to ``tries`` requests. Raises the error of the last one."""
         return steadily(ask, tries=self.tries, cap_s=CAP_S, pause=self.pause, away=SinkUnavailable,
                         failed=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
 
 
 def _rows(table: pa.RecordBatch) -> Iterator[dict[str, Any]]:
-    """Times as microseconds: which there are is all that is asked."""
+    """The rows, with times as microseconds."""
     columns = [column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column for column in table.columns]
     for values in zip(*(column.to_pylist() for column in columns), strict=True):
         yield dict(zip(table.column_names, values, strict=True))

@@ -91,7 +91,8 @@ INGESTED: Final = Table(
     'ingested',
     pa.schema([
         (DATE, pa.string()), (ROBOT, pa.string()), (PART, pa.string()), ('etag', pa.string()),
-        ('ingested', _KINDS[TIME]), ('rows', pa.int64()), ('rejected', pa.int64()), ('why', pa.string()),
+        ('ingested', _KINDS[TIME]), ('rows', pa.int64()), ('rejected', pa.int64()), ('unknown', pa.int64()),
+        ('why', pa.string()),
     ]),
     (PART, 'etag'), 'ingested', 'ingested', (DATE,),
 )  # fmt: skip

@@ -1,11 +1,11 @@
-"""When the numbers in the objects were so: from a condition such as ``imu.accelerometer.2 > 15`` to ranges of time.
+"""Queries by value: from a condition such as ``imu.accelerometer.2 > 15`` to the times at which it was true.
 
-A name is that of a sensor and of a field (formats/statistics.py), or what several fields begin with: then any of them will do.
-A plain name is about each message; ``max(...)`` and the other statistics are about each object, a batch of messages, as a whole.
-``and``, ``or`` and parentheses join comparisons. What is missing, NaN or infinite compares as false.
+A name consists of a sensor and a field (formats/statistics.py), or the start of several fields: then any of them can match.
+A plain name is about each message; ``max(...)`` and the other statistics are about each object, that is, a batch of messages.
+``and``, ``or`` and parentheses join comparisons. Values that are missing, NaN or infinite compare as false.
 
-The statistics in the catalogue say of most objects that all or none of their messages meet the condition. Only the others are
-opened, and what they say counts: the answer is that of a loop over all messages.
+For most objects the statistics decide that all or none of their messages meet the condition. Only the others are opened: the
+answer is the same as that of a loop over all messages.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ from shadowhound_data_logger.lake.tables import among, answer, literal, narrow, 
 from shadowhound_data_logger.lake.views import views
 
 MIN_JOIN_S: Final = 1.0
-"""What is no further apart is one range, unless the sensor is slower."""
+"""Messages that are not further apart are one range, unless the sensor is slower."""
 MAX_JOIN_S: Final = 60.0
-"""Of messages that are stored on a change, nobody knows a period."""
+"""Messages that are stored on a change have no period."""
 JOIN_PERIODS: Final = 2
-"""A sampler keeps the first message of each period: two in a row are up to two periods apart."""
+"""A sampler keeps the first message of each period: consecutive ones are up to two periods apart."""
 OPENED_AT_A_TIME: Final = 64
 MAX_COMPARISONS: Final = 32
 _TINY: Final = 2.0**-140
@@ -67,11 +67,11 @@ _TINY: Final = 2.0**-140
 _JSON, _JPEG, _PCD = 'json', 'jpg', 'pcd'
 _KEY: Final = ('bucket', 'key', 't_start_ns')
 _SEEN: Final = ('sensor', 'topic', 't_start_ns', 't_end_ns')
-"""Columns of all rows of the catalogue, by which is chosen which objects are judged."""
+"""The columns that decide which objects are examined."""
 _OBJECT: Final = (*_SEEN, 'count', 'bucket', 'key')
 _STATISTIC: Final = ('t_start_ns', 'field', *NUMBERS)
 _BY_QUERY: Final = ('near', 'mission', 'mission_type', 'success', 'policy', 'where')
-"""Flags that `query` understands."""
+"""Flags of `query`."""
 MAX_NAMED_TIMES: Final = 5000
 """In a query in SQL; of more, all rows between the first and the last are read."""
 Mask = NDArray[np.bool_]
@@ -91,35 +91,35 @@ class Range:
 
 @dataclass(frozen=True, slots=True)
 class Freshness:
-    """Up to when a stream is in the answer. None: not known."""
+    """Up to when a topic is in the answer. None: unknown."""
 
     robot: str
     topic: str
     newest_ns: int | None
-    """End of the newest object that the catalogue has."""
+    """End of the newest object with a row."""
     complete_ns: int | None
-    """The watermark: what was lost before is in the gap journal."""
+    """The watermark: earlier losses are in the gap journal."""
 
     @property
     def fresh_ns(self) -> int | None:
-        """What was stored or lost until then is known here; an object that is still on the robot comes later."""
+        """What was stored or lost until then is known here; objects on the robot are delivered later."""
         known = [each for each in (self.newest_ns, self.complete_ns) if each is not None]
         return min(known) if len(known) == 2 else None
 
 
 @dataclass(frozen=True, slots=True)
 class ValueAnswer:
-    """When a condition held, and what was looked at to find out."""
+    """When a condition was true, and which objects were examined."""
 
     ranges: tuple[Range, ...]
     objects: int
-    """Of the sensor, in the time that was asked for."""
+    """Of the sensor, in the requested time."""
     opened: int
     unknown: int
-    """Without statistics of these fields, and not opened: the condition may hold in them as well."""
+    """Without statistics of these fields, and not opened: the condition can be true in them as well."""
     fresh: tuple[Freshness, ...]
     fields: tuple[str, ...] = ()
-    """Where a field is in no object: those that are there."""
+    """If no object has a field: those that exist."""
 
 
 def parse(text: str) -> Expression:
@@ -140,10 +140,10 @@ def parse(text: str) -> Expression:
 
 def ranges(condition: str, source: Bucket | None = None, *, scan: bool = False, join_s: float | None = None, pad_s: float = 0.0,
            findings: Findings | None = None, **flags: Any) -> ValueAnswer:  # fmt: skip
-    """When a condition held; ``flags`` are those of ``lake.objects`` and choose objects of its sensor.
+    """When a condition was true; ``flags`` are those of ``lake.objects`` and select objects of its sensor.
 
     ``scan`` opens objects without statistics as well. Ranges at most ``join_s`` apart are one (None: 1 s, or two periods of a
-    slower sensor), and each gets ``pad_s`` before and after it. Raises SettingError, LakeError for a wrong question, StoreError.
+    slower sensor), and each gets ``pad_s`` before and after it. Raises SettingError, LakeError for an invalid query, StoreError.
     """
     expression = parse(condition)
     sensor = comparisons(expression)[0].source
@@ -175,7 +175,7 @@ def sensor_of(condition: str) -> str:
 
 
 def field_of(condition: str, there: Sequence[str]) -> str:
-    """The first field of a condition that is not among those there are. Raises SettingError."""
+    """The first field of a condition that does not exist. Raises SettingError."""
     asked = [leaf.path for leaf in comparisons(parse(condition))]
     return next((field for field in asked if not any(covers(field, name) for name in there)), asked[0])
 
@@ -226,10 +226,10 @@ class _Question:
         )  # fmt: skip
 
     def _candidates(self) -> tuple[pa.Table, _Told, _Sieve]:
-        """The objects that have to be judged, by their times, and what their statistics say; no other meets the condition.
+        """The objects that must be examined, by their times, and their statistics; no other object meets the condition.
 
-        The first comparisons say so of objects that have a time of their own. Keys make most of the bytes of a part: they are
-        read only of what is left.
+        The first comparisons decide this for objects with a unique time. Keys are most of the bytes of a table: they are read
+        only for the objects that are left.
         """
         wholes = self._wholes()
         stamps = _stamps(wholes)
@@ -245,7 +245,7 @@ class _Question:
         if len(repeated := seen.repeated()):
             rows, seen = self._rows(chosen, np.setdiff1d(known, repeated, assume_unique=True))
         stamps = _stamps(rows)
-        if not _is_among(stamps, known).all() or len(repeated):  # by their times alone they cannot be told apart
+        if not _is_among(stamps, known).all() or len(repeated):  # times alone do not identify them
             statistics = self._statistics(comparisons(self._expression), stamps, _KEY)
             return rows, _Told(rows, statistics, _KEY, self._findings), seen
         others = [leaf for leaf in comparisons(self._expression) if leaf not in leads]
@@ -255,7 +255,7 @@ class _Question:
         return rows, _Told(rows, pa.concat_tables(tables).combine_chunks(), _KEY[-1:], self._findings), seen
 
     def _rows(self, chosen: NDArray[np.int64], known: NDArray[np.int64]) -> tuple[pa.Table, _Sieve]:
-        """The rows of the catalogue at the chosen times, and those that are not known."""
+        """The rows of objects at the chosen times, and of those without statistics."""
         sieve = _Sieve(self._asked, chosen, known)
         if self._asked.chosen or any(self._flags.get(name) is not None for name in _BY_QUERY):
             from shadowhound_data_logger.lake import query  # noqa: PLC0415 - which asks for labels, too
@@ -279,7 +279,7 @@ class _Question:
         return pa.table(given, schema=narrow(_STATISTIC, STATISTICS))
 
     def _lead(self, lead: Comparison, *, with_exact: bool) -> tuple[pa.Table, NDArray[np.int64]]:
-        """The statistics by which a comparison may hold, and, if asked for, the times of all objects with this very field."""
+        """The statistics with which a comparison can be true; if requested, also the times of all objects with this field."""
         table = self._fields([lead.path], _STATISTIC, 'true' if with_exact else _may_hold(lead))
         values = {name: _numbers(table, name) for name in NUMBERS}
         kept = _by_statistics(lead, values)[0] | _contradictory(values)
@@ -287,7 +287,7 @@ class _Question:
         return _filtered(table, kept), exact
 
     def _statistics(self, of: Sequence[Comparison], stamps: NDArray[np.int64], key: Sequence[str] = ()) -> pa.Table:
-        """The rows at these times of the fields that are asked for, and with a ``key`` those of the objects as a whole, too."""
+        """The rows at these times of the requested fields, and with a ``key`` also those of the objects as a whole."""
         columns = tuple(dict.fromkeys((*key, *_STATISTIC)))
         names = [*([ALL] if key else []), *sorted({each.path for each in of})]
         if not len(stamps):
@@ -296,7 +296,7 @@ class _Question:
         return _filtered(table, _is_among(_stamps(table), stamps)).combine_chunks()
 
     def _fields(self, names: Sequence[str], columns: Sequence[str], condition: str = 'true') -> pa.Table:
-        """Statistics of the sensor and the time that is asked for, of fields among the names or below one of them."""
+        """Statistics of the sensor and the requested time, of fields with one of the names or below one of them."""
         below = [f'starts_with(field, {literal(f"{name}.")})' for name in names if name != ALL]
         fields = ' OR '.join([among('field', names), *below])
         return self._select(columns, 'statistics', f'{self._where()} AND ({fields}) AND {condition}')
@@ -316,7 +316,7 @@ class _Question:
         return answer(self._ready, f'SELECT {", ".join(map(quoted, columns))} FROM all_{table} WHERE {where}')  # noqa: S608
 
     def _fields_instead(self, seen: _Sieve) -> Iterator[str]:
-        """The fields of the newest objects, where one that is asked for is not among them."""
+        """The fields of the newest objects, if a requested one is not among them."""
         found: set[str] = set()
         where = f'{self._where()} AND t_start_ns >= {max(seen.newest_ns - LONGEST_BATCH_NS, 0)}'
         fields = answer(self._ready, f'SELECT DISTINCT field FROM all_statistics WHERE {where}')  # noqa: S608
@@ -334,10 +334,10 @@ class _Question:
 
 
 class _Sieve:
-    """Sees the rows of the catalogue, some at a time, and lets through what has to be judged."""
+    """Reads the rows of objects, some at a time, and selects those that must be examined."""
 
     def __init__(self, asked: Wanted, chosen: NDArray[np.int64], known: NDArray[np.int64]) -> None:
-        """Both are in order: the times of objects that are wanted whatever they are, and of those that have statistics."""
+        """Both are sorted: the times of objects that are selected in any case, and of those with statistics."""
         self._asked = asked
         self._chosen = chosen
         self._known = known
@@ -346,7 +346,7 @@ class _Sieve:
         self.objects = 0
         self.newest_ns = 0
         self.ends: dict[str, int | None] = {}
-        """By topic the end of its newest object."""
+        """Topic -> end of its newest object."""
 
     def __call__(self, table: pa.Table) -> Mask:
         asked = self._asked
@@ -366,12 +366,12 @@ class _Sieve:
         return kept & (_is_among(stamps, self._chosen) | ~_is_among(stamps, self._known))
 
     def repeated(self) -> NDArray[np.int64]:
-        """Times that several rows have."""
+        """Times of more than one row."""
         stamps = np.sort(np.concatenate([np.zeros(0, np.int64), *self._seen]), kind='stable')
         return np.unique(stamps[1:][np.diff(stamps) == 0])
 
     def period_ns(self) -> int:
-        """The usual time between two messages, as far as rows tell it: no longer than a batch; 0 where it is unknown."""
+        """The usual time between two messages by the rows, at most that of a batch; 0 if unknown."""
         first, last = (np.sort(np.concatenate([np.zeros(0, np.int64), *some])) for some in (self._seen, self._last))
         if len(first) < 2:
             return 0
@@ -391,7 +391,7 @@ class _Sieve:
 
 
 def _leads(expression: Expression) -> list[Comparison]:
-    """Comparisons of which at least one must hold for the expression to hold: as few as there are."""
+    """Comparisons of which at least one must be true for the expression to be true: as few as possible."""
     if isinstance(expression, Comparison):
         return [expression]
     assert isinstance(expression, Joined)
@@ -407,7 +407,7 @@ def _at(stamps: NDArray[np.int64]) -> str:
 
 
 def _may_hold(lead: Comparison) -> str:
-    """A condition in SQL that all statistics meet by which a comparison may hold, and those that cannot be true."""
+    """A condition in SQL for statistics with which a comparison can be true, and for contradictory ones."""
     number = repr(float(lead.value))
     low, high = (lead.function, lead.function) if lead.function and lead.function != 'mean' else ('min', 'max')
     by_sign = {
@@ -423,12 +423,12 @@ def _may_hold(lead: Comparison) -> str:
 
 
 def _stamps(table: pa.Table) -> NDArray[np.int64]:
-    """No sane row has -1."""
+    """The times; -1 for none, which no valid row has."""
     return np.asarray(pc.fill_null(table['t_start_ns'], -1).to_numpy())
 
 
 def _is_among(stamps: NDArray[np.int64], of: NDArray[np.int64]) -> Mask:
-    """Whether each is among some others, which are in order."""
+    """Whether each is among others, which are sorted."""
     if not len(of):
         return np.zeros(len(stamps), bool)
     found: Mask = of[np.minimum(np.searchsorted(of, stamps), len(of) - 1)] == stamps
@@ -440,15 +440,15 @@ def _are(column: pa.ChunkedArray, value: str | None) -> Mask:
 
 
 def _filtered(table: pa.Table, kept: Mask) -> pa.Table:
-    """Without a copy where all of it is kept."""
+    """The filtered rows, without a copy if all are kept."""
     return table if kept.all() else table.filter(pa.array(kept))
 
 
 class _Told:
-    """What the statistics say of each object, by its row."""
+    """The statistics of each object, by its row."""
 
     def __init__(self, rows: pa.Table, statistics: pa.Table, key: Sequence[str], findings: Findings) -> None:
-        """``key`` tells the rows apart, and which statistics are whose."""
+        """``key`` identifies a row and its statistics."""
         self._objects = len(rows)
         numbered = rows.select(key).append_column('_row', pa.array(np.arange(len(rows)), pa.int64()))
         found = statistics.join(numbered, keys=list(key), join_type='inner').combine_chunks()
@@ -472,7 +472,7 @@ class _Told:
             findings.add(rows['key'][int(number)].as_py(), 'its statistics contradict each other')
 
     def judged(self, expression: Expression) -> tuple[Mask, Mask, Mask]:
-        """Whether the condition may hold in an object; must hold in all of it; may hold by what is known alone."""
+        """Whether the condition can be true in an object; must be true in all of it; can be true by known values alone."""
         if isinstance(expression, Comparison):
             may, must, unknown = self._leaf(expression)
             return may | unknown, must, may
@@ -495,7 +495,7 @@ class _Told:
         if not leaf.function:
             messages, count = self._messages[rows], self._values['count'][chosen]
             is_one_each = (count == messages) & (self._values['nan_count'][chosen] == 0) & is_scalar[chosen]
-            # Of a single message any of its values will do, and where they are told by their ends one of the two is it.
+            # For a single message, any of its values; if only their ends are known, it is one of the two.
             every = (every & is_one_each) | (some & (messages == 1) & (leaf.sign != '=='))
         may, must, exact = (np.zeros(self._objects, bool) for _ in range(3))
         may[rows[some]] = True
@@ -505,7 +505,7 @@ class _Told:
 
 
 def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) -> tuple[Mask, Mask]:
-    """Whether it holds for some of the numbers, and for all; of a statistic both are one, but for a mean that is near."""
+    """Whether it is true for some of the numbers, and for all; for a statistic both are equal, except for a close mean."""
     low, high, number = values['min'], values['max'], leaf.value
     if leaf.function and leaf.function != 'mean':
         found: Mask = leaf.holds(values[leaf.function])
@@ -513,7 +513,7 @@ def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) 
     if leaf.function:
         reach = MEAN_ERROR * np.maximum(np.abs(low), np.abs(high)) + _TINY
         mean = values['mean']
-        is_open = np.isnan(mean) & (values['count'] > 0)  # the sum has no double, or not in that order
+        is_open = np.isnan(mean) & (values['count'] > 0)  # the sum is not a double, or not in that order
         low, high = np.where(is_open, -np.inf, mean - reach), np.where(is_open, np.inf, mean + reach)
     if leaf.sign == '==':
         return (low <= number) & (number <= high), (low == number) & (number == high)
@@ -524,7 +524,7 @@ def _by_statistics(leaf: Comparison, values: Mapping[str, NDArray[np.float64]]) 
 
 
 def _contradictory(values: Mapping[str, NDArray[np.float64]]) -> Mask:
-    """Of statistics of fields, as far as they are given: which cannot be true."""
+    """Which statistics of fields contradict themselves."""
     low, high, count = values['min'], values['max'], values['count']
     found: Mask = (low > high) | np.isinf(low) | np.isinf(high)
     for name in ('count', 'nan_count'):
@@ -539,7 +539,7 @@ def _contradictory(values: Mapping[str, NDArray[np.float64]]) -> Mask:
 
 
 def _absurd(table: pa.Table) -> Mask:
-    """Of rows of objects as a whole: which cannot be true."""
+    """Which rows of objects as a whole contradict themselves."""
     found: Mask = np.zeros(len(table), bool)
     for name in ('count', 'nan_count'):
         values = _numbers(table, name)
@@ -556,12 +556,12 @@ def _numbers(table: pa.Table, name: str) -> NDArray[np.float64]:
 
 
 _Run = tuple[int, int, int]
-"""First and last stamp of messages that follow each other, and how many they are."""
+"""First and last stamp of consecutive messages, and their number."""
 
 
 def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expression: Expression,
             findings: Findings) -> Iterator[list[_Run] | None]:  # fmt: skip
-    """The runs in each of these objects; None where it cannot be read."""
+    """The runs in each of these objects; None for one that cannot be read."""
 
     def body(row: dict[str, Any]) -> bytes | DataLoggerError:
         try:
@@ -599,7 +599,7 @@ def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterat
     if not len(stamps):
         return
     order = np.argsort(stamps, kind='stable')
-    # Of a repeat, and of what was stored before the clock was set, the row has the time.
+    # The row has the time of a repeat, and of an object stored before the clock was set.
     stamps, met = stamps[order] + (row['t_start_ns'] - stamps.min()), met[order]
     edges = np.flatnonzero(np.diff(np.concatenate(([False], met, [False])).astype(np.int8)))
     for first, end in zip(edges[::2], edges[1::2], strict=True):
@@ -607,7 +607,7 @@ def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterat
 
 
 def statistics_of(key: str, body: bytes, chosen: Sequence[str] = ()) -> dict[str, Statistic]:
-    """Of the content of an object, as its encoder told them; empty for what none is told of. Raises LakeError."""
+    """Statistics of the content of an object, as its encoder computes them; empty for other formats. Raises LakeError."""
     extension = extension_of(key)
     if extension == _JSON:
         return _collected(records(body), chosen)
@@ -654,18 +654,18 @@ def _met_by(expression: Expression, found: Mapping[str, Statistic], points: NDAr
 
 
 Spans = NDArray[np.int64]
-"""A row is a time: its begin, its end, and how many messages are in it."""
+"""Each row is a time: its start, its end, and the number of its messages."""
 
 
 def _whole(rows: pa.Table, numbers: NDArray[np.intp]) -> Spans:
-    """Of objects all of which meet the condition."""
+    """The times of objects of which all messages meet the condition."""
     some = rows.select(['t_start_ns', 't_end_ns', 'count']).take(pa.array(numbers))
     first, last, count = (np.asarray(pc.fill_null(column, 0).to_numpy()) for column in some.columns)
     return np.stack((first, np.maximum(first, last), np.maximum(count, 1)), axis=1)
 
 
 def _joined_spans(found: Spans, apart_ns: int) -> Spans:
-    """In the order of their times; those that are not further apart are one."""
+    """In the order of their times; those that are closer than this are joined."""
     if not len(found):
         return found
     found = found[np.lexsort((found[:, 1], found[:, 0]))]
@@ -676,7 +676,7 @@ def _joined_spans(found: Spans, apart_ns: int) -> Spans:
 
 
 def _clipped(found: Spans, within: Iterable[TimeSpan]) -> Spans:
-    """What of them lies in the times that were given; messages are then those of all of a range."""
+    """The parts of them within given times; each has the number of messages of the whole range."""
     inside = [np.stack((np.maximum(found[:, 0], span.since_ns), np.minimum(found[:, 1], span.until_ns), found[:, 2]), axis=1)
               for span in within]  # fmt: skip
     clipped = np.concatenate((found[:0], *inside))

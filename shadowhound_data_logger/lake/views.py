@@ -19,7 +19,7 @@ from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.formats.rows.schema import FORGOTTEN, OBJECTS, TableSchema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import fresh, ingest, known_files, pending
+from shadowhound_data_logger.lake.ingest import fresh, ingest, known_files, pending, unknown_of
 from shadowhound_data_logger.lake.row_files import Scope, row_files
 from shadowhound_data_logger.lake.tables import INGESTED, TABLES, Tables, answer, engine, literal
 
@@ -89,9 +89,8 @@ def current(source: Bucket, scope: Scope, findings: Findings) -> Tables:
     tables = Tables.of(source)
     if not tables.is_shared:
         _catch_up(source, tables, scope, findings)
-    for bad in known_files(tables.open(INGESTED), where='rejected > 0'):
-        if bad.is_in(scope):
-            findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
+    for bad in known_files(tables.open(INGESTED), scope, 'rejected > 0'):
+        findings.add(bad.part, bad.why or 'rows of it are rejected', bad.rejected)
     return tables
 
 
@@ -99,13 +98,12 @@ def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) 
     """Ingest what this user's tables lack; if the store lost files that they contain, it is another store: begin again."""
     tables.create()
     opened = tables.open(INGESTED)  # before the listing: what another process ingests after it is not missing there
-    files = row_files(source, findings, scope)
-    there = {(file.entry.key, file.entry.etag) for file in files}
-    if any(each.is_in(scope) and (each.part, each.etag) not in there for each in known_files(opened)):
+    files, known = row_files(source, findings, scope), known_files(opened, scope)
+    if not {(each.part, each.etag) for each in known} <= {(file.entry.key, file.entry.etag) for file in files}:
         tables.delete_local()
         tables.create()
-        opened = tables.open(INGESTED)
-    ingest(source, tables, findings, pending(opened, files))
+        known = []
+    ingest(source, tables, findings, unknown_of(files, known))
 
 
 def _view(name: str, found: Mapping[str, Any], columns: str, *, is_pruned: bool) -> str:

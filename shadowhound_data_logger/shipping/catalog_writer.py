@@ -1,7 +1,7 @@
-"""The robot's side of the catalog and the gap journal: makes parts of what is new, and spools them like any object.
+"""The robot's side of the catalog and the gap journal: writes new rows to row files, and spools these like any object.
 
-Every delivered object is in exactly one part, whoever delivered it and whenever a process died: the list of what is in none
-yet is the spool index's, and a part takes its rows off it in the transaction that makes the part durable.
+Every delivered object is in exactly one file, whichever process delivered it and whenever one was killed: the spool's index lists
+the objects without a row, and the transaction that makes a file durable removes its objects from that list.
 """
 
 from __future__ import annotations
@@ -30,27 +30,26 @@ from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 
 MOST_ROWS: Final = 2000
-"""At a time: 60 ms of CPU without their statistics, and 10 MB of memory meanwhile. While there are more, the next ones come with
-the next look."""
+"""At a time: 60 ms of CPU without their statistics, and 10 MB of memory. Further rows are written by the next call."""
 OBJECTS_A_PART: Final = 400
-"""How many objects' statistics one part holds. While it is made, those of one object take tens of KB of memory."""
+"""Objects per file of statistics. While it is made, those of one object take tens of KB of memory."""
 SOON_S: Final = 5.0
-"""After a mission: until then its last objects are usually delivered."""
+"""After the end of a mission: by then its last objects are usually delivered."""
 KEPT_S: Final = 5.0
-"""Between two parts of what is kept: somebody may ask for it as soon as it is known."""
+"""Between two files about kept objects: these can be requested as soon as they are known."""
 PRIORITY: Final = 1
-"""As a mission's summary: a part has what the store holds already."""
+"""That of a mission's summary."""
 
 
 class CatalogWriter:
-    """Makes parts of the catalog and of the gap journal from what was delivered and lost.
+    """Makes row files of the catalog and of the gap journal from what was delivered and lost.
 
-    New; ``due`` now and then, on one thread. The thread that commits spools what it returns.
+    Lifecycle: ``due`` is called regularly, on one thread. The thread that commits spools the files that it returns.
     """
 
     def __init__(self, spool: Path, settings: CatalogSettings, robot: str, clock: Clock,
                  monotonic: Callable[[], float] = time.monotonic, *, keeps: bool = False) -> None:  # fmt: skip
-        """``keeps``: objects are kept here until somebody asks for them, and who may ask is told of them soon."""
+        """``keeps``: objects are kept here until they are requested, so their rows are written soon."""
         self._spool = spool
         self._settings = settings
         self._robot = robot
@@ -58,17 +57,17 @@ class CatalogWriter:
         self._monotonic = monotonic
         self._due_s = monotonic()
         self._handed: list[frozenset[int]] = []
-        """The ids of the rows of each part that is on its way."""
+        """The ids of the rows of each file that is being delivered."""
         self._gaps = _GapParts(spool, robot, clock)
         self._keeps = keeps
         self._kept_due_s = monotonic()
         self._told: list[frozenset[tuple[int, str]]] = []
-        """The same of each part of what is kept."""
+        """The same for each file about kept objects."""
 
     def due(self) -> list[DataObject]:
-        """The parts of a period that is over, at first of what an earlier process left.
+        """The row files of a period that has ended; at first of what an earlier process left.
 
-        Raises SpoolError or sqlite3.Error; the next look tries again.
+        Raises SpoolError or sqlite3.Error; the next call tries again.
         """
         now_s = self._monotonic()
         if now_s < self._due_s:
@@ -82,11 +81,11 @@ class CatalogWriter:
         return made
 
     def expedite(self) -> None:
-        """Somebody waits for what happened until now: the end of a mission. Any thread."""
+        """Write rows soon, at the end of a mission. Any thread."""
         self._due_s = min(self._due_s, self._monotonic() + SOON_S)
 
     def parts(self) -> list[DataObject]:
-        """Parts of what is in none yet, nor handed out before: objects that were delivered, and what is known of gaps.
+        """Row files with what is in none yet and was not returned before: delivered objects, and gaps.
 
         Raises SpoolError or sqlite3.Error.
         """
@@ -100,7 +99,7 @@ class CatalogWriter:
             index.open()
             listed = index.catalog.uncataloged(MOST_ROWS)
         there = {item.id for item in listed}
-        # A part takes all its rows at once: where one has gone without the others, another process's part has it, not ours.
+        # A file removes all of its rows from the list at once: if one is missing there without the others, it is in another file.
         self._handed = [numbers for numbers in self._handed if numbers <= there]
         handed = frozenset[int]().union(*self._handed)
         new = [item for item in listed if item.id not in handed]
@@ -109,7 +108,7 @@ class CatalogWriter:
         self._handed += [frozenset(part.catalogs) for part in made]
         packed = {item.id: item.statistics for item in new if item.statistics}
         statistics = self._statistics_parts([(number, row) for number, row in rows if number in packed], packed)
-        # Before the rows: what is told goes with those from the index, and statistics that are told twice do no harm.
+        # Before the rows, with which they leave the index; statistics that are written twice do no harm.
         return [*statistics, *made, *self._gaps.parts(), *self._kept_parts()]
 
     def _statistics_parts(self, rows: list[tuple[int, Row]], packed: Mapping[int, bytes]) -> Iterator[DataObject]:
@@ -122,7 +121,7 @@ class CatalogWriter:
             yield from (self._part(*each, STATISTICS) for each in parts.by_folder(told))
 
     def _kept_parts(self) -> list[DataObject]:
-        """Parts of the table of what is kept, of what is in none yet nor handed out. Raises SpoolError or sqlite3.Error."""
+        """Row files with kept objects that are in none yet and were not returned. Raises SpoolError or sqlite3.Error."""
         if not self._settings.enabled:
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
@@ -158,7 +157,7 @@ class CatalogWriter:
         )  # fmt: skip
 
     def _named(self, robot: str | None) -> str:
-        """The robot of a row, or this one where that is not a name."""
+        """The robot of a row, or this one if that is not a valid name."""
         try:
             return check_name(robot or '', 'the robot name')
         except NameRefused:
@@ -166,10 +165,10 @@ class CatalogWriter:
 
 
 class _GapParts:
-    """What changed in the gap journal of one robot since its last part, wherever that was written.
+    """What changed in the gap journal of one robot since its last row file, whichever process wrote it.
 
-    A part that is spooled says up to which version of the journal all is told: so a death costs nothing, and what is told
-    twice is the same. A watermark is told once all rows are: in the part that has the last of them, or after that is delivered.
+    A spooled file names the version of the journal that it reaches: a kill loses nothing, and rows that are written twice are
+    equal. A watermark is written when all rows are: in the file with the last of them, or after that file was delivered.
     """
 
     def __init__(self, spool: Path, robot: str, clock: Clock) -> None:
@@ -204,7 +203,7 @@ class _GapParts:
                     self._marks.clear()
                 found = index.gaps.changed(self._version, MOST_ROWS, offsets)
                 self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
-                # A watermark must not be in the store before a part with gaps that is told before it.
+                # A watermark must not be in the store before the gaps that precede it.
                 is_waiting = index.catalog.has_waiting(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR, priority=PRIORITY)
                 marks = [] if self.has_more or is_waiting else index.gaps.watermarks()
         if found:
@@ -223,13 +222,13 @@ class _GapParts:
                     from_ns=mark.since_ns, to_ns=mark.complete_ns, received_from_ns=mark.received_since_ns,
                     received_to_ns=mark.received_complete_ns, grade=mark.grade, received=mark.received, skipped=mark.skipped,
                 )  # fmt: skip
-                if dates <= {date_of(said)}:  # else rows and watermark are in two parts, and either may be delivered first
+                if dates <= {date_of(said)}:  # otherwise rows and watermark are in two files, and either can be delivered first
                     self._marks[name] = mark
                     rows.append(said)
         return self._made(rows, self._version)
 
     def _row(self, gap: Gap, began_ns: int) -> Statement:
-        """Revisions go on where an index was damaged, and versions start again: the new one began later."""
+        """After a damaged index, versions start from 0, but revisions keep growing, because the new index began later."""
         is_dated = gap.boot_id is None or gap.from_ns is not None
         clock = None if gap.boot_id is None else words.SET_LATER if is_dated else words.UNSET
         name = name_of(
@@ -244,7 +243,7 @@ class _GapParts:
         )  # fmt: skip
 
     def _made(self, rows: list[Statement], version: int) -> list[DataObject]:
-        """A part a date; the last of them says how far all is told."""
+        """One file per date; the last one names the version of the journal that they reach."""
         if not rows:
             return []
         now_ns = self._clock.wall_ns()

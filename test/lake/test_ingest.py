@@ -18,7 +18,8 @@ from lake.making import FAILED, FINISHED, NOON_NS, Watched, add, add_part, fill,
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.formats.rows import schema
+from shadowhound_data_logger.core.zstd import ZstdDecompressor, compress
+from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import ingest as library
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -200,6 +201,24 @@ def test_a_file_that_is_not_one_is_named_and_counted(tmp_path: Path, tables: Tab
     assert ingest(source, tables, findings).files == 0
 
 
+def test_the_rows_of_a_newer_robot_are_added_without_the_columns_that_are_unknown(tmp_path: Path, tables: Tables) -> None:
+    """They are counted, no query takes them for rejected, and another robot's file is no part of the count."""
+    source, findings = bucket(tmp_path), Findings(lambda _: None)
+    rows = [row('camera', NOON_NS + second * SECOND) for second in range(3)]
+    lines = ZstdDecompressor().decompress(parts.encode(rows)).splitlines(keepends=True)
+    lines[1] = lines[1].replace(b'{', b'{"lens":{"f":[1.5]},"date":"../x",', 1)
+    with closing(open_store(source.settings, UploadSettings())) as store:
+        add(store, tmp_path / 'tmp', schema.OBJECTS.part_key('thor', '2026-10-28', 'newer'), compress(b''.join(lines)))
+        add_part(store, [row('odom', NOON_NS)], 'a', tmp_path / 'tmp')
+    done = ingest(source, tables, findings)
+    assert (done.rows, done.rejected, done.unknown, len(findings)) == (4, 0, 1, 0)
+    assert table_keys(tables) == keys([*rows, row('odom', NOON_NS)])
+    assert sorted(lake.objects(source, findings=findings)['key'].to_pylist()) == table_keys(tables)
+    assert len(findings) == 0
+    with engine({'ingested': tables.open(INGESTED)}) as ready:
+        assert answer(ready, 'SELECT sum("unknown") AS n FROM ingested').to_pylist() == [{'n': 1}]
+
+
 INGESTER = """
 import sys
 from pathlib import Path
@@ -257,7 +276,7 @@ def test_upkeep_makes_one_ordered_file_of_a_day_that_has_ended(tmp_path: Path, t
 
 @pytest.mark.seaweedfs
 def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path: Path) -> None:
-    """Not before the grace period ends, and never one with rejected rows; the tables have the rows then."""
+    """Not before the grace period ends, and never one of which the tables lack rows or columns; they have the others then."""
     import boto3
 
     settings = tower.store_settings()
@@ -275,13 +294,15 @@ def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path:
         add_part(store, rows, 'a', tmp_path / 'tmp')
         bad = schema.OBJECTS.part_key(robot, '2026-10-28', 'bad')
         add(store, tmp_path / 'tmp', bad, b'hello')
+        newer = schema.OBJECTS.part_key(robot, '2026-10-28', 'newer')
+        add(store, tmp_path / 'tmp', newer, parts.encode([{**rows[0], 'color': 'red'}]))
     only = Scope(robot=robot)
     assert ingest(source, tables, Findings(lambda _: None), row_files(source, Findings(), only)).rows == 3
     assert tend(source, tables, Findings()).expired == 0
-    assert len(row_files(source, Findings(), only)) == 2
+    assert len(row_files(source, Findings(), only)) == 3
     later = datetime.now(timezone.utc) + timedelta(hours=2)
     assert tend(source, tables, Findings(), now=later).expired == 1
-    assert [file.entry.key for file in row_files(source, Findings(), only)] == [bad]
+    assert [file.entry.key for file in row_files(source, Findings(), only)] == [bad, newer]
     assert table_keys(tables) == keys(rows)
 
 

@@ -1,1 +1,1 @@
-"""The catalog as a robot writes it: the columns, the row of each object, and Parquet parts of what was delivered."""
+"""Rows that robots write about their data: the columns of each table, and the files with these rows."""

@@ -21,7 +21,6 @@ from shadowhound_data_logger.formats.rows.schema import GAPS_FOLDER, INT32, INT6
 FORMAT_VERSION: Final = 1
 """Of the statements. Columns are only ever added, at the end."""
 GAP, WITHDRAWN, COMPLETE = 'gap', 'withdrawn', 'complete'
-STATEMENT_KINDS: Final = (GAP, WITHDRAWN, COMPLETE)
 """Values of ``what``."""
 GAPS: Final = TableSchema(
     folder=GAPS_FOLDER,
@@ -52,7 +51,6 @@ GAPS: Final = TableSchema(
         'format_version': INT32,
     },
     required=('robot', 'what', 'id', 'revision', 'sink', 'topic', 'format_version'),
-    about={'shadowhound.gaps': str(FORMAT_VERSION)},
 )
 """``sink topic publisher session kind cause count merged grade mission_id`` are those of ``shadowhound-data ledger --gaps``.
 

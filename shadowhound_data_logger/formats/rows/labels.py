@@ -32,7 +32,6 @@ LABELS: Final = TableSchema(
         'format_version': INT32,
     },
     required=('robot', 'what', 'id', 'label', 'since_ns', 'until_ns', 'made_ns', 'format_version'),
-    about={'shadowhound.labels': '1'},
 )
 """Every label has ``since_ns`` to ``until_ns``, both included; that of an object has ``bucket key``, and that of a box in it
 ``x y width height``, in pixels. ``by`` is the author and ``made`` the time; the newest row of an ``id`` counts."""

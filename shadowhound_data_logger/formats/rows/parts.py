@@ -47,16 +47,16 @@ KINDS: Final[Mapping[str, TableSchema]] = {
 """The table of each kind of row."""
 MAX_FILE_BYTES: Final = 16 << 20
 MAX_BYTES: Final = 64 << 20
-"""Of all lines: the statistics of 400 objects can have 26,000 rows, which take 10 MB."""
+"""Decompressed: the statistics of 400 objects can have 26,000 rows, which take 10 MB."""
 MAX_RATIO: Final = 400
-"""Between the lines and the file, beyond the slack. Rows that differ only in a number reach 230."""
+"""Of the decompressed size, beyond the slack, to that of the file. Rows that differ only in a number reach 230."""
 SLACK_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 64 << 10
 MAX_LINES: Final = 100_000
 _PIECE_BYTES: Final = 1 << 18
 _LEVEL: Final = 3
 _WINDOW: Final[Mapping[int, int]] = {DecompressionParameter.window_log_max: 23}
-"""8 MiB: four times what this level needs, and what a file can make its reader allocate."""
+"""8 MiB: four times what this level needs; a file cannot make its reader allocate more."""
 _KIND_OF: Final = {of.folder: kind for kind, of in KINDS.items() if kind != 'watermark'}
 _OWNED_BY_ROBOT: Final = frozenset({GAPS.folder, LABELS.folder})
 """Tables whose rows must name their robot; the rows of the others have a key below its name."""
@@ -67,7 +67,7 @@ _SPANS: Final[Mapping[str, Sequence[tuple[str, str]]]] = {
     LABELS.folder: (('since_ns', 'until_ns'),),
 }
 _YEARS_US: Final = (-62_135_596_800_000_000, 253_402_300_799_999_999)
-"""Years 1 to 9999, which are those of a date."""
+"""Years 1 to 9999, those that a date can have."""
 
 
 class Rejected(NamedTuple):
@@ -87,8 +87,8 @@ class RowsRead:
     rows: dict[str, list[Row]] = field(default_factory=dict)
     """By the folder of their table, in the order of the file; each has all columns of the table."""
     rejected: list[Rejected] = field(default_factory=list)
-    extended: int = 0
-    """Valid rows with columns that this version does not know, which it leaves out: their writer is newer."""
+    unknown: int = 0
+    """Valid rows with columns that this version does not know, because the robot is newer; these columns are ignored."""
     ended: str | None = None
     """Why the rest of the file was not read; None if it was read to its end."""
 
@@ -109,12 +109,8 @@ def encode(rows: Sequence[Row], of: TableSchema = OBJECTS) -> bytes:
     return compress(b''.join(_line(row, of) for row in rows), _LEVEL)
 
 
-def _unicode(value: Any) -> Any:
-    return value.encode(errors='replace').decode() if isinstance(value, str) else value
-
-
 def by_folder(rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[str | None, str, list[tuple[int, Row]]]]:
-    """(robot, date, its rows in the order of their times) for each folder that gets a part; each row with its object's id."""
+    """(robot, date, rows in the order of their times) of each file that is written; each row with the id of its object."""
     folders: dict[tuple[str | None, str], list[tuple[int, Row]]] = {}
     for number, row in rows:
         folders.setdefault((row['robot'], date_of(row)), []).append((number, row))
@@ -130,14 +126,14 @@ def read_rows(content: bytes, robot: str) -> RowsRead:
             found.ended = f'it has more than {MAX_LINES:,} lines'
             break
         try:
-            of, row, is_extended = _checked(line, robot)
+            of, row, has_unknown = _checked(line, robot)
         except ValueError as error:
             why = str(error)
             before = reasons.get(why, Rejected(why, 0, number))
             reasons[why] = before._replace(lines=before.lines + 1)
         else:
             found.rows.setdefault(of.folder, []).append(row)
-            found.extended += is_extended
+            found.unknown += has_unknown
     found.rejected = list(reasons.values())
     return found
 
@@ -155,7 +151,7 @@ def _line(row: Row, of: TableSchema) -> bytes:
 
 
 def _lines(content: bytes, found: RowsRead) -> Iterator[bytes | None]:
-    """Line by line, None for one that is too long; sets why the file ended early."""
+    """The lines, None for one that is too long; sets why the file ended early."""
     rest, is_long = b'', False
     for piece in _pieces(content, found):
         *lines, rest = (rest + piece).split(b'\n')
@@ -198,7 +194,7 @@ def _pieces(content: bytes, found: RowsRead) -> Iterator[bytes]:
 def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
     """The row of a line, and whether it has more columns than this version knows.
 
-    Raises ValueError with a reason that has no text of the line.
+    Raises ValueError; its text contains nothing from the line.
     """
     if line is None:
         raise ValueError(f'longer than {MAX_LINE_BYTES:,} bytes')
@@ -215,8 +211,8 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
         check = checks.get(name)
         if check is not None and value is not None and not check(value):
             raise ValueError(f'{name} is invalid')
-    is_extended = not checks.keys() >= said.keys()
-    if is_extended:
+    has_unknown = not checks.keys() >= said.keys()
+    if has_unknown:
         said = {name: value for name, value in said.items() if name in checks}
     row = {**_EMPTY[of.folder], **said}
     for name in _REQUIRED[of.folder]:
@@ -228,7 +224,7 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
     for first, last in _SPANS.get(of.folder, ()):
         if row[first] is not None and row[last] is not None and row[first] > row[last]:
             raise ValueError(f'{first} is after {last}')
-    return of, row, is_extended
+    return of, row, has_unknown
 
 
 def _check_owner(row: Row, robot: str, of: TableSchema) -> None:
@@ -283,5 +279,5 @@ _CHECKS: Final = {folder: {name: _check_of(name, kind) for name, kind in of.colu
 _REQUIRED: Final = {
     folder: tuple(name for name in of.required if not (of is STATISTICS and name in NUMBERS)) for folder, of in _TABLES.items()
 }
-"""Numbers of statistics are judged by the query: without its row, an object would seem to be without the field."""
+"""Queries check the numbers of statistics: if the row were rejected, the object would appear to lack the field."""
 _EMPTY: Final[Mapping[str, Row]] = {folder: dict.fromkeys(of.columns) for folder, of in _TABLES.items()}

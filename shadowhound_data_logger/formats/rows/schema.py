@@ -1,10 +1,10 @@
-"""The catalog: one row for each object in the store, its columns, and how a row is made from an object's metadata.
+"""The catalog: one row per object in the store, its columns, and how a row is made from the metadata of an object.
 
-A row holds nothing that is not in the object's S3 metadata and in a listing: a catalog that is lost is made again from those.
-Every object of a robot is a row but the files of the catalog itself. Parts lie at
+A row contains nothing that is not in the object's S3 metadata and in a listing: a lost catalog can be rebuilt from those.
+Every object of a robot has a row, except the row files themselves. These are at
 ``<robot>/_catalog/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``t_start``, UTC.
-Beside them lie the parts of the gap journal (formats/rows/gaps.py), in ``<robot>/_gaps/``, and of the statistics of the objects
-(formats/rows/statistics.py), in ``<robot>/_stats/``.
+Those of the gap journal (formats/rows/gaps.py) are in ``<robot>/_gaps/``, and those of the statistics of the objects
+(formats/rows/statistics.py) in ``<robot>/_stats/``.
 """
 
 from __future__ import annotations
@@ -55,57 +55,53 @@ COLUMNS: Final[Mapping[str, str]] = {
     'received_end_ns': INT64,
     'by_arrival': INT64,
 }
-"""Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are always there; all else is null where it is not known.
+"""Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are never null; others are null if unknown.
 
-Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact ones stand beside them as int64.
+Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact times are also there as int64.
 ``x y yaw`` are meters and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
 message, the middle of a batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date:
-``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the part lies under ``date=1970-01-01``.
-``clock_offset_ns`` is to be added to the times in the content, with ``set_later``. ``received_*`` is when its messages arrived;
+``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the file is below ``date=1970-01-01``. With
+``set_later``, ``clock_offset_ns`` must be added to the times in the content. ``received_*`` is when its messages arrived;
 ``by_arrival`` of them are dated by that, because their stamps were not trusted.
 """
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
 UNDATED: Final = '1970-01-01'
 SENSOR: Final = '_catalog'
-"""Of the catalog's own objects and of the gap journal's, which have no rows in it."""
+"""Of row files, which have no rows themselves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSchema:
-    """A table whose parts lie in the store: their folder below the robot's name, and their columns."""
+    """A table with row files in the store: their folder below the robot's name, and their columns."""
 
     folder: str
     columns: Mapping[str, str]
     """Name -> kind."""
     required: tuple[str, ...]
     """Columns without nulls."""
-    about: Mapping[str, str]
-    """The key-value metadata of each part."""
     is_apart: bool = False
-    """Whether the parts lie beside the robots' own folders: a robot's credentials may not write them."""
+    """Whether the files are outside of the robots' folders: a robot's credentials may not write them."""
 
     def prefix(self, robot: str) -> str:
-        """What the keys of a robot's parts begin with."""
+        """The start of the keys of a robot's row files."""
         return f'{self.folder}/{robot}/' if self.is_apart else f'{robot}/{self.folder}/'
 
     def robot_of(self, key: str) -> str:
-        """Whose part this is."""
+        """The robot of a row file."""
         return ''.join(key.split('/')[1:2]) if self.is_apart else key.partition('/')[0]
 
     def part_key(self, robot: str, date: str, name: str) -> str:
-        """The key of a part with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
+        """The key of a row file with rows of one date (``YYYY-MM-DD``); ``name`` makes it unique."""
         return f'{self.prefix(robot)}date={date}/{robot}_{name}{SUFFIX}'
 
 
-OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED, {'shadowhound.catalog': str(FORMAT_VERSION)})
-KEPT: Final = TableSchema(
-    '_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'), {'shadowhound.kept': str(FORMAT_VERSION)}
-)
-"""What robots keep until somebody asks for it: rows as of the catalog, and ``where`` each object is.
+OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED)
+KEPT: Final = TableSchema('_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'))
+"""What robots keep until it is requested: rows like those of the catalog, and ``where`` each object is.
 
-``robot``: on the robot's disk. ``lost``: it was evicted there, or refused; ``reason`` says why. A row of the same object in the
-catalog, which says that the store has it, supersedes both, and ``lost`` supersedes ``robot``, whatever comes first. Readers of
-the catalog that know nothing of this table see only what the store has.
+``robot``: on the robot's disk. ``lost``: evicted there, or rejected by the store; ``reason`` is why. A row of the same object in
+the catalog supersedes both, because the store has the object then, and ``lost`` supersedes ``robot``, in any order. Readers of
+the catalog alone see only what the store has.
 """
 FORGOTTEN: Final = TableSchema(
     '_forgotten',
@@ -126,17 +122,16 @@ FORGOTTEN: Final = TableSchema(
         'format_version': INT32,
     },
     ('bucket', 'key', 'bytes', 't_start_ns', 'forgotten_ns', 'format_version'),
-    {'shadowhound.forgotten': '1'},
     is_apart=True,
 )
-"""What ``lake prune`` deleted from the store on purpose: of each object the columns of its row in the catalog, ``forgotten``
-when, and by which ``rule``.
+"""What ``lake prune`` deleted from the store: columns of the object's row in the catalog, when it was ``forgotten``, and by which
+``rule``.
 
-The row in the catalog stays; one here, under the same date, supersedes it. It is there before the object is deleted: a robot
-that could write one could have an object deleted.
+The row in the catalog is kept; one here, with the same date, supersedes it. It is written before the object is deleted: a robot
+that could write such a row could have objects deleted.
 """
 GAPS_FOLDER: Final = '_gaps'
-"""Of the gap journal's parts."""
+"""Of the gap journal's row files."""
 STATISTICS_FOLDER: Final = '_stats'
 LABELS_FOLDER: Final = '_labels'
 
@@ -145,7 +140,7 @@ Row = dict[str, Any]
 
 
 def is_row(bucket: str, key: str) -> bool:
-    """Whether an object belongs into the catalog: all do but its own files, and those of the tables beside it."""
+    """Whether an object has a row in the catalog: all have one except row files."""
     folders = {SENSOR, GAPS_FOLDER, KEPT.folder, STATISTICS_FOLDER, LABELS_FOLDER}
     return bucket != BUCKET or ''.join(key.split('/')[1:2]) not in folders
 
@@ -156,9 +151,9 @@ def date_of(row: Row) -> str:
 
 
 def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mapping[str, str]) -> Row:
-    """The row of an object by its S3 metadata; never raises: what is missing or senseless there is null.
+    """The row of an object from its S3 metadata; never raises: missing or invalid values are null.
 
-    ``robot`` is that of its key, whatever the object says; ``sensor`` of one that tells nothing too.
+    ``robot`` is that of its key, whatever the metadata is; so is ``sensor`` without metadata.
     """
     parts = key.split('/')
     start_ns, end_ns = _int(metadata, words.T_START_NS, words.BOOT_START_NS), _int(metadata, words.T_END_NS, words.BOOT_END_NS)
@@ -202,7 +197,7 @@ def _micros(stamp_ns: int | None) -> int | None:
 
 
 def _int(metadata: Mapping[str, str], *names: str) -> int | None:
-    """The first of these that is there, as a whole number of 64 bits; None where it is none."""
+    """The first of these that exists, as an integer of 64 bits; None if it is not one."""
     for name in names:
         if name in metadata:
             try:

@@ -35,7 +35,6 @@ STATISTICS: Final = TableSchema(
         'format_version': INT32,
     },
     required=('bucket', 'key', 'field', 'count', 'nan_count', 'format_version'),
-    about={'shadowhound.statistics': str(FORMAT_VERSION)},
 )
 """``robot sensor bucket key t_start t_start_ns`` are those of the object's row in the catalog.
 

@@ -132,7 +132,7 @@ def test_a_newer_robots_columns_are_left_out_and_counted() -> None:
     """Its rows are used."""
     found = parts.read_rows(compress(line(color='red', shape={'a': [1]}) + line()), 'thor')
     assert found.rows == {'_catalog': some(1) * 2}
-    assert (found.extended, found.findings) == (1, '')
+    assert (found.unknown, found.findings) == (1, '')
 
 
 @pytest.mark.parametrize('kind', BAD)
