@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, Clock, utc
 from shadowhound_data_logger.core.errors import DataLoggerError
-from shadowhound_data_logger.core.stamps import describe
+from shadowhound_data_logger.core.stamps import BY_STAMP, describe
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
+from shadowhound_data_logger.spool.gaps import OBJECTS
 from shadowhound_data_logger.spool.status import read as read_status
 
 _HEAD: Final = (
@@ -64,7 +64,7 @@ class SpoolFigures:
             'topics': [_row(topic, accounts.get(topic, {}), live.get(topic, {})) for topic in sorted({*accounts, *live})],
         }  # fmt: skip
 
-    def gaps(self, since_ns: int | None = None, until_ns: int | None = None) -> dict[str, Any]:
+    def gaps(self, since_ns: int | None = None, until_ns: int | None = None, by: str = BY_STAMP) -> dict[str, Any]:
         """Every gap between two times (today's, unless they are given), and what the journal can say of each topic.
 
         ``known``: [topic, since, until]; between them no row is no gap, beyond nobody knows yet. Times are UTC in ms.
@@ -73,16 +73,23 @@ class SpoolFigures:
         midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
         since_ns = since_ns if since_ns is not None else int(midnight.timestamp()) * SECOND
         until_ns = until_ns if until_ns is not None else int((midnight + timedelta(days=1)).timestamp()) * SECOND
+        is_by_stamp = by == BY_STAMP
         gaps = [
-            (gap.sink, gap.topic, gap.kind, gap.cause, gap.from_ns, gap.to_ns, gap.count or 0, gap.grade)
-            for gap in ledger.journal(self._spool, self._robot) if _is_within(gap, since_ns, until_ns)
+            (gap.sink, gap.topic, gap.kind, gap.cause, *times, gap.count or 0, gap.grade)
+            for gap in ledger.journal(self._spool, self._robot)
+            if _is_within(times := (gap.from_ns, gap.to_ns) if is_by_stamp else (gap.received_from_ns, gap.received_to_ns),
+                          since_ns, until_ns)
         ]  # fmt: skip
-        marks = [mark for mark in ledger.watermarks(self._spool) if mark.complete_ns >= since_ns and mark.since_ns <= until_ns]
-        known = [(mark.topic, mark.since_ns, mark.complete_ns) for mark in marks if mark.sink == OBJECTS]
-        return told_gaps(gaps, known, since_ns, until_ns, now_ns)
+        known = [
+            (mark.topic, *times) for mark in ledger.watermarks(self._spool)
+            if mark.sink == OBJECTS and _is_within(
+                times := (mark.since_ns, mark.complete_ns) if is_by_stamp
+                else (mark.received_since_ns, mark.received_complete_ns), since_ns, until_ns)
+        ]  # fmt: skip
+        return told_gaps(sorted(gaps, key=lambda gap: gap[4]), known, since_ns, until_ns, now_ns)
 
 
-def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[str, int, int]], since_ns: int, until_ns: int,
+def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[Any, ...]], since_ns: int, until_ns: int,
               now_ns: int) -> dict[str, Any]:  # fmt: skip
     """As ``SpoolFigures.gaps``, of gaps by time with the columns that it names, their times in ns."""
     grain_ns = (until_ns - since_ns) // MAX_GAPS if len(gaps) > MAX_GAPS else 0
@@ -105,8 +112,9 @@ def told_gaps(gaps: Sequence[tuple[Any, ...]], known: Sequence[tuple[str, int, i
     }  # fmt: skip
 
 
-def _is_within(gap: Gap, since_ns: int, until_ns: int) -> bool:
-    return gap.from_ns is not None and gap.to_ns is not None and gap.to_ns >= since_ns and gap.from_ns <= until_ns
+def _is_within(times: tuple[int | None, int | None], since_ns: int, until_ns: int) -> bool:
+    from_ns, to_ns = times
+    return from_ns is not None and to_ns is not None and to_ns >= since_ns and from_ns <= until_ns
 
 
 def _row(topic: str, account: Mapping[str, Any], live: Mapping[str, Any]) -> dict[str, Any]:

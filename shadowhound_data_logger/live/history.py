@@ -14,7 +14,7 @@ import resource
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import closing, suppress
@@ -35,6 +35,7 @@ from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.mailbox import KeptFilter
 from shadowhound_data_logger.core.model import ON_ROBOT
 from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS, SAME_NS
 from shadowhound_data_logger.core.untrusted import check_pixels, visible
 from shadowhound_data_logger.formats.mcap.index import McapIndex, read_summary
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
@@ -76,6 +77,8 @@ IN_BAG_NS: Final = 3 * SECOND // 2
 """So much before a moment is read of a bag."""
 MOST_TEXT: Final = 160
 MAX_MARKS: Final = 500
+MAX_OFFSETS: Final = 8
+"""Between stamp and arrival, in the messages about a moment."""
 MAX_CUTS: Final = 3
 """Commands that cut a bag."""
 MAX_COLUMNS: Final = 64
@@ -112,9 +115,9 @@ class PastReader:
         if do == 'days':
             return {'days': self._source.days(robot)}, b''
         if do == 'timeline':
-            return self.timeline(robot, int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000), b''
+            return self.timeline(robot, int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000, _clock(asked)), b''
         if do == 'moment':
-            return self.moment(robot, int(asked['at']) * 1_000_000)
+            return self.moment(robot, int(asked['at']) * 1_000_000, _clock(asked))
         if do == 'label':
             if robot not in self._source.robots():
                 raise LabelRefused(f'there is no robot {robot!r} here')
@@ -159,16 +162,17 @@ class PastReader:
 
     # -- a time ----------------------------------------------------------------------------------------------------
 
-    def timeline(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
-        """What was recorded between two times, the gaps, and what happened.
+    def timeline(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
+        """What was recorded between two times, the gaps, and what happened; ``by`` which of the two times of messages.
 
+        Missions, bags, events and labels have the robot's own time, which is that of arrival.
         ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone; ``marks``: [kind, name, from, to, text];
         times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
         if not 0 < end_ns - begin_ns <= MAX_SPAN_NS:
             raise ValueError(f'a timeline has at most {MAX_SPAN_NS // SECOND // 3600} hours')
-        days = [self._source.day(robot, date) for date in dates_between(begin_ns - LONGEST_BATCH_NS, end_ns)]
-        found = self._source.gaps(robot, begin_ns, end_ns)
+        days = [self._source.day(robot, date, by) for date in dates_between(begin_ns - LONGEST_BATCH_NS, end_ns)]
+        found = {**self._source.gaps(robot, begin_ns, end_ns, by), 'by': by}
         found['recorded'] = [
             [_text(topic), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)]
             for topic, from_ns, to_ns in _runs(days, begin_ns, end_ns)
@@ -181,12 +185,11 @@ class PastReader:
             for kind, name, from_ns, to_ns, text in inside
         ]  # fmt: skip
         rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
-        kept = [(row['topic'] or row['sensor'] or '', row['t_start_ns'], row['t_end_ns'] or row['t_start_ns'])
-                for row in rows if row['where'] == ON_ROBOT]  # fmt: skip
+        kept = [(row['topic'] or row['sensor'] or '', *_kept_times(row, by)) for row in rows if row['where'] == ON_ROBOT]
         found['kept'] = [[_text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)] for name, from_ns, to_ns in
                          _spans(kept, begin_ns, end_ns)]  # fmt: skip
         found['problem'] = _text(next((day.problem for day in days if day.problem), lacking), 400)
-        found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'])
+        found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'], by)
         return found
 
     @staticmethod
@@ -213,27 +216,31 @@ class PastReader:
 
     # -- a moment --------------------------------------------------------------------------------------------------
 
-    def moment(self, robot: str, at_ns: int) -> tuple[dict[str, Any], bytes]:
+    def moment(self, robot: str, at_ns: int, by: str = BY_STAMP) -> tuple[dict[str, Any], bytes]:
         """What there is of a moment: the newest of each topic at or before it, as items, each after a uint32 with its length.
 
-        The head has ``shown``: [topic, kind, ms before the moment, where it was read]. Raises DataLoggerError.
+        ``by`` says by which of their two times messages are of the moment, and their age is measured. The head has ``shown``:
+        [topic, kind, ms before the moment, where it was read]. Raises DataLoggerError.
         """
-        days = [self._source.day(robot, date) for date in dates_between(at_ns - PATH_NS, at_ns + 1)]
+        days = [self._source.day(robot, date, by) for date in dates_between(at_ns - PATH_NS, at_ns + 1)]
         near = [one for day in days for one in day.between(at_ns - LONGEST_BATCH_NS, at_ns + 1)]
         shown: dict[str, tuple[LiveItem, str]] = {}
-        for item, where in (*self._of_objects(near, at_ns), *self._of_bags(days, at_ns)):
+        late = _offsets(near) if by == BY_STAMP else [0]
+        dates = sorted({date for late_ns in late for date in dates_between(at_ns + late_ns - PATH_NS, at_ns + late_ns + 1)})
+        bag_files = [pair for date in dates for pair in self._source.day(robot, date, by).bag_files.items()]
+        for item, where in (*self._of_objects(near, at_ns), *self._of_bags(bag_files, at_ns, by, late)):
             known = shown.get(item.topic)
             if known is None or (item.head or {})['at'] > (known[0].head or {})['at'] + 1:
                 shown[item.topic] = item, where
         walked = [one for day in days for one in day.between(at_ns - PATH_NS, at_ns + 1)]
         poses = [((one.begin_ns + one.end_ns) // 2, one.pose) for one in walked if one.pose]
         items = [*(item for item, _ in shown.values()), *_track(poses)]
-        bags = [pair for day in days for pair in day.bag_files.items()]
-        covering = [bag for bag, files in bags if _slices(files, self._contents.manifest(files), at_ns)]
+        covering = [bag for bag, files in bag_files
+                    if any(_slices(files, self._contents.manifest(files), at_ns + late_ns) for late_ns in late)]  # fmt: skip
         last = max((one for one in near if one.mission_id), key=lambda one: one.begin_ns, default=None)
         head = {
-            'at': at_ns / 1e6, 'mission': _text(last.mission_id) if last is not None else '',
-            'commands': commands(robot, at_ns - AROUND_NS, at_ns + AROUND_NS, covering),
+            'at': at_ns / 1e6, 'by': by, 'mission': _text(last.mission_id) if last is not None else '',
+            'commands': commands(robot, at_ns - AROUND_NS, at_ns + AROUND_NS, covering, by, (min(late), max(late))),
             'shown': [[_text(item.topic), item.kind, round(at_ns / 1e6 - (item.head or {})['at'], 1), _text(where, 300)]
                       for item, where in shown.values()],
         }  # fmt: skip
@@ -261,11 +268,11 @@ class PastReader:
                 return None
             body, stamp_ns = self._contents.get(last), last.begin_ns
             if extension in decode.ARCHIVES:
-                members = [one for one in decode.members(body, extension) if one.stamp_ns <= at_ns]
+                members = [one for one in decode.members(body, extension) if one.stamp_ns + last.offset_ns <= at_ns]
                 if not members:
                     return None
                 newest = max(members, key=lambda one: one.stamp_ns)
-                body, stamp_ns, extension = newest.body, newest.stamp_ns, newest.extension
+                body, stamp_ns, extension = newest.body, newest.stamp_ns + last.offset_ns, newest.extension
             if item := _picture(topic, extension, body, stamp_ns / 1e6):
                 return item, _where(last)
         return None
@@ -282,8 +289,8 @@ class PastReader:
             if kind is None or kind.values is None:
                 return None
             rows += [
-                (sample['stamp_ns'] / 1e6, _checked(kind.values(_message(name, sample)))) for sample in samples[-MAX_MESSAGES:]
-                if at_ns - SERIES_NS <= sample['stamp_ns'] <= at_ns
+                ((sample['stamp_ns'] + one.offset_ns) / 1e6, _checked(kind.values(_message(name, sample))))
+                for sample in samples[-MAX_MESSAGES:] if at_ns - SERIES_NS <= sample['stamp_ns'] + one.offset_ns <= at_ns
             ]  # fmt: skip
         if not rows:
             return None
@@ -292,32 +299,44 @@ class PastReader:
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
-    def _of_bags(self, days: Sequence[PastDay], at_ns: int) -> list[tuple[LiveItem, str]]:
+    def _of_bags(self, bag_files: Sequence[tuple[str, Sequence[PastObject]]], at_ns: int, by: str,
+                 late: Sequence[int]) -> list[tuple[LiveItem, str]]:  # fmt: skip
+        """Messages of a moment. Bags are sorted by arrival: with these offsets that is so much after the stamp."""
         found: list[tuple[LiveItem, str]] = []
-        for day in days:
-            for files in day.bag_files.values():
-                for one in _slices(files, self._contents.manifest(files), at_ns):
-                    with suppress(DataLoggerError, *_BROKEN):
-                        found += self._of_slice(one, at_ns)
+        for _, files in bag_files:
+            manifest = self._contents.manifest(files)
+            slices = {one.key: one for late_ns in late for one in _slices(files, manifest, at_ns + late_ns)}
+            for one in slices.values():
+                with suppress(DataLoggerError, *_BROKEN):
+                    found += self._of_slice(one, at_ns, by, late)
         return found
 
-    def _of_slice(self, one: PastObject, at_ns: int) -> list[tuple[LiveItem, str]]:
+    def _of_slice(self, one: PastObject, at_ns: int, by: str, late: Sequence[int]) -> list[tuple[LiveItem, str]]:
         source, index = self._index(one)
         if index is None:
             return []
-        wanted = MessageFilter(at_ns - IN_BAG_NS, at_ns + 1, lambda channel: channel.type in KINDS)
-        came: dict[tuple[str, str], list[tuple[float, bytes]]] = {}
-        for message in read_messages(source, index, wanted):
-            name = message.channel.topic, message.channel.type
-            if name in came or len(came) < MAX_TOPICS:
-                of = came.setdefault(name, [])
-                of.append((message.log_ns / 1e6, message.cdr))
-                if KINDS[name[1]].is_bulk or len(of) > MAX_MESSAGES:
-                    del of[:-1]
+        came: dict[tuple[str, str], dict[int, bytes]] = {}
+        waiting, read = list(late), set[int]()
+        while waiting:
+            late_ns = waiting.pop(0)
+            read.add(late_ns)
+            for message in read_messages(source, index, _around(at_ns + late_ns, by)):
+                is_by_stamp, offset_ns = by == BY_STAMP, message.log_ns - message.publish_ns
+                if is_by_stamp and len(read) + len(waiting) < MAX_OFFSETS and _is_new(offset_ns, (*read, *waiting)):
+                    waiting.append(offset_ns)
+                message_ns = message.publish_ns if is_by_stamp else message.log_ns
+                name = message.channel.topic, message.channel.type
+                if at_ns - IN_BAG_NS <= message_ns <= at_ns and (name in came or len(came) < MAX_TOPICS):
+                    of = came.setdefault(name, {})
+                    of[message_ns] = message.cdr
+                    if KINDS[name[1]].is_bulk or len(of) > MAX_MESSAGES:
+                        for oldest in sorted(of)[:-1]:
+                            del of[oldest]
         found: list[tuple[LiveItem, str]] = []
         for (topic, type_name), messages in came.items():
             with suppress(Rejected, *_BROKEN):
-                found.append((self._of_messages(topic, type_name, messages), _where(one)))
+                ordered = [(message_ns / 1e6, messages[message_ns]) for message_ns in sorted(messages)]
+                found.append((self._of_messages(topic, type_name, ordered), _where(one)))
         return found
 
     def _of_messages(self, topic: str, type_name: str, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
@@ -408,16 +427,59 @@ _BROKEN: Final = (ValueError, LookupError, TypeError, AttributeError, Arithmetic
 """What comes of content that is not what its name says."""
 
 
-def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str]) -> list[list[str]]:
-    """[what, command line] for this time, to be pasted into a shell: names of a store are quoted."""
-    since, until = (f'{utc(at_ns):%Y-%m-%dT%H:%M:%S.%f}'[:-3] + 'Z' for at_ns in (begin_ns, end_ns))
+def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: str = BY_STAMP,
+             late_ns: tuple[int, int] = (0, 0)) -> list[list[str]]:  # fmt: skip
+    """[what, command line] for this time, to be pasted into a shell: names of a store are quoted.
+
+    Bags are cut by arrival, which is at least and at most ``late_ns`` after the stamps.
+    """
+    since, until, start, end = (
+        f'{utc(at_ns):%Y-%m-%dT%H:%M:%S.%f}'[:-3] + 'Z'
+        for at_ns in (begin_ns, end_ns, begin_ns + late_ns[0], end_ns + late_ns[1])
+    )
     of = f'--robot {shlex.quote(robot)}'
     span = f'{of} --since {since} --until {until}'
     cuts = [
-        ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {since} --end {until} --output cut']
+        ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {start} --end {end} --output cut']
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
+    if by == BY_RECEIVED:
+        return [['query', f'shadowhound-data query {span} --by {by}'], *cuts]
     return [['query', f'shadowhound-data query {span}'], ['fetch', f'shadowhound-data fetch {span} --to data'], *cuts]
+
+
+def _around(log_ns: int, by: str) -> MessageFilter:
+    """The messages of a bag that may be of a moment; offsets that differ by less than ``SAME_NS`` are the same."""
+    slack_ns = SAME_NS if by == BY_STAMP else 0
+    return MessageFilter(log_ns - IN_BAG_NS - slack_ns, log_ns + slack_ns + 1, lambda channel: channel.type in KINDS)
+
+
+def _is_new(offset_ns: int, known: Iterable[int]) -> bool:
+    return all(abs(offset_ns - each) > SAME_NS // 2 for each in known)
+
+
+def _offsets(objects: Sequence[PastObject]) -> list[int]:
+    """How much later than their stamps messages of some objects arrived: 0, and what differs from that by more than a second."""
+    found = [0]
+    for one in objects:
+        if len(found) < MAX_OFFSETS and _is_new(one.late_ns, found) and abs(one.late_ns) > SAME_NS:
+            found.append(one.late_ns)
+    return found
+
+
+def _kept_times(row: Mapping[str, Any], by: str) -> tuple[int, int]:
+    """First and last of an object that is kept."""
+    start_ns, end_ns = row['t_start_ns'], row['t_end_ns'] or row['t_start_ns']
+    if by == BY_RECEIVED and (received_ns := row['received_start_ns']) is not None:
+        return received_ns, row['received_end_ns'] or received_ns
+    return start_ns, end_ns
+
+
+def _clock(asked: Mapping[str, Any]) -> str:
+    """Raises ValueError."""
+    if (by := asked.get('by', BY_STAMP)) not in CLOCKS:
+        raise ValueError(f'by is {" or ".join(CLOCKS)}')
+    return str(by)
 
 
 def _times(asked: Mapping[str, Any]) -> tuple[int, int]:

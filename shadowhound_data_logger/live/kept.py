@@ -82,8 +82,8 @@ class SpoolKept:
         found = self._read(lambda index: list(index.overview.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns)))
         return [
             {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
-             'where': ON_ROBOT}
-            for _, key, state, _, sensor, topic, _, size, start_ns, last_ns, *_ in found
+             'received_start_ns': received_ns, 'received_end_ns': received_end_ns, 'where': ON_ROBOT}
+            for _, key, state, _, sensor, topic, _, size, start_ns, last_ns, received_ns, received_end_ns, *_ in found
             if state == State.KEPT.value and want.takes(key, sensor, topic, start_ns, last_ns, {})
         ]  # fmt: skip
 

@@ -30,6 +30,7 @@ from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import BagDamaged, LakeError, SpoolError, StoreError
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, MOST_OBJECT_BYTES, is_path
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
 from shadowhound_data_logger.formats.rows import schema
@@ -58,7 +59,7 @@ MAX_BAGS: Final = 200
 _IN_KEY: Final = re.compile(r'/(\d{8})/(\d{6})(?:_(\d{3}))?[_.]', re.ASCII)
 _IN_BAG: Final = re.compile(r'_(\d{8})_(\d{6})(?:_\d+)?$', re.ASCII)
 _COLUMNS: Final = ('bucket', 'key', 'sensor', 'topic', 'type', 'bytes', 't_start_ns', 't_end_ns', 'mission_id', 'mission_type',
-                   'x', 'y', 'yaw', 'battery_pct')  # fmt: skip
+                   'x', 'y', 'yaw', 'battery_pct', 'received_start_ns', 'clock_offset_ns')  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,10 @@ class PastObject:
     pose: tuple[float, float, float] | None = None
     """x, y, yaw."""
     battery: float | None = None
+    late_ns: int = 0
+    """How much later than their stamps its messages arrived."""
+    offset_ns: int = 0
+    """To be added to the times in its content."""
     path: str = ''
     """Of its file in the spool; empty for what lies in the store alone."""
 
@@ -144,9 +149,10 @@ class PastSource(Protocol):
     def days(self, robot: str) -> list[str]:
         """Dates with something recorded, ``YYYY-MM-DD``."""
 
-    def day(self, robot: str, date: str) -> PastDay: ...
+    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
+        """The objects that begin on it, by their stamps or by the arrival of their messages."""
 
-    def gaps(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """As ``SpoolFigures.gaps``."""
 
 
@@ -239,42 +245,48 @@ class SpoolPast:
                 found.add(f'{utc(at_ns):%Y-%m-%d}')
         return sorted(found)
 
-    def day(self, robot: str, date: str) -> PastDay:
+    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
         """Raises SpoolError."""
-        return _kept(self._kept, date, lambda: self._read(robot, date))
+        return _kept(self._kept, f'{date} {by}', lambda: self._read(robot, date, by))
 
-    def _read(self, robot: str, date: str) -> PastDay:
+    def _read(self, robot: str, date: str, by: str) -> PastDay:
         begin_ns = date_ns(date)
         topics = {
             row.get('sensor'): topic for topic, row in read_status(self._spool, robot, self._clock).get('topics', {}).items()
         }
         with closing(self._index()) as index, _reading(self._spool):
-            found = [self._of_row(row) for row in index.overview.recorded(robot, begin_ns, begin_ns + DAY_NS)]
+            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, begin_ns + DAY_NS, by)]
             topics |= {one.sensor: one.topic for one in found if one.topic}
-            for bucket, key, sensor, size, settled_s in index.overview.recorded_compact(robot, date.replace('-', '')):
+            for bucket, key, sensor, size, settled_s, late_ms in _compact_rows(index, robot, begin_ns, by):
                 bag = key.partition('/rosbags/')[2].partition('/')[0]
-                at_ns = (_bag_begin(bag) if bag else _stamp(key)) or 0
+                late_ns = late_ms * (SECOND // 1000)
+                offset_ns = late_ns if by == BY_RECEIVED else 0
+                at_ns = ((_bag_begin(bag) if bag else _stamp(key)) or 0) + offset_ns
                 if begin_ns <= at_ns < begin_ns + DAY_NS:
                     end_ns = max(at_ns, settled_s * SECOND) if bag else at_ns
-                    found.append(PastObject(bucket, key, sensor, topics.get(sensor, ''), '', size, at_ns, end_ns))
+                    found.append(PastObject(bucket, key, sensor, topics.get(sensor, ''), '', size, at_ns, end_ns,
+                                            late_ns=late_ns, offset_ns=offset_ns))  # fmt: skip
         found.sort(key=lambda one: one.begin_ns)
         return _day(found[:MOST_ROWS], 'this is not all of the day' if len(found) > MOST_ROWS else '')
 
-    def _of_row(self, row: tuple[Any, ...]) -> PastObject:
-        """Of a row of ``Index.recorded``."""
-        bucket, key, state, reason, sensor, topic, kind, size, begin_ns, end_ns, mission, mission_type, pose, battery, content = (
-            row
-        )
+    def _of_row(self, row: tuple[Any, ...], by: str) -> PastObject:
+        """Of a row of ``OverviewTable.recorded``."""
+        (bucket, key, state, reason, sensor, topic, kind, size, begin_ns, end_ns, received_ns, received_end_ns, mission,
+         mission_type, pose, battery, content) = row  # fmt: skip
+        late_ns = 0 if received_ns is None else received_ns - begin_ns
+        offset_ns = late_ns if by == BY_RECEIVED else 0
+        if offset_ns:
+            begin_ns, end_ns = received_ns, received_end_ns or received_ns
         is_here = State(state) in HERE
         path = str(self._tree.path(State(state), reason, bucket, key)) if is_here else ''
         return PastObject(
             bucket, content or key, sensor, topic or '', kind or '', size, begin_ns, max(begin_ns, end_ns), mission or '',
-            mission_type or '', _pose(pose), _number(battery), path,
+            mission_type or '', _pose(pose), _number(battery), late_ns, offset_ns, path,
         )  # fmt: skip
 
-    def gaps(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """Raises SpoolError."""
-        return SpoolFigures(self._spool, robot, self._clock).gaps(begin_ns, end_ns)
+        return SpoolFigures(self._spool, robot, self._clock).gaps(begin_ns, end_ns, by)
 
     def _index(self) -> Index:
         """Raises SpoolError where there is none."""
@@ -313,11 +325,11 @@ class StorePast:
         found = dates(self._source, robot, (schema.OBJECTS, schema.KEPT), self._findings)
         return [date for date in found if date > schema.UNDATED]
 
-    def day(self, robot: str, date: str) -> PastDay:
+    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
         """Raises StoreError."""
-        return _kept(self._kept, f'{robot} {date}', lambda: self._read(robot, date))
+        return _kept(self._kept, f'{robot} {date} {by}', lambda: self._read(robot, date, by))
 
-    def _read(self, robot: str, date: str) -> PastDay:
+    def _read(self, robot: str, date: str, by: str) -> PastDay:
         import pyarrow as pa  # noqa: PLC0415 - the extra lake
         import pyarrow.compute as pc  # noqa: PLC0415
 
@@ -325,9 +337,12 @@ class StorePast:
         from shadowhound_data_logger.lake.views import rows_of  # noqa: PLC0415
 
         findings = Findings(lambda _: None)
-        where = f"date = '{date}' AND t_start_ns IS NOT NULL"
-        table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=date.__eq__, where=where,
-                        columns=_COLUMNS, order='t_start_ns, key', limit=MOST_ROWS)  # fmt: skip
+        where, has_date = f"date = '{date}' AND t_start_ns IS NOT NULL", date.__eq__
+        if by == BY_RECEIVED:  # the dates of rows are those of stamps
+            begin_ns = date_ns(date)
+            where, has_date = f't_start_ns >= {begin_ns} AND t_start_ns < {begin_ns + DAY_NS}', schema.UNDATED.__ne__
+        table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=has_date, where=where,
+                        columns=_COLUMNS, order='t_start_ns, key', limit=MOST_ROWS, by=by)  # fmt: skip
         begins = table['t_start_ns'].to_numpy()
         ends = np.maximum(begins, pc.fill_null(table['t_end_ns'], 0).to_numpy())
         names = pc.dictionary_encode(pc.coalesce(table['topic'], table['sensor'], pa.scalar(''))).combine_chunks()
@@ -337,11 +352,11 @@ class StorePast:
         return PastDay(begins, ends, [str(name) for name in names.dictionary.to_pylist()], codes, table,
                        problem or ('this is not all of the day' if len(table) >= MOST_ROWS else ''))  # fmt: skip
 
-    def gaps(self, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
+    def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """Raises StoreError."""
         from shadowhound_data_logger.lake import gaps as journal  # noqa: PLC0415 - pyarrow
 
-        rows = journal.newest(self._source, robot=robot, since_ns=begin_ns, findings=self._findings).to_pylist()
+        rows = journal.newest(self._source, robot=robot, since_ns=begin_ns, findings=self._findings, by=by).to_pylist()
         gaps = [
             (row['sink'], row['topic'], row['kind'] or '', row['cause'] or '', row['from_ns'], row['to_ns'], row['count'] or 0,
              row['grade'] or '')
@@ -390,6 +405,13 @@ def _reading(spool: Path) -> Iterator[None]:
         raise SpoolError(f'the index of {spool} cannot be read: {error}') from error
 
 
+def _compact_rows(index: Index, robot: str, begin_ns: int, by: str) -> Iterator[tuple[str, str, str, int, int, int]]:
+    """Of objects that may be of the day that begins then: their keys have the date of the stamp."""
+    around = (-DAY_NS, 0, DAY_NS) if by == BY_RECEIVED else (0,)
+    for step_ns in around:
+        yield from index.overview.recorded_compact(robot, f'{utc(begin_ns + step_ns):%Y%m%d}')
+
+
 def _day(found: list[PastObject], problem: str) -> PastDay:
     names = sorted({one.topic or one.sensor for one in found})
     places = {name: place for place, name in enumerate(names)}
@@ -404,7 +426,8 @@ def _of_catalog(row: Mapping[str, Any]) -> PastObject:
     return PastObject(
         row['bucket'], row['key'], row['sensor'] or '', row['topic'] or '', row['type'] or '', row['bytes'], row['t_start_ns'],
         max(row['t_start_ns'], row['t_end_ns'] or 0), row['mission_id'] or '', row['mission_type'] or '', pose,
-        row['battery_pct'],
+        row['battery_pct'], 0 if row['received_start_ns'] is None else row['received_start_ns'] - row['t_start_ns'],
+        row['clock_offset_ns'] or 0,
     )  # fmt: skip
 
 

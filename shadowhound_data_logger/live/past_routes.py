@@ -64,7 +64,7 @@ class PastRoutes:
             return await self._gaps_of_store(times)
         try:
             async with self._reading:
-                read = partial(self._figures.gaps, *times)
+                read = partial(self._figures.gaps, times[0], times[1])
                 return answer(await asyncio.get_running_loop().run_in_executor(self._pool, read), compress=True)
         except DataLoggerError as error:
             return problem(503, str(error))
@@ -84,4 +84,5 @@ class PastRoutes:
             return problem(400, str(error))
         if not is_name(robot) or None in times.values():
             return problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
-        return await self.ask(do, robot, times)
+        by = {'by': request.query['by']} if 'by' in request.query else {}
+        return await self.ask(do, robot, {**times, **by})

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.model import ObjectInfo, State
 from shadowhound_data_logger.spool.gap_table import GapTable
@@ -64,7 +65,9 @@ class HistoryTable(Table):
         is unchanged. Totals do not change.
         """
         rows = self._db.execute(
-            'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns FROM objects INDEXED BY settled'
+            'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns, ifnull(CASE WHEN json_valid(metadata) THEN'  # noqa: S608
+            f" CAST(json_extract(metadata, '$.{words.RECEIVED_START_NS}') AS INTEGER) - t_start_ns END, 0)"
+            ' FROM objects INDEXED BY settled'
             " WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns < ?"
             ' AND NOT EXISTS (SELECT 1 FROM uncataloged WHERE uncataloged.id = objects.id)'
             ' AND NOT EXISTS (SELECT 1 FROM unreported WHERE unreported.id = objects.id) ORDER BY settled_ns LIMIT ?',
@@ -72,7 +75,7 @@ class HistoryTable(Table):
         ).fetchall()
         folders: dict[tuple[str, str, str], int] = {}
         short = []
-        for number, bucket, key, sensor, state, size, sha256, settled_ns in rows:
+        for number, bucket, key, sensor, state, size, sha256, settled_ns, late_ns in rows:
             path, name = split(key)
             place = bucket, path, sensor
             if place not in folders:
@@ -80,8 +83,8 @@ class HistoryTable(Table):
                 query = 'SELECT id FROM folders WHERE bucket = ? AND path = ? AND sensor = ?'
                 folders[place] = self._db.execute(query, place).fetchone()[0]
             of = COMPACT_STATES.index(State(state))
-            short.append((folders[place], name, number, of, size, _digest(sha256), settled_ns // SECOND))
-        self._db.executemany('INSERT OR REPLACE INTO compact_objects VALUES (?,?,?,?,?,?,?)', short)
+            short.append((folders[place], name, number, of, size, _digest(sha256), settled_ns // SECOND, late_ns // 1_000_000))
+        self._db.executemany('INSERT OR REPLACE INTO compact_objects VALUES (?,?,?,?,?,?,?,?)', short)
         for table in ('contents', 'statistics', 'objects'):
             self._db.executemany(f'DELETE FROM {table} WHERE id = ?', ((row[0],) for row in rows))  # noqa: S608
         return len(rows) < COMPACT_STEP

@@ -8,11 +8,15 @@ from typing import Any, Final
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.spool.history_table import CATALOG
 from shadowhound_data_logger.spool.object_table import IN_SPOOL
 from shadowhound_data_logger.spool.table import Table, after
 
 _DESCRIBED: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
+_RECEIVED: Final = tuple(
+    f"CAST(json_extract(metadata, '$.{word}') AS INTEGER)" for word in (words.RECEIVED_START_NS, words.RECEIVED_END_NS)
+)
 
 
 class OverviewTable(Table):
@@ -46,24 +50,27 @@ class OverviewTable(Table):
             (state and state.value, sensor, prefix, prefix),
         )
 
-    def recorded(self, robot: str, begin_ns: int, end_ns: int) -> Iterator[tuple[Any, ...]]:
+    def recorded(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> Iterator[tuple[Any, ...]]:
         """Objects of a robot that are not lost and begin in this time, with what the catalog has of them, by time.
 
-        (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, mission_id, mission_type, pose, battery,
-        content_key); objects with a short row are not included.
+        (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, received_start_ns, received_end_ns,
+        mission_id, mission_type, pose, battery, content_key); objects with a short row are not included.
         """
+        start = f'ifnull({_RECEIVED[0]}, t_start_ns)' if by == BY_RECEIVED else 't_start_ns'
         described = ', '.join(f"json_extract(metadata, '$.{word}')" for word in _DESCRIBED)
         return self._db.execute(
-            f'SELECT bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, {described} FROM objects'  # noqa: S608
-            f" WHERE t_start_ns >= ? AND t_start_ns < ? AND key >= ? AND key < ? AND state <> 'evicted'"
-            f" AND sensor <> '{CATALOG}' AND json_valid(metadata) ORDER BY t_start_ns",
+            'SELECT bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns,'  # noqa: S608
+            f' {", ".join(_RECEIVED)}, {described} FROM objects'
+            f" WHERE {start} >= ? AND {start} < ? AND key >= ? AND key < ? AND state <> 'evicted'"
+            f" AND sensor <> '{CATALOG}' AND json_valid(metadata) ORDER BY {start}",
             (begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),
         )
 
-    def recorded_compact(self, robot: str, date: str) -> Iterator[tuple[str, str, str, int, int]]:
-        """(bucket, key, sensor, bytes, settled_s) of short rows of delivered objects in folders with this ``YYYYMMDD``."""
+    def recorded_compact(self, robot: str, date: str) -> Iterator[tuple[str, str, str, int, int, int]]:
+        """Short rows of delivered objects in folders with this ``YYYYMMDD``: (bucket, key, sensor, bytes, settled_s, late_ms)."""
         return self._db.execute(
-            'SELECT bucket, path || name, sensor, bytes, settled_s FROM folders JOIN compact_objects ON folder = folders.id'  # noqa: S608
+            'SELECT bucket, path || name, sensor, bytes, settled_s, late_ms FROM folders'  # noqa: S608
+            ' JOIN compact_objects ON folder = folders.id'
             f" WHERE path >= ? AND path < ? AND instr(path, ?) AND state <> 2 AND sensor <> '{CATALOG}'",
             (f'{robot}/', after(f'{robot}/'), date),
         )

@@ -97,6 +97,7 @@ CREATE TABLE compact_objects (
   bytes INTEGER NOT NULL,
   sha256 BLOB NOT NULL,
   settled_s INTEGER NOT NULL,
+  late_ms INTEGER NOT NULL,     -- how much later than its stamp its first message arrived; 0 if that is unknown
   PRIMARY KEY (folder, name)) WITHOUT ROWID;
 
 -- Delivered objects that no part of the catalog describes yet, and the statistics of their contents for it.

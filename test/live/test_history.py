@@ -107,8 +107,23 @@ def patrol(store: ObjectStore, folder: Path) -> None:
     add_part(store, rows, 'a', folder / 'tmp')
 
 
-def asked(history: PastReader, at_s: float) -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], bytes]]]:
-    head, body = history.moment('thor', NOON_NS + round(at_s * SECOND))
+LATE_S = 146
+
+
+def late_patrol(store: ObjectStore, folder: Path) -> None:
+    """As ``patrol``, of cameras whose stamps are far behind, and a bag of them; its log times are those of arrival."""
+    rows = []
+    for second in range(10):
+        received = str(NOON_NS + (second + LATE_S) * SECOND)
+        rows.append(
+            told(second, 'camera', '/camera', COMPRESSED_IMAGE, 'jpg', received_start_ns=received, received_end_ns=received)
+        )
+        add(store, folder / 'tmp', rows[-1]['key'], jpeg(20 * second))
+    add_part(store, [*rows, *bag(store, folder, 'late', 'bump', late_s=LATE_S)], 'a', folder / 'tmp')
+
+
+def asked(history: PastReader, at_s: float, by: str = 'stamp') -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], bytes]]]:
+    head, body = history.moment('thor', NOON_NS + round(at_s * SECOND), by)
     return head, items(body)
 
 
@@ -136,6 +151,71 @@ def test_the_past_of_a_store(store: ObjectStore, opened: Opened, tmp_path: Path)
     assert rows.tolist() == [noon + 1000 * second for second in range(6)]
     places = np.frombuffer(shown[''][1], '<f4').reshape(-1, 3)
     assert places[-1].tolist() == [5.0, 1.0, 0.5]
+
+
+def test_a_moment_is_of_the_clock_that_was_chosen(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Frames in objects and in bags whose stamps are 146 s behind: at its stamp or at its arrival, never both."""
+    late_patrol(store, tmp_path)
+    history = opened(StorePast())
+    for at_s in (0.0, 3.5, 9.0):
+        for by, late_s in (('stamp', 0), ('received', LATE_S)):
+            head, shown = asked(history, at_s + late_s, by)
+            assert shown['/camera'][1] == jpeg(20 * int(at_s))
+            assert [(topic, before) for topic, _, before, _ in head['shown']] == [('/camera', 1000 * (at_s % 1))]
+            assert '--by received' in dict(head['commands'])['query'] or by == 'stamp'
+    assert asked(history, LATE_S + 3.5)[0]['shown'] == asked(history, 3.5, 'received')[0]['shown'] == []
+    for by, late_s in (('stamp', 0), ('received', LATE_S)):
+        head, shown = asked(history, 20.55 + late_s, by)
+        assert shown['/bagged'][1] == jpeg(100)
+        ages = {topic: before for topic, _, before, _ in head['shown']}
+        assert ages['/bagged'] == pytest.approx(50)
+        cut = shlex.split(dict(head['commands'])['bag cut'])
+        start, end = cut[cut.index('--start') + 1], cut[cut.index('--end') + 1]
+        assert start <= f'{utc(NOON_NS + round((20.55 + LATE_S) * SECOND)):%Y-%m-%dT%H:%M:%S.%f}' <= end
+
+
+@pytest.mark.parametrize('by', ['stamp', 'received'])
+def test_the_timeline_is_of_the_clock_that_was_chosen(store: ObjectStore, opened: Opened, tmp_path: Path, by: str) -> None:
+    """What was recorded and what was lost are in the same place."""
+    late_patrol(store, tmp_path)
+    lost_late = {'received_from_ns': NOON_NS + (3 + LATE_S) * SECOND, 'received_to_ns': NOON_NS + (4 + LATE_S) * SECOND}
+    tell(folder_store(tmp_path), tmp_path, lost('1', 3, 4, cause='transport', topic='/camera', **lost_late))
+    noon = NOON_NS // 1_000_000
+    span = {'from': noon - 60_000, 'to': noon + 300_000}
+    found, _ = opened(StorePast()).answer({'do': 'timeline', 'robot': 'thor', 'by': by, **span})
+    begin = noon + (1000 * LATE_S if by == 'received' else 0)
+    assert found['recorded'] == [['/camera', begin, begin + 9000]]
+    assert [row[4:6] for row in found['gaps']] == [[begin + 3000, begin + 4000]]
+    with pytest.raises(ValueError, match='by is stamp or received'):
+        opened(StorePast()).answer({'do': 'timeline', 'robot': 'thor', 'by': 'log', **span})
+
+
+@pytest.mark.parametrize('is_compact', [False, True])
+def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_path: Path, *, is_compact: bool) -> None:
+    """Also what has a short row only, and what arrived on another day than its stamp."""
+    clock = FakeClock()
+    spool = new_spool(tmp_path / 'spool', clock)
+    spool.open()
+    late_ns = 13 * 3600 * SECOND
+    try:
+        metadata = {'received_start_ns': str(NOON_NS_OF_SPOOL + late_ns), 'received_end_ns': str(NOON_NS_OF_SPOOL + late_ns)}
+        (item,) = put(spool, make('thor/camera/20251018/120000_front.jpg', jpeg(60), t_start_ns=NOON_NS_OF_SPOOL,
+                                  t_end_ns=NOON_NS_OF_SPOOL, topic='/camera', metadata=metadata))  # fmt: skip
+        add(store, tmp_path / 'tmp', item.key, item.path.read_bytes())
+        settle(spool, item, State.DELIVERED)
+    finally:
+        spool.close()
+    with index_of(tmp_path / 'spool') as index:
+        index.catalog.clear()
+        with index.transaction():
+            if is_compact:
+                index.history.compact(clock.wall_ns() + 1)
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
+    for by, at_ns in (('stamp', NOON_NS_OF_SPOOL), ('received', NOON_NS_OF_SPOOL + late_ns)):
+        head, _ = history.moment('thor', at_ns + SECOND, by)
+        assert [shown[1:3] for shown in head['shown']] == [['camera', 1000.0]]
+        other, _ = history.moment('thor', at_ns + SECOND, 'stamp' if by == 'received' else 'received')
+        assert other['shown'] == []
 
 
 def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
@@ -170,7 +250,7 @@ def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path)
 NOON_NS_OF_SPOOL = 1_760_788_800 * SECOND
 
 
-def recorded(path: Path, begin_s: float, seconds: int = 1) -> Any:
+def recorded(path: Path, begin_s: float, seconds: int = 1, late_s: float = 0) -> Any:
     """A slice with ten frames and a hundred samples of an IMU a second, in chunks of 64 KiB."""
     camera, imu = (Channel(topic, kind, 'ros2msg', '', '', '') for topic, kind in (('/bagged', COMPRESSED_IMAGE), ('/imu', IMU)))
     vector, turn = (
@@ -183,18 +263,19 @@ def recorded(path: Path, begin_s: float, seconds: int = 1) -> Any:
     still = cdr(sample, IMU)
     for number in range(100 * seconds):
         at_ns = NOON_NS + round((begin_s + number / 100) * SECOND)
-        writer.write(imu, at_ns, at_ns, number, still)
+        log_ns = at_ns + round(late_s * SECOND)
+        writer.write(imu, log_ns, at_ns, number, still)
         if number % 10 == 0:
             shade = jpeg(2 * (number % 100))
             frame = new(COMPRESSED_IMAGE, header=header(), format='jpeg', data=np.frombuffer(shade, np.uint8))
-            writer.write(camera, at_ns, at_ns, number, cdr(frame, COMPRESSED_IMAGE))
+            writer.write(camera, log_ns, at_ns, number, cdr(frame, COMPRESSED_IMAGE))
     return writer.close()
 
 
-def bag(store: ObjectStore, folder: Path, name: str, event: str, seconds: int = 1) -> list[Row]:
+def bag(store: ObjectStore, folder: Path, name: str, event: str, seconds: int = 1, late_s: float = 0) -> list[Row]:
     """A whole bag of one slice in the store; the rows of its files."""
     (folder / 'tmp').mkdir(exist_ok=True)
-    info = recorded(folder / 'tmp' / f'{name}_0.mcap', 20.0, seconds)
+    info = recorded(folder / 'tmp' / f'{name}_0.mcap', 20.0, seconds, late_s)
     key = f'thor/rosbags/{name}/{name}_0.mcap'
     trigger = TriggerOf(event, 'service', NOON_NS + 20 * SECOND, HOSTILE)
     manifest = Manifest(name, 'thor', MissionOf('patrol', 'm1', None), COMPLETE, (), (), (SliceEntry.of(info, key),),

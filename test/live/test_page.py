@@ -26,9 +26,9 @@ import pytest
 from domains import free_domain
 from e2e.machines import ROBOT, Machines
 from e2e.processes import Node, Processes, until
-from lake.making import add, add_part, folder_store
+from lake.making import NOON_NS, add, add_part, folder_store
 from lake.test_pull import Field
-from live.test_history import ODOMETRY, jpeg, odometry, patrol, told
+from live.test_history import LATE_S, ODOMETRY, jpeg, late_patrol, odometry, patrol, told
 from live.test_kinds import cdr, header, new
 from ros.ports import locked
 from spool.test_status import written
@@ -958,6 +958,32 @@ def played(page: Page, seconds: int) -> tuple[float, float]:
     }"""
     hz, pace = page.evaluate(script, seconds)
     return hz, pace
+
+
+def test_the_past_by_arrival(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of frames whose stamps are behind: timeline, moment and command are of the time that was chosen, and so are their ages."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    with closing(open_store(folder_store(tmp_path), UploadSettings())) as store:
+        late_patrol(store, tmp_path)
+    store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
+    served = Served(store_page, monkeypatch)
+    noon = NOON_NS // 1_000_000
+    bars = '[...document.querySelectorAll(\'rect.recorded[data-topic="/camera"]\')].map(bar => Number(bar.dataset.from))'
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, f'{bars}[0] === {noon}')
+        page.get_by_label('By which time of the messages').select_option('received')
+        holds(page, f'{bars}[0] === {noon + 1000 * LATE_S}')
+        press(page.get_by_role('button', name='10 seconds back'))
+        holds(page, "document.querySelector('[data-command=query]').textContent.includes('--by received')")
+        assert page.locator('[data-act=label]').count() == 0
+        page.get_by_label('By which time of the messages').select_option('stamp')
+        holds(page, f'{bars}[0] === {noon}')
+        assert page.wrong == []
+        page.close()
+    finally:
+        served.close()
 
 
 def test_the_page_of_a_store(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

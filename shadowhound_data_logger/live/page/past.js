@@ -12,6 +12,7 @@ export const problem = signal('');
 export const busy = signal(false);
 export const playing = signal(false);
 export const speed = signal(1);
+export const clock = signal('stamp'); // by which of the two times of its messages a moment is shown: stamp, or received
 export const robots = signal([]);
 export const days = signal([]);
 
@@ -44,7 +45,7 @@ function parts(content) {
   return [head, items];
 }
 
-const read = async (robot, at) => parts(await (await ask('moment', { robot, at: Math.round(at) })).arrayBuffer());
+const read = async (robot, at) => parts(await (await ask('moment', { robot, at: Math.round(at), by: clock.value })).arrayBuffer());
 
 let wanted = null;
 let asking = false;
@@ -82,6 +83,13 @@ export function go(robot, at) {
   load();
 }
 
+export function showBy(chosen) {
+  clock.value = chosen;
+  ahead = null;
+  if (range.value) look(range.value.robot, range.value.from, range.value.to);
+  if (past.value) go(past.value.robot, past.value.at);
+}
+
 export function leave() {
   batch(() => {
     past.value = range.value = told.value = wanted = null;
@@ -95,7 +103,7 @@ export async function look(robot, from, to) {
   const mine = (loading += 1);
   range.value = { robot, from, to };
   try {
-    const found = await (await ask('timeline', { robot, from: Math.round(from), to: Math.round(to) })).json();
+    const found = await (await ask('timeline', { robot, from: Math.round(from), to: Math.round(to), by: clock.value })).json();
     if (mine !== loading || range.value === null) return;
     told.value = found;
     problem.value = '';

@@ -1,6 +1,8 @@
 // What was recorded and what is missing, by topic and time: of today beside the live view, of any day when looking back.
 import { html, useEffect, useRef, useState } from './vendor/preact.js';
-import { busy, days, go, leave, list, look, openDay, openRobot, past, playing, problem as pastProblem, range, robots, speed, told } from './past.js';
+import {
+  busy, clock as shownBy, days, go, leave, list, look, openDay, openRobot, past, playing, problem as pastProblem, range, robots, showBy, speed, told,
+} from './past.js';
 import { Pull } from './pull.js';
 import { clock, digits, meaning, moment, shade, span } from './words.js';
 
@@ -88,6 +90,8 @@ function Transport({ robot }) {
     <button type="button" onClick=${() => step(1000)} aria-label="1 second on">+1 s</button>
     <button type="button" onClick=${() => step(10000)} aria-label="10 seconds on">+10 s</button>
     <select aria-label="How fast" value=${speed.value} onChange=${(event) => { speed.value = Number(event.target.value); }}>${SPEEDS.map((each) => html`<option value=${each}>${each}×</option>`)}</select>
+    <select aria-label="By which time of the messages" value=${shownBy.value} onChange=${(event) => showBy(event.target.value)}>
+      <option value="stamp">by stamp</option><option value="received">by arrival</option></select>
     <time class="moment" data-moment=${Math.round(at)}>${moment(at)}</time><span class="unit">UTC${past.value.mission ? ` · ${past.value.mission}` : ''}${busy.value ? ' · reading…' : ''}</span></div>`;
 }
 
@@ -131,6 +135,7 @@ export function Timeline({ session }) {
   const drags = useRef(false);
   const lately = useRef(null); // what the robot's clock was, and when: { now, at }
   const isPast = past.value !== null;
+  const isByArrival = shownBy.value === 'received';
 
   useEffect(() => {
     if (!isPast) return undefined;
@@ -246,8 +251,9 @@ export function Timeline({ session }) {
       ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${leave}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
     </div>
     ${isPast && html`<${Transport} robot=${robot} />`}
-    ${isPast && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} begin=${begin} setBegin=${setBegin} />`}
-    ${isPast && html`<${Pull} session=${session} robot=${robot} begin=${begin} />`}
+    ${isPast && isByArrival && session.role === 'operator' && html`<p class="note">Labels and requests are by stamp.</p>`}
+    ${isPast && !isByArrival && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} begin=${begin} setBegin=${setBegin} />`}
+    ${isPast && !isByArrival && html`<${Pull} session=${session} robot=${robot} begin=${begin} />`}
     <div ref=${box} class="timeline-box">
       ${problem && html`<p class="note bad" role="alert">${problem}</p>`}
       ${isPast && found?.problem && html`<p class="note watch">${found.problem}</p>`}
