@@ -24,7 +24,7 @@ from shadowhound_data_logger.core.errors import LakeError, PolicyRefused, StoreE
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
+from shadowhound_data_logger.formats.rows.gaps import COMPLETE, GAP, GAPS
 from shadowhound_data_logger.formats.rows.labels import LABELS
 from shadowhound_data_logger.formats.rows.schema import COLUMNS, FORGOTTEN, OBJECTS
 from shadowhound_data_logger.lake import labels
@@ -386,11 +386,14 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
         rows = rows.filter(pc.greater_equal(rows['to_ns'], asked.since_ns))
     if asked.until_ns is not None:
         rows = rows.filter(pc.less(rows['from_ns'], asked.until_ns))
-    marks = pa.Table.from_pylist(watermarks(rows.to_pylist()), schema=rows.schema)
+    marks = pa.Table.from_pylist(watermarks(rows.filter(pc.equal(rows['what'], COMPLETE)).to_pylist()), schema=rows.schema)
     gaps = rows.filter(pc.equal(rows['what'], GAP))
     if asked.mission is not None:
         gaps = gaps.filter(pc.starts_with(gaps['mission_id'], asked.mission))
-    return {'gaps': gaps.select(_GAP_COLUMNS), 'watermarks': marks.select(_WATERMARK_COLUMNS)}
+    return {
+        'gaps': gaps.select(_GAP_COLUMNS),
+        'watermarks': pa.Table.from_pylist(marks, schema=rows.schema).select(_WATERMARK_COLUMNS),
+    }
 
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
