@@ -386,14 +386,12 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
         rows = rows.filter(pc.greater_equal(rows['to_ns'], asked.since_ns))
     if asked.until_ns is not None:
         rows = rows.filter(pc.less(rows['from_ns'], asked.until_ns))
-    marks = pa.Table.from_pylist(watermarks(rows.filter(pc.equal(rows['what'], COMPLETE)).to_pylist()), schema=rows.schema)
+    completes = rows.filter(pc.equal(rows['what'], COMPLETE)).to_pylist()
+    marks = pa.Table.from_pylist(watermarks(completes), schema=rows.schema)
     gaps = rows.filter(pc.equal(rows['what'], GAP))
     if asked.mission is not None:
         gaps = gaps.filter(pc.starts_with(gaps['mission_id'], asked.mission))
-    return {
-        'gaps': gaps.select(_GAP_COLUMNS),
-        'watermarks': pa.Table.from_pylist(marks, schema=rows.schema).select(_WATERMARK_COLUMNS),
-    }
+    return {'gaps': gaps.select(_GAP_COLUMNS), 'watermarks': marks.select(_WATERMARK_COLUMNS)}
 
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
