@@ -59,8 +59,8 @@ def run(folder: Path, odom_skip: int, seconds: float) -> dict[str, Any]:
 
 def _floor(node: Program, world: World) -> float:
     """Seconds of CPU of the intake and of threads that are not the node's own, which are those of the middleware."""
-    told = status.read(world.spool, ROBOT, SystemClock.of_this_machine()).get('workers', {})
-    ours = {'main', *(name[:COMM_BYTES] for name in told)} - {INTAKE}
+    workers = status.read(world.spool, ROBOT, SystemClock.of_this_machine()).node.workers
+    ours = {'main', *(name[:COMM_BYTES] for name in workers)} - {INTAKE}
     return sum(used for name, used in _proc.threads(node.pid).items() if name not in ours)
 
 

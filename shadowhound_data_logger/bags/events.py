@@ -13,9 +13,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, TriggerOf
 from shadowhound_data_logger.bags.place import BagPlace
@@ -26,6 +26,7 @@ from shadowhound_data_logger.bags.ring import Claims, Ring
 from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.options import BagSettings, EventSettings
+from shadowhound_data_logger.core.status import EventStatus, Trigger
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.folder import safe_type
 
@@ -43,26 +44,6 @@ FLUSH_S: Final = 5.0
 MAX_WAIT_NS: Final = 24 * 3600 * SECOND
 """No trigger waits longer for its event; a difference beyond it is one between two clocks."""
 PATIENCE_S: Final = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class EventStatus:
-    """Ring and events at one instant."""
-
-    enabled: bool
-    seconds: float = 0.0
-    """In the ring, from the oldest message to the newest."""
-    bytes: int = 0
-    max_bytes: int = 0
-    bag: str = ''
-    """Which is written now."""
-    refused: str = ''
-    """Why the disk takes nothing of it now."""
-    triggers: int = 0
-    written: int = 0
-    """Events that ended."""
-    last: Mapping[str, str] = field(default_factory=dict)
-    """The last trigger: name, by, time, bag."""
 
 
 @dataclass(slots=True)
@@ -109,7 +90,7 @@ class Events:
         self._ended.set()
         self._due_s = 0.0
         self._triggers = self._written = 0
-        self._last: Mapping[str, str] = {}
+        self._last = Trigger()
         self._worker = Worker('event-writer', self._step, patience_s=PATIENCE_S)
 
     @property
@@ -139,14 +120,14 @@ class Events:
         self._settings = settings
         self._ring.max_bytes, self._ring.keep_s = settings.max_bytes, settings.pre_s + NOTICE_S
 
-    def on_mission(self, told: Mapping[str, Any]) -> None:
-        """Which mission is active now (``MissionWatch.status``); empty for none."""
-        self._mission = MissionOf(told['type'], told['mission_id'], told.get('run_id')) if told else None
+    def on_mission(self, mission: MissionOf | None) -> None:
+        """The mission that is active now."""
+        self._mission = mission
 
     def status(self) -> EventStatus:
         """From any thread."""
         if not self._settings.enabled:
-            return EventStatus(enabled=False)
+            return EventStatus()
         event, ring = self._current, self._ring
         refused = '' if event is None else event.refused or (event.recording.refused if event.recording is not None else '')
         return EventStatus(
@@ -180,7 +161,7 @@ class Events:
             else:
                 self._waiting.append(said)
                 text = f'another event follows {event.bag}, which is as long as it may be'
-            self._last = {'name': name, 'by': by, 'time': iso(said.at_ns), 'bag': event.bag}
+            self._last = Trigger(name, by, iso(said.at_ns), event.bag)
             self._wake.set()
         log.info('event %s (%s): %s', name, by, text)
         return True, text

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.place import BagPlace
@@ -20,6 +20,7 @@ from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core.options import BagSettings
+from shadowhound_data_logger.core.status import BagStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.spool.accounts import BAG
 
@@ -36,24 +37,6 @@ SERVICE, MISSION, ALWAYS = 'service', 'mission', 'always'
 """Who began a recording; also the settings' words for when one begins."""
 Answer = tuple[bool, str]
 """Whether it was done, and what, in words."""
-
-
-@dataclass(frozen=True, slots=True)
-class BagStatus:
-    """The recording at one instant; all but ``recording`` and ``error`` are of the bag that is recorded."""
-
-    recording: bool
-    paused: bool = False
-    bag: str = ''
-    slice: int = 0
-    """Number of the newest one, from 0."""
-    messages: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    duration_s: float = 0.0
-    queue_bytes: int = 0
-    refused: str = ''
-    """Why the disk takes nothing now."""
 
 
 @dataclass(slots=True)
@@ -115,7 +98,7 @@ class Recorder:
         """From any thread."""
         current = self._current
         if current is None:
-            return BagStatus(recording=False)
+            return BagStatus()
         recording = current.recording
         return BagStatus(
             recording=True, paused=self._queue.paused, bag=recording.state.bag, slice=max(0, recording.number),
@@ -164,9 +147,8 @@ class Recorder:
             self._queue.paused = paused
             return True, f'{self._current.recording.state.bag} is {"paused" if paused else "recorded"}'
 
-    def on_mission(self, told: Mapping[str, Any]) -> None:
-        """Which mission is active now (``MissionWatch.status``); empty for none."""
-        mission = MissionOf(told['type'], told['mission_id'], told.get('run_id')) if told else None
+    def on_mission(self, mission: MissionOf | None) -> None:
+        """The mission that is active now."""
         with self._control:
             before, self._mission = self._mission, mission
             current = self._current

@@ -26,7 +26,8 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.stamps import SAME_NS, describe
+from shadowhound_data_logger.core.dataclass_json import parse
+from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
@@ -204,7 +205,7 @@ def notes(found: Mapping[str, Any]) -> list[str]:
         if row.get('corrected'):
             lines.append(f'{topic}: of the stored messages, corrected: {_listed(row["corrected"])}')
         if row.get('stamps'):
-            lines.append(f'{topic}: {describe(row["stamps"])}')
+            lines.append(f'{topic}: {describe(parse(StampReport, row["stamps"]))}')
         if row.get('by_arrival'):
             lines.append(f'{topic}: dated by arrival, not by the message: {_listed(row["by_arrival"])}')
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
@@ -273,8 +274,9 @@ def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> 
 
 
 def _lossy(name: str, row: Mapping[str, Any]) -> str:
-    is_loss = name in LOSSES and (row[name] or row.get(f'{name}_estimated'))
-    return f'[yellow]{figure(row, name)}[/]' if is_loss else figure(row, name)
+    exact, estimated = row[name], row.get(f'{name}_estimated')
+    is_loss = name in LOSSES and (exact or estimated)
+    return f'[yellow]{figure(exact, estimated)}[/]' if is_loss else figure(exact, estimated)
 
 
 def _listed(counts: Mapping[str, int], mark: str = '') -> str:

@@ -114,10 +114,9 @@ def counted(count: int, noun: str) -> str:
     return f'{number(count)} {noun}{"s" * (count != 1)}'
 
 
-def figure(row: Mapping[str, Any], name: str) -> str:
-    """A figure of a ledger or a status: ``~12`` where it is estimated, a dash where it is not known."""
-    about = row.get(f'{name}_estimated')
-    return number(row[name]) if about is None else f'~{about:,}'
+def figure(exact: int | None, estimated: int | None) -> str:
+    """A figure of a ledger or a status: ``~12`` if it is estimated, a dash if it is unknown."""
+    return number(exact) if estimated is None else f'~{estimated:,}'
 
 
 def unsure(grades: Sequence[str]) -> str:

@@ -158,7 +158,7 @@ def _overview(folder: Path, *, as_json: bool) -> ExitCode:
     clock = SystemClock.of_this_machine()
     with _opened(folder) as index:
         found = usage_by_sensor(index)
-    running = [name for name in robots(folder) if read_status(folder, name, clock)['running']]
+    running = [name for name in robots(folder) if read_status(folder, name, clock).running]
     quarantined = sum(usage.objects for usage in found if usage.state == State.QUARANTINED.value)
     if as_json:
         said = [{**asdict(usage), 'oldest': iso(usage.oldest_ns)} for usage in found]

@@ -8,31 +8,15 @@ from __future__ import annotations
 
 import logging
 import threading
-from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock
+from shadowhound_data_logger.core.status import ClockState
 
 log = logging.getLogger(__name__)
 
 STEP_NS: Final = SECOND
 """A clock that is slewed (at most 0.5 ms a second) never moves so far between two looks."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockState:
-    """What is known of the wall clock at one instant."""
-
-    is_set: bool
-    gave_up: bool
-    """Whether it was not set for so long that nothing is held for it any more."""
-    unset_s: float
-    """How long it has not been set, as far as this process knows; 0 when it is set."""
-    steps: int
-    """Steps so far; the first setting is one."""
-    last_step_s: float | None
-    """By how much it stepped last, seconds."""
-    last_step_age_s: float | None
 
 
 class ClockWatch:

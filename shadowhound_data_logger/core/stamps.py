@@ -12,9 +12,8 @@ listed in docs/formats.md:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, SECOND, Clock, iso
 
@@ -216,7 +215,8 @@ class StampTrack:
         return offset_ns > known_ns and stamp_ns > self._newest_ns  # late, but in order: a queue that was held up
 
 
-class StampReport(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class StampReport:
     """What is wrong with the stamps of a publisher, or unusual; the field names are those of ``status --json``."""
 
     publisher: str | None
@@ -242,18 +242,18 @@ CAUSES: Final = {
 }
 
 
-def describe(report: Mapping[str, Any]) -> str:
+def describe(report: StampReport) -> str:
     """What is said of a report, after the names of the topics: ``... stamps are 146.0 s older than their arrival since ...``."""
-    offset_s, since = report['offset_s'], iso(report['since_ns'])
-    if report['state'] == OFFSET:
+    offset_s, since = report.offset_s, iso(report.since_ns)
+    if report.state == OFFSET and offset_s is not None:
         what = f'stamps are {abs(offset_s):,.1f} s {"older" if offset_s > 0 else "newer"} than their arrival since {since}'
     else:
         what = {
             ERRATIC: 'stamps jump back and forth', STUCK: 'stamps do not advance', UNSET: 'stamps are before 2024',
             TOO_OLD: 'stamps are too old to be trusted', AHEAD: 'stamps are too far in the future to be trusted',
-        }.get(report['state'], f'stamps are {report["state"]}')  # fmt: skip
+        }.get(report.state, f'stamps are {report.state}')  # fmt: skip
         what += f' since {since}, messages are dated by their arrival'
-    return f'{what}: {CAUSES.get(report["cause"], "the cause is unknown")}'
+    return f'{what}: {CAUSES.get(report.cause, "the cause is unknown")}'
 
 
 class StampTracks:

@@ -11,11 +11,11 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.core.errors import DataLoggerError
+from shadowhound_data_logger.core.status import WorkerStatus
 
 log = logging.getLogger(__name__)
 
@@ -24,25 +24,6 @@ LONGEST_PAUSE_S: Final = 5.0
 DIED: Final = 'died'
 SYSTEM_NAME: Final = Path('/proc/thread-self/comm')
 """Where Linux keeps the name of the thread that asks (proc(5)), as ``top -H`` shows it; CPython tells it since 3.14 only."""
-
-
-@dataclass(frozen=True, slots=True)
-class WorkerStatus:
-    """A thread at one instant."""
-
-    alive: bool
-    failing: bool
-    """Whether the last round failed, or the thread ended on its own."""
-    failures: int
-    """Failed rounds and deaths."""
-    deaths: int
-    """How often the thread itself ended on its own."""
-    last_error: str
-    """The newest failure; it may be over."""
-    busy_s: float
-    """For how long the round under way has lasted."""
-    patience_s: float | None
-    """What is too long for one round; None where any length is fine."""
 
 
 class Worker:

@@ -201,16 +201,16 @@ def _proxies(context: Context) -> Iterator[Result]:
 def _node(context: Context) -> Iterator[Result]:
     """The node that runs may have been started with other variables, or with keys that were changed since."""
     found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
-    if not found['running']:
+    if not found.running:
         return
-    theirs = variables(context.root, found['pid'])
+    theirs = variables(context.root, found.node.pid)
     # Without an endpoint here, 'environment.endpoint' has said so, and the keys with it.
     compared = [name for name in SHARED if context.settings.store.endpoint_url or not name.startswith('AWS_')]
     other = [name for name in compared if theirs and _value(theirs, name) != _value(context.environ, name)]
     if other:
         yield warning(
             'environment.node',
-            f'the node (process {found["pid"]}) has another {" and ".join(other)} than this shell',
+            f'the node (process {found.node.pid}) has another {" and ".join(other)} than this shell',
             'it was started elsewhere, or before a change: what works here may not work there',
             f'{OF_THE_NODE}  # if this shell is right instead: sudo systemctl restart shadowhound-data-logger',
         )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.status import MiddlewareStatus
 from shadowhound_data_logger.doctor.machine import MAX_DOMAIN, Process, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, of_error, ok, warning
 from shadowhound_data_logger.node.intake.middleware import Middleware, choose
@@ -42,10 +43,10 @@ def middleware(context: Context) -> Middleware:
     return choose(context.settings.capture.rmw, context.environ)
 
 
-def running(context: Context) -> Mapping[str, Any] | None:
-    """The middleware of the node that runs, as its status has it; None where none runs that says so."""
+def running(context: Context) -> MiddlewareStatus | None:
+    """The middleware of the running node, from its status; None if none runs."""
     found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
-    return found['middleware'] if found['running'] and found['middleware']['rmw'] else None
+    return found.node.middleware if found.running and found.node.middleware.rmw else None
 
 
 def _listens(context: Context) -> Result:
@@ -55,9 +56,8 @@ def _listens(context: Context) -> Result:
         here = middleware(context)
     except SettingError as problem:
         return of_error(name, problem, 'the node does not start with it')
-    rmw, robot, why, asked = (
-        (here.rmw, here.robot, here.why, here.asked) if node is None else (node[key] for key in ('rmw', 'robot', 'why', 'asked'))
-    )
+    chosen = node or here
+    rmw, robot, why, asked = chosen.rmw, chosen.robot, chosen.why, chosen.asked
     because = f"the robot's is {robot}: {why}" if rmw != robot else why
     verb = 'listens' if node is not None else 'would listen'
     return ok(name, f'the node {verb} by {rmw} ({because}); capture.rmw is {asked}', rmw=rmw, robot=robot, asked=asked)

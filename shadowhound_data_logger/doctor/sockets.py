@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.options import IMAGE, POINT_CLOUD
+from shadowhound_data_logger.core.status import MiddlewareStatus
 from shadowhound_data_logger.doctor.machine import Process, number, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, middleware, running
@@ -46,7 +47,7 @@ def check(context: Context) -> Iterator[Result]:
     driver = processes(context.root, *DRIVERS)
     robot = context.environ.get('RMW_IMPLEMENTATION', '')
     node = running(context)
-    rmw = node['rmw'] if node is not None else _rmw(context)
+    rmw = node.rmw if node is not None else _rmw(context)
     if 'cyclone' in robot or 'cyclone' in rmw:
         yield _obtained(context, node)
         yield from _cyclone(context, listens='cyclone' in rmw)
@@ -70,21 +71,21 @@ def _rmw(context: Context) -> str:
         return ''
 
 
-def _obtained(context: Context, node: Mapping[str, Any] | None) -> Result:
+def _obtained(context: Context, node: MiddlewareStatus | None) -> Result:
     """The receive buffer of the node that runs, else what the kernel would give, where a driver with Cyclone DDS is heard."""
     name, limit = 'sockets.buffer', number(context.root / 'proc/sys/net/core/rmem_max')
     cause = (
         'Cyclone DDS sends all over UDP: clouds and raw images are cut into fragments, and one that finds no room costs all of it'
     )
-    size = (node or {}).get('receive_bytes') or limit
+    size = (node.receive_bytes if node is not None else None) or limit
     if size is None:
         return info(name, 'net.core.rmem_max cannot be read here')
     figures: dict[str, Any] = {'rmem_max': limit}
-    if node is not None and node['receive_bytes']:
-        seen = f'the node has a receive buffer of {size:,} bytes ({node["rmw"]})'
-        figures |= {'receive_bytes': size, 'dropped_datagrams': node['dropped_datagrams']}
-        if node['dropped_datagrams']:
-            seen += f', in which {node["dropped_datagrams"]:,} datagrams found no room since its start'
+    if node is not None and node.receive_bytes:
+        seen = f'the node has a receive buffer of {size:,} bytes ({node.rmw})'
+        figures |= {'receive_bytes': size, 'dropped_datagrams': node.dropped_datagrams}
+        if node.dropped_datagrams:
+            seen += f', in which {node.dropped_datagrams:,} datagrams found no room since its start'
     else:
         seen = f'net.core.rmem_max is {size:,} bytes'
     if size < MIN_BUFFER <= (limit or 0):

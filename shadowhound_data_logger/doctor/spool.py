@@ -10,12 +10,13 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.status import NodeStatus, SpoolStatus, UnheardTopic
 from shadowhound_data_logger.doctor.machine import command, lock_holder
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.node.intake.unheard import REMEDY
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
+from shadowhound_data_logger.spool.usage import usage_of
 
 NAME: Final = 'spool'
 OLD_S: Final = 600.0
@@ -32,8 +33,8 @@ STORE: Final = 'shadowhound-data doctor --only s3 --only network'
 def check(context: Context) -> Iterator[Result]:
     """See the module."""
     folder, robot = context.settings.spool_path, context.settings.robot
-    found = status.read(folder, robot, SystemClock.of_this_machine())
-    yield from _node(found, folder)
+    report = status.read(folder, robot, SystemClock.of_this_machine())
+    yield from _node(report, folder)
     path = folder / 'index.db'
     if not path.is_file():
         yield info(
@@ -53,12 +54,12 @@ def check(context: Context) -> Iterator[Result]:
         return
     yield ok('spool.index', 'the index is whole')
     yield _ledger(accounts, path)
-    yield _backlog(usage, context, runs=found['running'])
+    yield _backlog(usage, context, runs=report.running)
     yield from _quarantine(quarantined)
-    yield from _lock(folder, found, context.root)
+    yield from _lock(folder, report, context.root)
 
 
-def _index(path: Path) -> tuple[SpoolUsage, dict[str, int]]:
+def _index(path: Path) -> tuple[SpoolStatus, dict[str, int]]:
     """What lies there, and objects in quarantine by reason; raises sqlite3.Error for a damaged file."""
     index = Index(path, read_only=True)
     try:
@@ -69,66 +70,65 @@ def _index(path: Path) -> tuple[SpoolUsage, dict[str, int]]:
         index.close()
 
 
-def _node(found: Mapping[str, Any], folder: Path) -> Iterator[Result]:
-    if found['state'] == status.NOT_RUNNING:
+def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
+    node = report.node
+    if report.state == status.NOT_RUNNING:
         yield warning(
-            'node.running', f'the node of {found["robot"]} does not run here', f'by {status.file(folder, found["robot"])}', START
+            'node.running', f'the node of {report.robot} does not run here', f'by {status.file(folder, report.robot)}', START
         )
         return
-    if found['state'] == status.NOT_ANSWERING:
+    if report.state == status.NOT_ANSWERING:
         yield error(
             'node.running',
-            f'the node (process {found["pid"]}) has been silent for {found["age_s"]:.0f} s',
+            f'the node (process {node.pid}) has been silent for {report.age_s:.0f} s',
             'it hangs: in a disk that does not answer, say',
-            f'kill -INT {found["pid"]} ; {START}',
+            f'kill -INT {node.pid} ; {START}',
         )
         return
-    yield ok('node.running', f'the node of {found["robot"]} runs (process {found["pid"]})')
-    store = found['store']
-    if store['state'] not in status.FINE_STORE:
+    yield ok('node.running', f'the node of {report.robot} runs (process {node.pid})')
+    store = node.store
+    if store.state not in status.FINE_STORE:
         yield warning(
             'node.delivery',
-            f'delivery: {str(store["state"]).replace("_", " ")}',
-            store['last_error'] or 'the node does not say why',
+            f'delivery: {store.state.replace("_", " ")}',
+            store.last_error or 'the node does not say why',
             STORE,
         )
-    yield from _unheard(found['middleware']['unheard'] or {})
-    yield from _front(found)
-    missed = {
-        topic: (row['missed'] or row['missed_estimated'] or 0) + row['dropped'] + row['rejected']
-        for topic, row in found['topics'].items()
-    }
-    said = tuple(row['text'] for row in (found['middleware']['unheard'] or {}).values())
-    for text in found['findings']:
-        if not text.startswith(('delivery:', 'front fails:', *said)):
+    unheard = node.middleware.unheard or {}
+    yield from _unheard(unheard)
+    yield from _front(node)
+    missed = {topic: (row.missed or row.missed_estimated or 0) + row.dropped + row.rejected for topic, row in node.topics.items()}
+    listed = tuple(row.text for row in unheard.values())
+    for text in report.findings:
+        if not text.startswith(('delivery:', 'front fails:', *listed)):
             yield warning('node.status', text, 'said by the node itself', _status_remedy(text), lost=sum(missed.values()))
 
 
-def _unheard(topics: Mapping[str, Any]) -> Iterator[Result]:
+def _unheard(topics: Mapping[str, UnheardTopic]) -> Iterator[Result]:
     for row in topics.values():
         yield error(
             'node.unheard',
-            f'{row["text"]}, for {row["seconds"]} s now',
+            f'{row.text}, for {row.seconds} s now',
             'the profile of the node looks at other interfaces or peers than programs of the robot do, or a firewall is between',
             f'{REMEDY[0].upper()}{REMEDY[1:]}',
-            publishers=row['publishers'],
-            nodes=row['nodes'],
+            publishers=row.publishers,
+            nodes=list(row.nodes),
         )
 
 
-def _front(found: Mapping[str, Any]) -> Iterator[Result]:
+def _front(node: NodeStatus) -> Iterator[Result]:
     """What stands for a node that listens through another RMW than the robot's."""
-    middleware, front = found['middleware'], found['workers'].get('front')
+    middleware, front = node.middleware, node.workers.get('front')
     cause = (
-        f'programs of the robot ({middleware["robot"]}) find no services, parameters and /diagnostics of the node, and '
+        f'programs of the robot ({middleware.robot}) find no services, parameters and /diagnostics of the node, and '
         'publishers are not compared with those that the robot finds; messages are still logged'
     )
-    if front is not None and front['failing']:
+    if front is not None and front.failing:
         remedy = 'journalctl -u shadowhound-data-logger | grep front  # what it said last; meanwhile: shadowhound-data node'
-        yield error('node.front', f'the front fails, {front["failures"]:,} times so far: {front["last_error"]}', cause, remedy)
-    elif front is None and middleware['rmw'] != middleware['robot']:
-        package = f'ros-$ROS_DISTRO-{middleware["robot"].replace("_", "-")}'
-        seen = f'no front runs: {middleware["robot"]} is not installed here'
+        yield error('node.front', f'the front fails, {front.failures:,} times so far: {front.last_error}', cause, remedy)
+    elif front is None and middleware.rmw != middleware.robot:
+        package = f'ros-$ROS_DISTRO-{middleware.robot.replace("_", "-")}'
+        seen = f'no front runs: {middleware.robot} is not installed here'
         yield warning('node.front', seen, cause, f'sudo apt install {package}  # or use: shadowhound-data node')
 
 
@@ -162,7 +162,7 @@ def _ledger(accounts: Mapping[str, Any], index: Path) -> Result:
     )
 
 
-def _backlog(usage: SpoolUsage, context: Context, *, runs: bool) -> Result:
+def _backlog(usage: SpoolStatus, context: Context, *, runs: bool) -> Result:
     """How much waits, and how long it takes at the rate that the check of the store has measured."""
     count, size, oldest_s = usage.pending, usage.bytes, usage.oldest_age_s
     if not count:
@@ -211,11 +211,11 @@ def _quarantine(reasons: Mapping[str, int]) -> Iterator[Result]:
         )
 
 
-def _lock(folder: Path, found: Mapping[str, Any], root: Path) -> Iterator[Result]:
+def _lock(folder: Path, report: status.NodeReport, root: Path) -> Iterator[Result]:
     """Who has the right to deliver."""
     path = folder / 'drain.lock'
     holder = lock_holder(root, path)
-    if holder is None or holder == found.get('pid'):
+    if holder is None or holder == report.node.pid:
         return
     time.sleep(TWICE_S)
     if lock_holder(root, path) != holder:

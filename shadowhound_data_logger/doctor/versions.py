@@ -78,10 +78,10 @@ def _node(context: Context) -> Iterator[Result]:
         ours = version(PACKAGE)
     except PackageNotFoundError:
         return
-    if found['running'] and found['version'] and found['version'] != ours:
+    if found.running and found.node.version and found.node.version != ours:
         yield warning(
             'versions.node',
-            f'the node that runs is version {found["version"]}, installed is {ours}',
+            f'the node that runs is version {found.node.version}, installed is {ours}',
             'it was not started again after an update',
             'sudo systemctl restart shadowhound-data-logger',
         )

@@ -10,6 +10,7 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import SECOND, Clock, utc
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.stamps import BY_STAMP, describe
+from shadowhound_data_logger.core.status import TopicStatus
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.gaps import OBJECTS
 from shadowhound_data_logger.spool.status import read as read_status
@@ -48,20 +49,20 @@ class SpoolFigures:
 
         ``topics``: received, stored, missed and so on as in ``ledger --json``, the rest as in ``status --json``.
         """
-        status = read_status(self._spool, self._robot, self._clock)
+        report = read_status(self._spool, self._robot, self._clock)
         if with_ledger:
             try:
                 self._ledger, self._problem = ledger.read(self._spool, self._robot), ''
             except DataLoggerError as error:
                 self._ledger, self._problem = {}, str(error)
-        accounts, live = self._ledger.get('topics', {}), status.get('topics', {})
-        found = {name: status.get(name) for name in _HEAD}
+        accounts, live, status = self._ledger.get('topics', {}), report.node.topics, report.as_dict()
         return {
-            **found, 'findings': [*status['findings'], *([self._problem] if self._problem else [])],
-            'store': {name: (status.get('store') or {}).get(name) for name in _OF_STORE},
+            **{name: status.get(name) for name in _HEAD},
+            'findings': [*report.findings, *([self._problem] if self._problem else [])],
+            'store': {name: status.get('store', {}).get(name) for name in _OF_STORE},
             'bag': _without(status.get('bag'), 'topics'), 'events': _without(status.get('events'), 'topics'),
             'balanced': self._ledger.get('balanced'), 'objects': self._ledger.get('objects'), 'bytes': self._ledger.get('bytes'),
-            'topics': [_row(topic, accounts.get(topic, {}), live.get(topic, {})) for topic in sorted({*accounts, *live})],
+            'topics': [_row(topic, accounts.get(topic, {}), live.get(topic)) for topic in sorted({*accounts, *live})],
         }  # fmt: skip
 
     def gaps(self, since_ns: int | None = None, until_ns: int | None = None, by: str = BY_STAMP) -> dict[str, Any]:
@@ -117,14 +118,14 @@ def _is_within(times: tuple[int | None, int | None], since_ns: int, until_ns: in
     return from_ns is not None and to_ns is not None and to_ns >= since_ns and from_ns <= until_ns
 
 
-def _row(topic: str, account: Mapping[str, Any], live: Mapping[str, Any]) -> dict[str, Any]:
+def _row(topic: str, account: Mapping[str, Any], live: TopicStatus | None) -> dict[str, Any]:
     return {
-        'topic': topic, 'type': account.get('type') or live.get('type', ''),
+        'topic': topic, 'type': account.get('type') or (live.type if live is not None else ''),
         **{name: account.get(name) for name in ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')},
         'lost': sum(sum(account.get(name, {}).values()) for name in ('rejected', 'dropped')),
         'pending': account.get('stored_in', {}).get('pending', 0),
-        'stamps': describe(live['stamps']) if live.get('stamps') else '',
-        **{name: live.get(name) for name in _OF_STATUS},
+        'stamps': describe(live.stamps) if live is not None and live.stamps else '',
+        **{name: getattr(live, name, None) for name in _OF_STATUS},
     }  # fmt: skip
 
 

@@ -88,8 +88,7 @@ class SpoolKept:
         ]  # fmt: skip
 
     def mbps(self, robot: str) -> float | None:
-        found = read_status(self._spool, robot, SystemClock.of_this_machine()).get('requests')
-        return found.get('mbps') if isinstance(found, dict) else None
+        return read_status(self._spool, robot, SystemClock.of_this_machine()).node.requests.mbps
 
     def requests(self, robot: str) -> list[dict[str, Any]]:
         """Raises SpoolError."""

@@ -251,9 +251,7 @@ class SpoolPast:
 
     def _read(self, robot: str, date: str, by: str) -> PastDay:
         begin_ns = date_ns(date)
-        topics = {
-            row.get('sensor'): topic for topic, row in read_status(self._spool, robot, self._clock).get('topics', {}).items()
-        }
+        topics = {row.sensor: topic for topic, row in read_status(self._spool, robot, self._clock).node.topics.items()}
         with closing(self._index()) as index, _reading(self._spool):
             found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, begin_ns + DAY_NS, by)]
             topics |= {one.sensor: one.topic for one in found if one.topic}

@@ -7,7 +7,7 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ from typing import Any
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.kept import KeptCut, sweep
+from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
@@ -25,11 +26,13 @@ from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
+from shadowhound_data_logger.core.dataclass_json import fields_of
 from shadowhound_data_logger.core.errors import DataLoggerError, SpoolError
 from shadowhound_data_logger.core.keys import dated
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.core.options import NAMED, ON_REQUEST
 from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, EncodePool
 from shadowhound_data_logger.node.encoding.halving import Halving
@@ -295,7 +298,7 @@ class Pipeline:
         self.uploader.set_max_mbps(settings.upload.max_mbps)
         self.event_buffer.update(settings.events)
 
-    def _active_mission(self) -> Mapping[str, Any]:
+    def _active_mission(self) -> MissionStatus:
         return self.mission.status()
 
     def _make_request_server(self, track: RobotTrack) -> None:
@@ -333,12 +336,13 @@ class Pipeline:
         return Unheard(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
                        lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
 
-    def _tell_mission(self, mission: Mapping[str, Any]) -> None:
-        self.spool.accounts.set_mission(str(mission.get('mission_id', '')))
+    def _tell_mission(self, mission: MissionStatus) -> None:
+        self.spool.accounts.set_mission(mission.mission_id)
         if self._interface is not None:
-            self._interface.tell_mission(mission)
-        self.recorder.on_mission(mission)
-        self.event_buffer.on_mission(mission)
+            self._interface.tell_mission(fields_of(mission))
+        of = MissionOf(mission.type, mission.mission_id, mission.run_id) if mission else None
+        self.recorder.on_mission(of)
+        self.event_buffer.on_mission(of)
         if not mission:
             self._catalog.expedite()
 

@@ -14,7 +14,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -38,6 +38,7 @@ from shadowhound_data_logger.core.mailbox import (
     request_id,
 )
 from shadowhound_data_logger.core.model import DataObject, SpooledObject
+from shadowhound_data_logger.core.status import RequestStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.spool.request_table import (
     ACTIVE,
@@ -106,19 +107,6 @@ class _Cutting(NamedTuple):
     row: RequestRow
     cut: SliceCut
     work: Generator[None, None, list[DataObject]]
-
-
-@dataclass(frozen=True, slots=True)
-class RequestStatus:
-    """What is asked for of what the robot keeps."""
-
-    open: int = 0
-    bytes: int = 0
-    """That requests wait for and nobody has released."""
-    mbps: float | None = None
-    """The pace of the link; None before it is known."""
-    left_s: int | None = None
-    """For so long these bytes take at this pace."""
 
 
 class RequestServer:

@@ -13,13 +13,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, Protocol
 
 from shadowhound_data_logger.core.config import Settings, UploadSettings
 from shadowhound_data_logger.core.errors import StoreError
 from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, Outcome, SpooledObject, State
+from shadowhound_data_logger.core.status import DeliveryStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.shipping.ahead import IMPORTANT, OLDEST
 from shadowhound_data_logger.shipping.failures import Notice, Verdict
@@ -49,32 +50,13 @@ class Backlog(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class UploadStatus:
+class UploadStatus(DeliveryStatus):
     """Delivery at one instant, for the status and the progress line."""
 
-    state: str
-    """``idle``, ``shipping``, ``store_down``, ``paused`` (keys, certificate, rights), ``not_draining`` (another does) or
-    ``waiting`` (for a rule to hold, ``waits_for``)."""
-    last_error: str
-    """The newest failure of this session, with its remedy; it may be over."""
-    delivered: int
-    """Objects confirmed by the store in this session, those that it had already among them."""
-    in_flight: int
-    deferred: int
-    """Objects that failed and wait for their next try."""
-    retries: int
-    """Failed tries of objects that stay pending."""
-    quarantined: int
-    blocked_buckets: Mapping[str, str] = field(default_factory=dict)
-    """Bucket -> why it gets nothing."""
     worker_failures: int = 0
     """Defects that the supervision of the threads caught; 0 in a healthy program."""
     sent_bytes: int = 0
-    """Payload bytes that left in this session, repeats included; it grows while a body leaves, so its slope is the rate."""
-    max_mbps: float = 0.0
-    """The cap that is set, megabits a second; 0 is none. It holds for an S3 server: a folder is behind no radio."""
-    waits_for: Mapping[str, str] = field(default_factory=dict)
-    """Rules that do not hold, such as ``upload.when``: why they do not."""
+    """Payload bytes sent in this session, including repeats; it grows while a body is sent, so its slope is the rate."""
 
 
 class Uploader:
@@ -184,7 +166,7 @@ class Uploader:
         failures = sum(worker.failures for worker in self.workers)
         pace = self._store.pace
         return UploadStatus(state, now.last_error, now.delivered, now.in_flight, now.deferred, now.retries, quarantined,
-                            now.blocked, failures, pace.sent_bytes, pace.max_mbps, self._waits_for)  # fmt: skip
+                            now.blocked, pace.max_mbps, self._waits_for, failures, pace.sent_bytes)  # fmt: skip
 
     # -- the threads -----------------------------------------------------------------------------------------------
 

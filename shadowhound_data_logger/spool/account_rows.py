@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
 from shadowhound_data_logger.spool.gaps import GapRow, TakenBack
@@ -73,42 +72,6 @@ class TopicRow:
     @property
     def open(self) -> int:
         return self.received - self.skipped - self.stored - sum(self.rejected.values()) - sum(self.dropped.values())
-
-
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """A topic of this session at one instant, as sums."""
-
-    type: str
-    accounting: str | None
-    """The grade of the newest message; None before the first."""
-    received: int
-    stored: int
-    skipped: int
-    rejected: int
-    dropped: int
-    """Without those of a pause, which somebody asked for."""
-    paused: int
-    missed: int | None
-    """None where it is not known exactly."""
-    missed_estimated: int | None
-    """None where it is known exactly, or not at all."""
-    open: int
-    wrong_type: int = 0
-    """Of those that were received and rejected: they are of another type than the topic's own."""
-    other_types: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Type that is published there besides and not logged -> nodes that publish it, and how many messages of it were
-    counted; ``messages`` is None where nobody listened to all of them."""
-    missed_by: Mapping[str, int] = field(default_factory=dict)
-    """By cause, those that are estimated among them."""
-    gaps: int = 0
-    """How often messages were lost in a row, for whatever cause."""
-    by_arrival: Mapping[str, int] = field(default_factory=dict)
-    """As of ``TopicRow``."""
-    corrected: Mapping[str, int] = field(default_factory=dict)
-    """As of ``TopicRow``."""
-    stamps: Mapping[str, Any] | None = None
-    """What is unusual about the stamps of its publishers now (``StampReport``)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from shadowhound_data_logger.core.dataclass_json import fields_of
 from shadowhound_data_logger.core.stamps import StampReport, Times
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.gap_table import GapTable
@@ -68,7 +69,7 @@ class AccountTable(Table):
             'INSERT OR REPLACE INTO accounts VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
               _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected),
-              _json(row.stamps._asdict() if row.stamps else {}), *row.last_kept,
+              _json(fields_of(row.stamps)), *row.last_kept,
               row.first_ns, *row.heard, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
         self._db.executemany(
@@ -150,7 +151,7 @@ def _continued_by(robot: str | None) -> tuple[str, tuple[str | int, ...]]:
 def _stamps(text: str) -> StampReport | None:
     """None for a report of another shape: it is information, and no reason to refuse an account."""
     found = json.loads(text)
-    return StampReport(**found) if found.keys() == set(StampReport._fields) else None
+    return StampReport(**found) if found.keys() == StampReport.__dataclass_fields__.keys() else None
 
 
 def _json(by_reason: Mapping[str, Any]) -> str:

@@ -14,7 +14,8 @@ from typing import Final
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, Clock
 from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
-from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow, Totals
+from shadowhound_data_logger.core.status import OtherType, Totals
+from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation, TopicEstimate
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
 from shadowhound_data_logger.spool.span import NumberRun, Span
@@ -50,7 +51,7 @@ Losses = Mapping[str, int] | None
 
 
 @dataclass(slots=True)
-class OtherType:
+class OtherTypeAccount:
     """A type that a topic is published under besides the one that is logged. Guarded as its topic's account is."""
 
     publishers: list[str] = field(default_factory=list)
@@ -97,7 +98,7 @@ class TopicAccount:
     estimate: TopicEstimate = field(default_factory=TopicEstimate)
     last_kept: Times = NO_TIMES
     """Those of the newest sample that is durable: a restarted node continues to sample after it."""
-    other_types: dict[str, OtherType] = field(default_factory=dict)
+    other_types: dict[str, OtherTypeAccount] = field(default_factory=dict)
     gone: dict[str, tuple[int, int]] = field(default_factory=dict)
     """First and last number of publishers whose accounts were added up."""
     removed: dict[str, Span | None] = field(default_factory=dict)
@@ -242,7 +243,7 @@ class TopicAccount:
         other = self.other_types.get(type_name)
         is_new = other is None
         if other is None:
-            other = self.other_types[type_name] = OtherType()
+            other = self.other_types[type_name] = OtherTypeAccount()
         if not (counted or named or self.is_doubtful):
             self.accounting, self.is_doubtful, is_new = RECEIVED_ONLY, True, True
         return other.see(nodes, counted=counted) or is_new
@@ -633,7 +634,7 @@ def _totals(account: TopicAccount) -> Totals:
         account.type, account.accounting or None, account.received, account.stored, account.skipped, account.rejected.total(),
         account.dropped.total() - paused, paused, account.missed, account.about_missed, account.open,
         account.rejected[WRONG_TYPE],
-        {name: {'publishers': list(other.publishers), 'messages': other.messages} for name, other in account.other_types.items()},
+        {name: OtherType(tuple(other.publishers), other.messages) for name, other in account.other_types.items()},
         dict(missed_by), account.gaps.count, dict(account.by_arrival), dict(account.corrected),
-        account.stamps and account.stamps._asdict(),
+        account.stamps,
     )  # fmt: skip

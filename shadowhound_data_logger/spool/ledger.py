@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool import act_record, clock_record
@@ -156,7 +157,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         'skipped': sum(row.skipped for row in rows),
         'by_arrival': _sum(row.by_arrival for row in rows),
         'corrected': _sum(row.corrected for row in rows),
-        'stamps': rows[-1].stamps and rows[-1].stamps._asdict() if rows else None,
+        'stamps': as_plain(rows[-1].stamps) if rows else None,
         'rejected': _sum(row.rejected for row in rows),
         'other_types': _other_types(row for row in others if row.topic == topic),
         'dropped': _sum(row.dropped for row in rows),

@@ -25,6 +25,7 @@ from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import Binding, DataObject, HeldObject, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.core.stamps import NO_TIMES, Times
+from shadowhound_data_logger.core.status import SpoolStatus
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
@@ -49,7 +50,7 @@ from shadowhound_data_logger.spool.request_table import (
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, is_short, make_room, thin_out
 from shadowhound_data_logger.spool.session import Session, carry
 from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned, thin
-from shadowhound_data_logger.spool.usage import SpoolUsage, usage_of
+from shadowhound_data_logger.spool.usage import usage_of
 
 log = logging.getLogger(__name__)
 
@@ -408,7 +409,7 @@ class Spool:
         """Whether a delivered object is in no part of the catalog yet. Waits for no commit."""
         return bool(self._view.catalog.uncataloged(1))
 
-    def usage(self) -> SpoolUsage:
+    def usage(self) -> SpoolStatus:
         """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
         return usage_of(self._view, self.root, self._clock.wall_ns())
 

@@ -1,7 +1,7 @@
-"""The status that a running node writes once a second; where none runs, what its spool says.
+"""The status of a robot's node, read from the file that a running node writes once per second, otherwise from its spool.
 
-``read`` waits for nobody and changes nothing. That no node runs, and even that there is no spool, is an answer and no
-error. Whether a node runs is decided by the boot clock, because a robot's wall clock may step.
+``read`` does not block and changes nothing. A node that does not run, and even a missing spool, is an answer, not an error.
+Whether a node runs is decided by the boot clock, because a robot's wall clock may step.
 """
 
 from __future__ import annotations
@@ -10,56 +10,75 @@ import json
 import os
 import sqlite3
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
+from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.stamps import describe
+from shadowhound_data_logger.core.status import NodeStatus, OtherType, SpoolStatus, TopicStatus, Totals
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.usage import usage_of
 
 FRESH_NS: Final = 5 * SECOND
-"""A node writes once a second: one that is silent for longer hangs, or is no more."""
+"""A node writes once per second: one that is silent for longer hangs or has exited."""
 RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
 NOT_RUNNING_TEXT: Final = 'the node is not running'
 FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining', 'waiting'})
 """States of delivery that are not a finding; ``not_draining``: another process delivers; ``waiting``: a rule says not now."""
 NAMED: Final = 3
-"""Topics that a finding names; the figures of the others stand in the table."""
-_TOPIC: Final[dict[str, Any]] = {
-    'sensor': '', 'type': '', 'enabled': True, 'publishers': 0, 'matched': 0, 'may_be_silent': False, 'unavailable': '',
-    'rate_hz': 0.0, 'age_s': None, 'received': 0, 'stored': 0,
-    'skipped': 0, 'rejected': 0, 'dropped': 0, 'paused': 0, 'missed': None, 'missed_estimated': None, 'open': 0,
-    'accounting': None, 'wrong_type': 0, 'other_types': {}, 'missed_by': {}, 'gaps': 0, 'by_arrival': {}, 'corrected': {},
-    'stamps': None,
-}  # fmt: skip
-_SECTIONS: Final[dict[str, dict[str, Any]]] = {
-    'queue': {'batches': 0, 'messages': 0, 'bytes': 0, 'finished': 0, 'max_messages': 0, 'max_bytes': 0},
-    'spool': {'path': '', 'pending': 0, 'held': 0, 'quarantined': 0, 'evicted': 0, 'bytes': 0, 'max_bytes': None,
-              'kept': 0, 'kept_bytes': 0, 'unkept': 0,
-              'free_bytes': None, 'oldest_age_s': None, 'min_free_bytes': None, 'remember_days': None},
-    'store': {'target': '', 'state': 'idle', 'last_error': '', 'delivered': 0, 'in_flight': 0, 'deferred': 0, 'retries': 0,
-              'quarantined': 0, 'blocked_buckets': {}, 'mbps': 0.0, 'max_mbps': 0.0, 'waits_for': {}, 'left_s': None,
-              'stuck': {}},
-    'requests': {'open': 0, 'bytes': 0, 'mbps': None, 'left_s': None},
-    'middleware': {'rmw': '', 'robot': '', 'why': '', 'asked': '', 'network': '', 'receive_bytes': None, 'dropped_datagrams': 0,
-                   'unheard': None},
-    'clock': {'is_set': True, 'gave_up': False, 'unset_s': 0.0, 'steps': 0, 'last_step_s': None, 'last_step_age_s': None},
-}  # fmt: skip
-_WORKER: Final[dict[str, Any]] = {
-    'alive': True, 'failing': False, 'failures': 0, 'deaths': 0, 'last_error': '', 'busy_s': 0.0, 'patience_s': None,
-}  # fmt: skip
-_HEAD: Final[dict[str, Any]] = {
-    'version': '', 'pid': 0, 'boot_id': '', 'boot_ns': 0, 'time': '', 'uptime_s': 0.0, 'paused': False, 'ended': False,
-    'stalls': {}, 'not_logged': {},
-}  # fmt: skip
+"""Topics that a finding names; the figures of the others are in the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSession:
+    """The last session of a node, by the wall clock."""
+
+    started: str
+    ended: str | None
+    """None if it was cut off, or has just started."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeReport:
+    """What is known here about the node of a robot."""
+
+    robot: str
+    state: str
+    """``running``, ``not_answering`` (its process exists and is silent) or ``not_running``."""
+    age_s: float | None
+    """Since the node wrote its status; None if unknown."""
+    node: NodeStatus
+    """As the node wrote it; without figures if it does not run."""
+    spool: SpoolStatus | None
+    """The current content of the spool; None if there is none."""
+    session: NodeSession | None = None
+    """Known unless the node runs."""
+    problem: str = ''
+    """Why the status file or the index cannot be read."""
+    findings: tuple[str, ...] = ()
+    """One sentence for each thing that needs attention."""
+
+    @property
+    def running(self) -> bool:
+        return self.state == RUNNING
+
+    def as_dict(self) -> dict[str, Any]:
+        """As ``shadowhound-data status --json`` prints it, without what only a running node knows if none runs."""
+        node = as_plain(self.node) if self.state != NOT_RUNNING else {}
+        found = {'state': self.state, 'running': self.running, 'age_s': self.age_s, 'spool': as_plain(self.spool)}
+        if not self.running:
+            found['session'] = as_plain(self.session)
+        if self.problem:
+            found['problem'] = self.problem
+        return {'robot': self.robot, **node, **found, 'findings': list(self.findings)}
 
 
 def file(spool: Path, robot: str) -> Path:
-    """Where the node of a robot writes its status."""
+    """The status file of the node of a robot."""
     return spool / f'status-{robot}.json'
 
 
@@ -70,73 +89,68 @@ def robots(spool: Path) -> list[str]:
 
 def targets(spool: Path) -> list[str]:
     """The stores that the nodes of this spool delivered to when they last wrote a status, as a store describes itself."""
-    written = (_load(file(spool, robot)) for robot in robots(spool))
-    return sorted({one['store']['target'] for one in written if one} - {''})
+    return sorted({written.store.target for written in _all_written(spool)} - {''})
 
 
-def not_logged(spool: Path, robot: str) -> dict[str, str]:
+def not_logged(spool: Path, robot: str) -> Mapping[str, str]:
     """Topics that the node of a robot found and did not log when it last wrote its status, and why."""
-    written = _load(file(spool, robot))
-    return written['not_logged'] if written and isinstance(written['not_logged'], dict) else {}
+    return _written(spool, robot)[0].not_logged
 
 
 def limits(spool: Path, own: SpoolSettings) -> SpoolSettings:
-    """What the nodes of this spool keep to, the widest of it, or ``own`` where none has run.
+    """The widest limits of the nodes of this spool, or ``own`` if none has run.
 
-    Their parameters are unknown to other processes, which would evict, or forget, by their own defaults what a node may keep.
+    Other processes do not know the nodes' parameters: by their own defaults they would evict, or forget, what a node may keep.
     """
-    said = [one['spool'] for one in (_load(file(spool, robot)) for robot in robots(spool)) if one]
-    most, least, days = (
-        [one[name] for one in said if isinstance(one[name], (int, float))]
-        for name in ('max_bytes', 'min_free_bytes', 'remember_days')
-    )
-    return replace(own, max_bytes=max(most, default=own.max_bytes), min_free_bytes=min(least, default=own.min_free_bytes),
-                   remember_days=max(days, default=own.remember_days))  # fmt: skip
+    written = [each.spool for each in _all_written(spool)]
+    return replace(
+        own,
+        max_bytes=max((each.max_bytes for each in written if each.max_bytes is not None), default=own.max_bytes),
+        min_free_bytes=min((each.min_free_bytes for each in written if each.min_free_bytes is not None),
+                           default=own.min_free_bytes),
+        remember_days=max((each.remember_days for each in written if each.remember_days is not None),
+                          default=own.remember_days),
+    )  # fmt: skip
 
 
-def read(spool: Path, robot: str, clock: Clock) -> dict[str, Any]:
-    """The status of a robot's node, as ``shadowhound-data status --json`` prints it.
-
-    ``state`` is running, not_answering (its process is there and silent) or not_running, ``age_s`` the time since the node
-    wrote its status (None where that is not known), ``session`` the last one as the index has it, ``findings`` one sentence
-    for each thing that somebody should look at. What only a running node can know (topics, queue, store, workers, ...) is
-    left out where none runs; ``spool`` is always of now, and None where there is none.
-    """
-    written = _load(file(spool, robot))
-    silent_ns = clock.boot_ns() - written['boot_ns'] if written and written['boot_id'] == clock.boot_id else None
+def read(spool: Path, robot: str, clock: Clock) -> NodeReport:
+    """The status of the node of a robot."""
+    written, problem = _written(spool, robot)
+    silent_ns = clock.boot_ns() - written.boot_ns if written.boot_id == clock.boot_id else None
     state = _state(written, silent_ns)
     age_s = None if silent_ns is None else round(silent_ns / SECOND, 3)
-    found: dict[str, Any] = {'robot': robot, 'state': state, 'running': state == RUNNING, 'age_s': age_s}
-    if written and state != NOT_RUNNING:
-        found |= {name: value for name, value in written.items() if name not in found}
+    node = written if state != NOT_RUNNING else NodeStatus()
+    report = NodeReport(robot, state, age_s, node, node.spool, problem=problem)
     if state != RUNNING:
-        found |= _of_index(spool, robot, clock.wall_ns(), written)
-    found['findings'] = list(_findings(found))
-    return found
+        report = _with_index(report, spool, written, clock.wall_ns())
+    return replace(report, findings=tuple(_findings(report)))
 
 
-def _load(path: Path) -> dict[str, Any] | None:
-    """The file with every figure in its place; None without one, or where a power cut left half of it."""
+def _all_written(spool: Path) -> list[NodeStatus]:
+    return [_written(spool, robot)[0] for robot in robots(spool)]
+
+
+def _written(spool: Path, robot: str) -> tuple[NodeStatus, str]:
+    """The last status of a node, and why it cannot be read; a power cut may damage it. Without figures if there is none."""
+    path = file(spool, robot)
     try:
-        given = json.loads(path.read_bytes())
-        sections = {name: {**rest, **given.get(name, {})} for name, rest in _SECTIONS.items()}
-        topics = {name: {**_TOPIC, **row} for name, row in given.get('topics', {}).items()}
-        workers = {name: {**_WORKER, **row} for name, row in given.get('workers', {}).items()}
-        return {**_HEAD, **given, **sections, 'topics': topics, 'workers': workers}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return None
+        return parse(NodeStatus, json.loads(path.read_bytes())), ''
+    except FileNotFoundError:
+        return NodeStatus(), ''
+    except (OSError, ValueError, RecursionError) as error:
+        return NodeStatus(), f'the status {path} cannot be read: {error}'
 
 
-def _state(written: Mapping[str, Any] | None, silent_ns: int | None) -> str:
-    if written is None or silent_ns is None or written['ended']:
+def _state(written: NodeStatus, silent_ns: int | None) -> str:
+    if silent_ns is None or written.ended:
         return NOT_RUNNING
     if silent_ns < FRESH_NS:
         return RUNNING
-    return NOT_ANSWERING if _lives(written['pid'], written['boot_ns']) else NOT_RUNNING
+    return NOT_ANSWERING if _lives(written.pid, written.boot_ns) else NOT_RUNNING
 
 
 def _lives(pid: int, boot_ns: int) -> bool:
-    """Whether the process that wrote the status is there: one of its number, begun before (proc(5), stat, field 22)."""
+    """Whether the process that wrote the status exists: one of its number that started before (proc(5), stat, field 22)."""
     try:
         fields = Path(f'/proc/{pid}/stat').read_text(encoding='utf-8', errors='replace').rpartition(')')[2].split()
     except OSError:
@@ -144,122 +158,136 @@ def _lives(pid: int, boot_ns: int) -> bool:
     return fields[0] not in 'ZX' and int(fields[19]) * SECOND // os.sysconf('SC_CLK_TCK') <= boot_ns
 
 
-def _of_index(spool: Path, robot: str, now_ns: int, written: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the spool itself tells: what lies in it, and the node's last session."""
-    path = spool / 'index.db'
+def _with_index(report: NodeReport, folder: Path, written: NodeStatus, now_ns: int) -> NodeReport:
+    """With the content of the spool and the last session, from the index."""
+    path = folder / 'index.db'
     if not path.is_file():
-        text = f'there is no spool in {spool}: start the node, or name its folder by SHADOWHOUND_HOME'
-        return {'spool': None, 'session': None, 'problem': text}
+        text = f'there is no spool in {folder}: start the node, or name its folder by SHADOWHOUND_HOME'
+        return replace(report, spool=None, problem=report.problem or text)
     index = Index(path, read_only=True)
+    last = written.spool
     try:
         index.open()
-        known = written['spool'] if written else {'max_bytes': None, 'evicted': 0}
-        usage = {'path': str(spool), **asdict(usage_of(index, spool, now_ns)),
-                 **{name: known[name] for name in ('max_bytes', 'evicted')}}  # fmt: skip
-        return {'spool': usage, 'session': _session(index, robot, written['pid'] if written else 0)}
+        spool = replace(usage_of(index, folder, now_ns), evicted=last.evicted, unkept=last.unkept, max_bytes=last.max_bytes,
+                        min_free_bytes=last.min_free_bytes, remember_days=last.remember_days)  # fmt: skip
+        return replace(report, spool=spool, session=_session(index, report.robot, written.pid))
     except (OSError, sqlite3.Error, SpoolError) as error:
-        return {'spool': None, 'session': None, 'problem': f'the spool index {path} cannot be read: {error}'}
+        return replace(report, spool=None, problem=f'the spool index {path} cannot be read: {error}')
     finally:
         index.close()
 
 
-def _session(index: Index, robot: str, pid: int) -> dict[str, Any] | None:
-    """The node's last session: when it began and ended by the wall clock; ``ended`` is None where it was cut off.
-
-    Who sends missions or bags has sessions as well: the node's is that of the process that wrote the status, where one did.
-    """
+def _session(index: Index, robot: str, pid: int) -> NodeSession | None:
+    """The last session of the process that wrote the status, if one did: processes that send missions or bags have some too."""
     row = index.accounts.last_session(robot, pid)
-    return {'started': iso(row[0]), 'ended': iso(row[1]) if row[1] is not None else None} if row else None
+    return NodeSession(iso(row[0]), iso(row[1]) if row[1] is not None else None) if row else None
 
 
-def _findings(found: Mapping[str, Any]) -> Iterator[str]:
-    if found['state'] == NOT_RUNNING:
+def _findings(report: NodeReport) -> Iterator[str]:
+    node = report.node
+    if report.state == NOT_RUNNING:
         yield NOT_RUNNING_TEXT
-    elif found['state'] == NOT_ANSWERING:
-        yield f'the node (process {found["pid"]}) has written no status for {found["age_s"]:.0f} s'
-    if 'problem' in found:
-        yield found['problem']
-    if 'store' not in found:
-        return
-    store = found['store']
-    if found['paused']:
+    elif report.state == NOT_ANSWERING:
+        yield f'the node (process {node.pid}) has written no status for {report.age_s:.0f} s'
+    if report.problem:
+        yield report.problem
+    if report.state != NOT_RUNNING:
+        yield from _faults(node)
+        yield from _losses(node.topics)
+        for topics in (node.topics, node.bag.topics, node.events.topics):
+            yield from _other_types(topics)
+        yield from _left_out(node)
+        yield from _given_up(report.spool or SpoolStatus())
+        if node.store.quarantined:
+            yield f'quarantined in this session: {node.store.quarantined:,} objects'
+
+
+def _faults(node: NodeStatus) -> Iterator[str]:
+    """What does not work now."""
+    store = node.store
+    if node.paused:
         yield 'the node is paused: nothing is logged'
-    if not found['clock']['is_set']:
-        what = 'objects go without a date' if found['clock']['gave_up'] else 'objects wait for their date'
+    if not node.clock.is_set:
+        what = 'objects go without a date' if node.clock.gave_up else 'objects wait for their date'
         yield f'the clock of this machine is not set: {what}'
-    if store['state'] not in FINE_STORE:
-        yield f'delivery: {str(store["state"]).replace("_", " ")}'
-    yield from store['stuck'].values()
-    yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store['blocked_buckets'].items())
-    yield from (f'{name} fails: {row["last_error"]}' for name, row in found['workers'].items() if row['failing'])
-    yield from (f'{name}: {text}' for name, text in found['stalls'].items())
-    yield from (row['text'] for row in (found['middleware']['unheard'] or {}).values())
-    yield from _missed(found['topics'], 'missed', 'missed in this session', '')
+    if store.state not in FINE_STORE:
+        yield f'delivery: {store.state.replace("_", " ")}'
+    yield from store.stuck.values()
+    yield from (f'bucket {name} takes nothing: {reason}' for name, reason in store.blocked_buckets.items())
+    yield from (f'{name} fails: {worker.last_error}' for name, worker in node.workers.items() if worker.failing)
+    yield from (f'{name}: {text}' for name, text in node.stalls.items())
+    yield from (row.text for row in (node.middleware.unheard or {}).values())
+
+
+def _losses(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
+    """What was lost in this session, and whose stamps are not trusted."""
+    missed = {topic: (row.missed, row.missed_by) for topic, row in topics.items()}
+    yield from _missed(missed, 'missed in this session', '')
     for what in ('dropped', 'rejected'):
-        lost = {topic: row[what] for topic, row in found['topics'].items() if row[what]}
+        lost = {topic: count for topic, row in topics.items() if (count := getattr(row, what))}
         if lost:
             yield f'{what} in this session: {_most(lost)}'
-    yield from _missed(found['topics'], 'missed_estimated', 'missed in this session, as estimated', '~')
-    yield from _by_arrival(found['topics'])
-    yield from stamp_findings(found['topics'])
-    yield from _other_types(found)
-    yield from _left_out(found)
-    yield from _given_up(found['spool'] or {})
-    if store['quarantined']:
-        yield f'quarantined in this session: {store["quarantined"]:,} objects'
+    missed = {topic: (row.missed_estimated, row.missed_by) for topic, row in topics.items()}
+    yield from _missed(missed, 'missed in this session, as estimated', '~')
+    yield from _by_arrival(topics)
+    yield from _untrusted_stamps(topics)
 
 
-def stamp_findings(topics: Mapping[str, Any]) -> Iterator[str]:
+def _untrusted_stamps(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
     """A line for all topics whose stamps have the same fault: one computer's clock shows on each of its topics."""
     groups: dict[tuple[str, str, int], list[str]] = {}
+    lines: dict[tuple[str, str, int], str] = {}
     for topic, row in topics.items():
-        if report := row.get('stamps'):
-            groups.setdefault((report['state'], report['cause'], round(report['offset_s'] or 0.0)), []).append(topic)
-    for names in groups.values():
+        if report := row.stamps:
+            fault = report.state, report.cause, round(report.offset_s or 0.0)
+            groups.setdefault(fault, []).append(topic)
+            lines.setdefault(fault, describe(report))
+    for fault, names in groups.items():
         more = f' and {len(names) - NAMED} more' if len(names) > NAMED else ''
-        yield f'{", ".join(names[:NAMED])}{more}: {describe(topics[names[0]]["stamps"])}'
+        yield f'{", ".join(names[:NAMED])}{more}: {lines[fault]}'
 
 
-def _by_arrival(topics: Mapping[str, Any]) -> Iterator[str]:
+def _by_arrival(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
     """A line for each reason: a clock that is wrong, old data that is replayed, or a stranger in the network."""
-    for reason in sorted({reason for row in topics.values() for reason in row['by_arrival']}):
-        found = {topic: row['by_arrival'][reason] for topic, row in topics.items() if row['by_arrival'].get(reason)}
+    for reason in sorted({reason for row in topics.values() for reason in row.by_arrival}):
+        found = {topic: row.by_arrival[reason] for topic, row in topics.items() if row.by_arrival.get(reason)}
         yield f'dated by arrival in this session, because of {reason}: {_most(found)}'
 
 
-def _given_up(spool: Mapping[str, Any]) -> Iterator[str]:
-    if evicted := spool.get('evicted', 0):
-        yield f'evicted in this session: {evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
-    if unkept := spool.get('unkept', 0):
-        yield f'not kept in this session: {unkept:,} objects, for what is kept is asked for or protected (keep.max_bytes)'
+def _given_up(spool: SpoolStatus) -> Iterator[str]:
+    if spool.evicted:
+        yield f'evicted in this session: {spool.evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
+    if spool.unkept:
+        yield (
+            f'not kept in this session: {spool.unkept:,} objects, because all kept objects are requested or protected '
+            '(keep.max_bytes)'
+        )
 
 
-def _left_out(found: Mapping[str, Any]) -> Iterator[str]:
-    for what, name in (('bag', 'recorded'), ('events', 'kept for events')):
-        if count := found.get(what, {}).get('left_out', 0):
+def _left_out(node: NodeStatus) -> Iterator[str]:
+    for what, name, count in (('bag', 'recorded', node.bag.left_out), ('events', 'kept for events', node.events.left_out)):
+        if count:
             yield f'{count:,} topics are not {name}: there are too many that no setting names ({what}.topics, {what}.exclude)'
 
 
-def _other_types(found: Mapping[str, Any]) -> Iterator[str]:
-    """Topics that were published under another type than the one that is logged, of sensors, bags and events."""
-    for where in (found['topics'], found.get('bag', {}).get('topics', {}), found.get('events', {}).get('topics', {})):
-        others = [(topic, name, other) for topic, row in where.items() for name, other in row.get('other_types', {}).items()]
-        yield from (_other_type(topic, where[topic], name, other) for topic, name, other in others[:NAMED])
-        if len(others) > NAMED:
-            yield f'and {len(others) - NAMED} more types on topics that carry another one'
+def _other_types(topics: Mapping[str, Totals]) -> Iterator[str]:
+    """Topics that were published under another type than the one that is logged."""
+    others = [(topic, row, name, other) for topic, row in topics.items() for name, other in row.other_types.items()]
+    yield from (_other_type(*found) for found in others[:NAMED])
+    if len(others) > NAMED:
+        yield f'and {len(others) - NAMED} more types on topics that carry another one'
 
 
-def _other_type(topic: str, row: Mapping[str, Any], name: str, other: Mapping[str, Any]) -> str:
-    by = ', '.join(other['publishers']) or 'a program that is not a ROS node'
-    count = other['messages']
+def _other_type(topic: str, row: Totals, name: str, other: OtherType) -> str:
+    by = ', '.join(other.publishers) or 'a program that is not a ROS node'
+    count = other.messages
     what = 'it was not listened to: the number of messages is not known' if count is None else f'{count:,} messages were refused'
-    return f'{topic} was published as {name} too, by {by}, and is logged as {row["type"] or "nothing"} alone; {what}'
+    return f'{topic} was published as {name} too, by {by}, and is logged as {row.type or "nothing"} alone; {what}'
 
 
-def _missed(topics: Mapping[str, Any], what: str, text: str, mark: str) -> Iterator[str]:
-    """A line for each cause, so that what a restart cost is told from what the network lost."""
-    rows = {topic: row for topic, row in topics.items() if row[what]}
-    by_cause = {topic: row['missed_by'] or {'': row[what]} for topic, row in rows.items()}
+def _missed(topics: Mapping[str, tuple[int | None, Mapping[str, int]]], text: str, mark: str) -> Iterator[str]:
+    """A line for each cause: what a restart missed is separate from what the network lost."""
+    by_cause = {topic: causes or {'': missed} for topic, (missed, causes) in topics.items() if missed}
     for cause in sorted({cause for causes in by_cause.values() for cause in causes}):
         lost = {topic: causes[cause] for topic, causes in by_cause.items() if cause in causes}
         yield f'{text}{cause and f" by {cause}"}: {_most(lost, mark)}'

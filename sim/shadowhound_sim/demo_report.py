@@ -121,7 +121,8 @@ def messages_table(audit: DemoAudit) -> Table:
     for topic, row in sorted(audit.messages.items()):
         account = row.account or dict.fromkeys(fates)
         before = [number(row.before_match)] if has_before else []
-        table.add_row(topic, number(row.published), *before, *(figure(account, name) for name in fates))
+        counts = (figure(account[name], account.get(f'{name}_estimated')) for name in fates)
+        table.add_row(topic, number(row.published), *before, *counts)
     return table
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from clocks import Clocks
 from mcap.reader import make_reader
 
+from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, Lot
 from shadowhound_data_logger.bags.recorder import Recorder
@@ -144,9 +145,8 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
         spool.close()
 
 
-def mission(name: str = 'patrol', number: int = 1, run_id: str | None = None) -> Mapping[str, Any]:
-    """As MissionWatch tells of it."""
-    return {'mission_id': f'{name}_{number}', 'run_id': run_id, 'type': name, 'started': ''}
+def mission(name: str = 'patrol', number: int = 1, run_id: str | None = None) -> MissionOf:
+    return MissionOf(name, f'{name}_{number}', run_id)
 
 
 def numbers(path: Path) -> list[int]:

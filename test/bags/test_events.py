@@ -10,10 +10,10 @@ from bags.eventing import buffer, hear_each_second, in_bag, only_bag
 from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission
 from spool.making import NOON_NS
 
-from shadowhound_data_logger.bags.events import EventStatus
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.core.model import DataObject, RecordingRows
 from shadowhound_data_logger.core.options import EventSettings
+from shadowhound_data_logger.core.status import EventStatus
 
 
 def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:

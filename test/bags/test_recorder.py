@@ -125,14 +125,14 @@ def test_a_full_queue_is_a_loss_with_a_name(tmp_path: Path) -> None:
 def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
     """It begins and ends with it, bears its type, and says its ids, also the run's that became known meanwhile."""
     with desk(tmp_path, record='mission') as it:
-        it.recorder.on_mission({})
+        it.recorder.on_mission(None)
         assert not it.recorder.status().recording
         it.recorder.on_mission(mission())
         bag = it.recorder.status().bag
         assert bag.startswith('patrol_2025')
         it.hear(range(3))
         it.recorder.on_mission(mission(run_id='r1'))
-        it.recorder.on_mission({})
+        it.recorder.on_mission(None)
         said = manifest(it.objects(), bag)
         assert said['mission'] == {'type': 'patrol', 'mission_id': 'patrol_1', 'run_id': 'r1'}
         assert not it.recorder.status().recording
@@ -142,7 +142,7 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
     """Recording always, a mission has a bag of its own; the intake listens all the time, and is told of each that begins."""
     with desk(tmp_path, record='always') as it:
         names = [it.recorder.status().bag]
-        for number, told in enumerate(({}, mission(), mission(number=2), {})):
+        for number, told in enumerate((None, mission(), mission(number=2), None)):
             it.recorder.on_mission(told)
             names.append(it.recorder.status().bag)
             it.hear(range(10 * number, 10 * number + 10))
@@ -201,7 +201,7 @@ def test_what_somebody_started_outlives_missions(tmp_path: Path) -> None:
     with desk(tmp_path, record='mission') as it:
         name = start(it.recorder)
         it.recorder.on_mission(mission())
-        it.recorder.on_mission({})
+        it.recorder.on_mission(None)
         assert it.recorder.status().bag == name
 
 

@@ -19,10 +19,12 @@ from spool.making import make, new_spool, put
 
 from shadowhound_data_logger.cli.main import main
 from shadowhound_data_logger.cli.output import print_page
-from shadowhound_data_logger.cli.status import status, view
+from shadowhound_data_logger.cli.status import Page, status, view
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.dataclass_json import parse
+from shadowhound_data_logger.core.status import NodeStatus
 from shadowhound_data_logger.policies.folder import PolicyFolder
-from shadowhound_data_logger.spool.status import file
+from shadowhound_data_logger.spool.status import RUNNING, NodeReport, file
 
 ERROR = 'Tower at http://192.168.10.20:9000 refused the connection (is it on, and the WiFi up? it is tried again until it works)'
 
@@ -58,13 +60,14 @@ def a_status(**changes: Any) -> dict[str, Any]:
     return found
 
 
-def shown(width: int = 80, *, terminal: bool = True, encoding: str = 'utf-8', **changes: Any) -> str:
+def shown(width: int = 80, *, terminal: bool = True, encoding: str = 'utf-8', state: str = RUNNING, age_s: float = 0.5,
+          findings: tuple[str, ...] = (), **changes: Any) -> str:  # fmt: skip
     """The view of a running node."""
-    told = {'state': 'running', 'running': True, 'age_s': 0.5, 'findings': [], 'others': []}
     output = io.TextIOWrapper(io.BytesIO(), encoding)
     console = Console(file=output, width=width, highlight=False, force_terminal=terminal, color_system=None)
-    found = {**a_status(**changes), **{name: changes.get(name, value) for name, value in told.items()}}
-    print_page(*view(found, console), console=console)
+    node = parse(NodeStatus, a_status(**changes))
+    report = NodeReport(node.robot, state, age_s, node, node.spool, findings=findings)
+    print_page(*view(Page(report), console), console=console)
     output.flush()
     output.seek(0)
     return output.read()
@@ -221,7 +224,7 @@ def test_topics_that_were_never_heard_are_one_line() -> None:
 def test_trouble_is_told_with_its_remedy() -> None:
     """The store's last error while it is not fine, each worker that fails, and that the node is paused."""
     text = shown(store={'state': 'store_down', 'last_error': 'refused (is it on?)'}, paused=True,
-                 findings=['delivery: store down'],
+                 findings=('delivery: store down',),
                  workers={'upload': {'failing': True, 'failures': 12, 'last_error': 'OSError: no space'}})  # fmt: skip
     assert 'refused (is it on?)' in text
     assert line(text, 'upload').split() == ['upload', 'fails', '12', 'times', 'so', 'far:', 'OSError:', 'no', 'space']
@@ -249,7 +252,7 @@ def test_a_thread_that_had_trouble(row: dict[str, Any], words: str | None) -> No
 
 def test_text_of_others_is_shown_and_not_obeyed() -> None:
     """Neither markup nor control characters in names and errors have an effect."""
-    text = shown(topics={'/[red]a[/red]\x1b[31m': a_topic()}, findings=['[bold]x\r\x07\u202e'],
+    text = shown(topics={'/[red]a[/red]\x1b[31m': a_topic()}, findings=('[bold]x\r\x07\u202e',),
                  store={'state': 'paused', 'target': '[link=x]y', 'last_error': 'a[/]\nb'})  # fmt: skip
     for each in ('/[red]a[/red]?[31m', '[bold]x???', '[link=x]y', 'a[/]?b'):
         assert each in text
@@ -258,7 +261,7 @@ def test_text_of_others_is_shown_and_not_obeyed() -> None:
 
 def test_a_node_that_hangs_shows_when_its_figures_were_true() -> None:
     """Not answering: for how long, and its last figures."""
-    text = shown(state='not_answering', running=False, age_s=80.0, findings=['the node has written no status'])
+    text = shown(state='not_answering', age_s=80.0, findings=('the node has written no status',))
     assert line(text, 'thor') == 'thor  NOT ANSWERING for 1 min 20 s, process 12345, version 0.1.0'
     assert line(text, '/imu')
     assert 'the node has written no status' in text

@@ -204,7 +204,7 @@ def test_the_likely_cause_is_reported(stamp_s: float, sent_s: float, state: str,
     assert (report.publisher, report.state, report.cause) == ('p', state, cause)
     assert report.offset_s == (stamp_s if state == 'offset' else None)
     assert report.since_ns == NOW_NS
-    assert describe(report._asdict()).startswith('stamps are ')
+    assert describe(report).startswith('stamps are ')
 
 
 def test_nothing_is_reported_of_stable_and_of_latched_stamps() -> None:

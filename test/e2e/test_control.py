@@ -224,9 +224,9 @@ def test_the_status_file_tells_what_the_ledger_tells(operated: Operated) -> None
 
     def told() -> bool:
         found = status.read(node.home / 'spool', node.robot, clock)
-        assert found['state'] == 'running'
-        return all(found['topics'][name]['stored'] == row['stored'] and not found['topics'][name]['open']
-                   and found['topics'][name]['missed'] == row['missed'] for name, row in rows.items())  # fmt: skip
+        assert found.running
+        return all(found.node.topics[name].stored == row['stored'] and not found.node.topics[name].open
+                   and found.node.topics[name].missed == row['missed'] for name, row in rows.items())  # fmt: skip
 
     until(told, 'the status is that of the ledger')
 

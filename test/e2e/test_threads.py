@@ -7,13 +7,13 @@ import shutil
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 from e2e.processes import HERE, Node, Processes, Publisher, until
 from e2e.reading import STRING, texts
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.status import WorkerStatus
 from shadowhound_data_logger.spool import status
 
 WORKERS = ('intake', 'encode-0', 'spool-writer', 'upload-0')
@@ -32,21 +32,22 @@ class Mortal:
     publisher: Publisher
     orders: Path
 
-    def worker(self, name: str) -> dict[str, Any]:
-        """Its row of the status; with the boot clock of that, ns."""
-        found = status.read(self.node.home / 'spool', self.node.robot, SystemClock.of_this_machine())
-        return {'boot_ns': found.get('boot_ns', 0), **found.get('workers', {}).get(name, {'failures': 0})}
+    def worker(self, name: str) -> tuple[int, WorkerStatus]:
+        """The boot clock of the status, ns, and the thread's part of it."""
+        node = status.read(self.node.home / 'spool', self.node.robot, SystemClock.of_this_machine()).node
+        return node.boot_ns, node.workers.get(name, WorkerStatus())
 
     def order(self, name: str, way: str) -> None:
         (self.orders / f'{name}.{way}').touch()
 
     def seen_after_s(self, name: str, way: str, failures: int) -> float:
         """How long after the death the status tells of it."""
-        row = until(lambda: found if (found := self.worker(name))['failures'] >= failures else None, f'{name} is seen to die')
+        boot_ns, row = until(lambda: found if (found := self.worker(name))[1].failures >= failures else None,
+                             f'{name} is seen to die')  # fmt: skip
         died_ns = int((self.orders / f'{name}.{way}.done').read_text())
-        assert row['failures'] == failures
-        assert f'on order of {name}' in row['last_error']
-        return float(row['boot_ns'] - died_ns) / SECOND
+        assert row.failures == failures
+        assert f'on order of {name}' in row.last_error
+        return float(boot_ns - died_ns) / SECOND
 
 
 @pytest.fixture
@@ -78,9 +79,9 @@ def test_each_thread_dies_and_nothing_is_lost(mortal: Mortal) -> None:
     row = mortal.node.settled('/talk', sent)
     assert (row['received'], row['stored'], row['missed'], row['rejected'], row['dropped']) == (sent, sent, 0, {}, {})
     for name in WORKERS:
-        until(lambda name=name: not mortal.worker(name)['failing'], f'{name} works again')  # type: ignore[misc]
-        last = mortal.worker(name)
-        assert (last['alive'], last['failures'], last['deaths']) == (True, 2, 1)
+        until(lambda name=name: not mortal.worker(name)[1].failing, f'{name} works again')  # type: ignore[misc]
+        _, last = mortal.worker(name)
+        assert (last.alive, last.failures, last.deaths) == (True, 2, 1)
         assert f'{name} died (2 times so far) and tries again' in mortal.node.log
     assert statistics.median(seen_s) < 1.0, seen_s
     assert max(seen_s) < 5.0, seen_s  # a machine that is busy with other things

@@ -23,8 +23,7 @@ SAID = 'by which the node listens, has not found; what it sends is not logged'
 
 
 def findings(node: Node) -> list[str]:
-    found: list[str] = status.read(node.home / 'spool', node.robot, SystemClock.of_this_machine())['findings']
-    return found
+    return list(status.read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).findings)
 
 
 @pytest.mark.long('twelve seconds of two machines')

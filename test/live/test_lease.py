@@ -35,8 +35,8 @@ EXEC = 'import os, sys; os.execvp(sys.argv[1], sys.argv[1:])'
 
 def cap(node: Node) -> float | None:
     """What the node says that uploads are limited to; None before its first status."""
-    found: float | None = read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).get('store', {}).get('max_mbps')
-    return found
+    report = read(node.home / 'spool', node.robot, SystemClock.of_this_machine())
+    return report.node.store.max_mbps if report.running else None
 
 
 def watching(stack: ExitStack, machine: int, url: str, token: str) -> Iterator[float]:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.core.options import MEBI, QueueSettings
-from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, QueueStatus
+from shadowhound_data_logger.core.status import QueueStatus
+from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 
 
 def batch(name: str, size: int = 10, messages: int = 1) -> Batch:
@@ -50,7 +51,7 @@ def test_too_many_messages_drop_as_well() -> None:
     queue = BatchQueue(QueueSettings(), max_messages=10)
     queue.put(batch('old', messages=6), 5)
     assert names(queue.put(batch('new', messages=6), 5)) == ['old']
-    assert queue.status() == QueueStatus(1, 6, 10, max_messages=10)
+    assert queue.status() == QueueStatus(1, 6, 10, 0, 10, QueueSettings().max_bytes)
 
 
 def test_the_newcomer_may_be_the_one_that_is_dropped() -> None:
@@ -102,7 +103,7 @@ def test_it_is_always_within_its_bounds_and_loses_nothing_silently(arrivals: lis
         assert status.messages <= 100
         assert status.batches == len(inside)
     assert sorted(taken(queue)) == sorted(inside)
-    assert queue.status() == QueueStatus(0, 0, 0, max_messages=100)
+    assert queue.status() == QueueStatus(max_messages=100, max_bytes=MEBI)
 
 
 def test_one_can_wait_for_what_is_in_it_now() -> None:

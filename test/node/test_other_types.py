@@ -23,6 +23,7 @@ from std_msgs.msg import Float64, Int32, String
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.core.status import OtherType, Totals
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake import subscriber as module
 from shadowhound_data_logger.node.intake.sampling import Sampler
@@ -30,7 +31,6 @@ from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscribe
 from shadowhound_data_logger.ros import endpoints
 from shadowhound_data_logger.ros.endpoints import Endpoint
 from shadowhound_data_logger.ros.reader import FAST_DDS, PolledGroup
-from shadowhound_data_logger.spool.account_rows import Totals
 from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
 
 pytestmark = pytest.mark.ros
@@ -159,7 +159,7 @@ def test_the_type_that_is_named_wins(
     assert totals.open == 5 + HISTORY
     (row,) = logger.accounts.snapshot({}).topics  # type: ignore[union-attr]
     assert row.rejected == {'wrong_type': refused}
-    said = {STRING: {'publishers': ['/squatter'], 'messages': refused}}
+    said = {STRING: OtherType(('/squatter',), refused)}
     logger.until(lambda: logger.totals('/odom').other_types == said, 'its node is known, which its messages do not wait for')
 
 
@@ -172,13 +172,13 @@ def test_a_type_that_is_not_installed(make: Callable[[str], Any], monkeypatch: p
     robot.create(Int32, '/odom')
     logger.listen('/odom', INT)
     logger.until(lambda: logger.source.status().matched and robot.matched(), 'its own is matched')
-    logger.until(lambda: logger.totals('/odom').other_types.get(STRING, {}).get('publishers'), 'the other one is seen')
+    logger.until(lambda: logger.totals('/odom').other_types.get(STRING, OtherType()).publishers, 'the other one is seen')
     squatter.publish(String())
     robot.publish(*ints(3))
     logger.until(lambda: logger.totals('/odom').received == 3, 'its own are received')
     totals = logger.totals('/odom')
     assert (totals.accounting == EXACT, totals.missed, totals.rejected) == (NUMBERED, 0 if NUMBERED else None, 0)
-    assert totals.other_types == {STRING: {'publishers': ['/squatter'], 'messages': None}}
+    assert totals.other_types == {STRING: OtherType(('/squatter',), None)}
     assert not squatter.matched()
 
 
@@ -191,7 +191,7 @@ def test_a_third_type(make: Callable[[str], Any]) -> None:
     second.create(Float64, '/odom')
     logger.until(lambda: len(logger.totals('/odom').other_types) == 2, 'the second is seen')
     refused = logger.refused('/odom', first, String())
-    messages = {name: row['messages'] for name, row in logger.totals('/odom').other_types.items()}
+    messages = {name: row.messages for name, row in logger.totals('/odom').other_types.items()}
     assert messages == {STRING: refused, FLOAT: None}
 
 
@@ -202,7 +202,7 @@ def test_few_types_are_listened_to(make: Callable[[str], Any], monkeypatch: pyte
     logger.listen('/odom', INT)
     squatter.create(String, '/odom')
     logger.until(lambda: logger.totals('/odom').other_types, 'it is seen')
-    assert logger.totals('/odom').other_types[STRING]['messages'] is None
+    assert logger.totals('/odom').other_types[STRING].messages is None
     assert not squatter.matched()
 
 

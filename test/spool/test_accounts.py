@@ -447,8 +447,8 @@ def test_other_types_are_few() -> None:
         accounts.see_other('/odom', 'b/msg/B1', [f'/{number}'], counted=True, named=True)
     found = accounts.totals()['/odom'].other_types
     assert len(found) == MAX_OTHER_TYPES + 1
-    assert found[MORE_TYPES]['messages'] is None
-    assert len(found['b/msg/B1']['publishers']) == len(found[MORE_TYPES]['publishers']) == MAX_NODES
+    assert found[MORE_TYPES].messages is None
+    assert len(found['b/msg/B1'].publishers) == len(found[MORE_TYPES].publishers) == MAX_NODES
 
 
 def test_without_a_named_type_nobody_knows_whose_messages_are_missed() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,7 @@ def test_the_whole_of_it(spool: Spool, root: Path) -> None:
                 'skipped': 3, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                 'gaps': {'missed': {'transport': 2}, 'rejected': {'truncated': 1}, 'dropped': {'queue_full': 1},
                          'quarantined': {'refused': 1}},
-                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'corrected': {'row_step': 2}, 'stamps': LATE._asdict(),
+                'other_types': {}, 'by_arrival': {'stamp_too_old': 2}, 'corrected': {'row_step': 2}, 'stamps': asdict(LATE),
                 'stored': 3, 'open': 1, 'stored_in': {
                     'delivered': 1, 'pending': 1, 'held': 0, 'evicted': 0, 'quarantined': 1, 'deduplicated': 0, 'kept': 0,
                 },

@@ -20,7 +20,9 @@ from shadowhound_data_logger.core.clock import SECOND, SystemClock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.stamps import CAUSES as OF
-from shadowhound_data_logger.spool.status import file, limits, read, robots
+from shadowhound_data_logger.spool.status import NodeSession, file, limits, not_logged, read, robots, targets
+
+OWN = SpoolSettings(max_bytes=20 << 20, min_free_bytes=10)
 
 
 def written(root: Path, **changes: Any) -> None:
@@ -39,16 +41,16 @@ def child() -> Iterator[int]:
 
 
 def state(root: Path, now_ns: int = NOON_NS) -> str:
-    return str(read(root, 'thor', FakeClock(now_ns))['state'])
+    return read(root, 'thor', FakeClock(now_ns)).state
 
 
 def test_a_fresh_status_is_that_of_a_running_node(tmp_path: Path) -> None:
     """Younger than five seconds by the boot clock, whatever the wall clock says; its figures are handed on as they are."""
     written(tmp_path, topics={'/imu': {'received': 7}}, time='1970-01-01T00:00:00Z')
     found = read(tmp_path, 'thor', FakeClock(NOON_NS + 4 * SECOND))
-    assert (found['state'], found['running'], found['age_s']) == ('running', True, 4.0)
-    assert found['topics']['/imu']['received'] == 7
-    assert found['findings'] == []
+    assert (found.state, found.running, found.age_s) == ('running', True, 4.0)
+    assert found.node.topics['/imu'].received == 7
+    assert found.findings == ()
 
 
 @pytest.mark.parametrize(
@@ -58,9 +60,9 @@ def test_a_status_of_a_node_that_is_no_more(tmp_path: Path, changes: dict[str, A
     """Of another boot, of a clean end, or old and of a process that is gone: not running, and its figures are not shown."""
     written(tmp_path, topics={'/imu': {}}, **changes)
     found = read(tmp_path, 'thor', FakeClock())
-    assert (found['state'], found['running']) == ('not_running', False)
-    assert 'topics' not in found
-    assert 'the node is not running' in found['findings']
+    assert (found.state, found.running) == ('not_running', False)
+    assert not found.node.topics
+    assert 'the node is not running' in found.findings
 
 
 def test_a_process_that_is_silent_is_not_answering(tmp_path: Path, child: int) -> None:
@@ -68,15 +70,15 @@ def test_a_process_that_is_silent_is_not_answering(tmp_path: Path, child: int) -
     clock = SystemClock.of_this_machine()
     written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns())
     found = read(tmp_path, 'thor', Ahead(clock.boot_id))
-    assert (found['state'], found['running'], found['pid']) == ('not_answering', False, child)
-    assert any(f'process {child}' in line for line in found['findings'])
+    assert (found.state, found.running, found.node.pid) == ('not_answering', False, child)
+    assert any(f'process {child}' in line for line in found.findings)
 
 
 def test_a_later_process_of_the_same_number_is_not_the_node(tmp_path: Path, child: int) -> None:
     """Process ids are given out again: one that began after the status was written did not write it."""
     clock = SystemClock.of_this_machine()
     written(tmp_path, pid=child, boot_id=clock.boot_id, boot_ns=clock.boot_ns() - 3600 * SECOND)
-    assert read(tmp_path, 'thor', clock)['state'] == 'not_running'
+    assert read(tmp_path, 'thor', clock).state == 'not_running'
 
 
 class Ahead(SystemClock):
@@ -86,20 +88,47 @@ class Ahead(SystemClock):
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 6 * SECOND
 
 
-@pytest.mark.parametrize('content', ['', '{"robot": "th', '[]', '{"topics": 3}', '{"store": null, "queue": []}', '\x00\x00'])
-def test_half_a_file_is_none(tmp_path: Path, content: str) -> None:
-    """A power cut may leave anything of a file that is never synced: that is not an error."""
-    file(tmp_path, 'thor').write_text(content)
-    assert state(tmp_path) == 'not_running'
+@pytest.mark.parametrize(
+    'content',
+    [
+        '',
+        '{"robot": "th',
+        '[]',
+        '{"topics": 3}',
+        '{"store": null, "queue": []}',
+        '\x00\x00',
+        '{"topics": {"/imu": {"received": "7"}}}',
+        '{"workers": {"intake": [1]}}',
+        '{"topics": {"/imu": {"other_types": {"x/msg/Y": {"publishers": [3]}}}}}',
+        '{"boot_ns": 1.5}',
+        '{"topics": {"/imu": {"stamps": {}}}}',
+        '[' * 100_000,
+    ],
+)
+def test_a_damaged_file_is_a_finding(tmp_path: Path, content: str) -> None:
+    """A power cut may damage a file that is never synced; another version may write other types. No reader fails."""
+    path = file(tmp_path, 'thor')
+    path.write_text(content)
+    found = read(tmp_path, 'thor', FakeClock())
+    assert found.state == 'not_running'
+    assert any(line.startswith(f'the status {path} cannot be read: ') for line in found.findings)
+    assert (targets(tmp_path), not_logged(tmp_path, 'thor'), limits(tmp_path, OWN)) == ([], {}, OWN)
+
+
+def test_fields_of_a_newer_node_are_ignored(tmp_path: Path) -> None:
+    """At the top, in a section and in a topic; all other figures are read."""
+    written(tmp_path, mood='good', store={'mood': 1, 'delivered': 5}, topics={'/imu': {'mood': [], 'received': 7}})
+    found = read(tmp_path, 'thor', FakeClock()).node
+    assert (found.store.delivered, found.topics['/imu'].received) == (5, 7)
 
 
 def test_figures_that_another_version_does_not_write_have_defaults(tmp_path: Path) -> None:
     """A program that is newer than the node that runs can still show its status."""
     written(tmp_path, topics={'/imu': {}}, workers={'intake': {}})
     found = read(tmp_path, 'thor', FakeClock())
-    assert found['topics']['/imu']['missed'] is None
-    assert found['store']['blocked_buckets'] == {}
-    assert found['workers']['intake']['failing'] is False
+    assert found.node.topics['/imu'].missed is None
+    assert found.node.store.blocked_buckets == {}
+    assert found.node.workers['intake'].failing is False
 
 
 def test_without_a_node_the_index_tells(tmp_path: Path) -> None:
@@ -115,11 +144,12 @@ def test_without_a_node_the_index_tells(tmp_path: Path) -> None:
     spool.close()
     written(tmp_path / 'spool', ended=True, boot_ns=clock.now_ns)
     found = read(tmp_path / 'spool', 'thor', clock)
-    assert found['session'] == {'started': '2025-10-18T12:00:00.000000Z', 'ended': '2025-10-18T12:01:30.000000Z'}
-    pile = found['spool']
-    assert (pile['pending'], pile['held'], pile['quarantined'], pile['bytes']) == (1, 1, 1, 6)
-    assert (pile['oldest_age_s'], pile['max_bytes']) == (90.0, 1000)
-    assert pile['free_bytes'] > 0
+    assert found.session == NodeSession('2025-10-18T12:00:00.000000Z', '2025-10-18T12:01:30.000000Z')
+    pile = found.spool
+    assert pile
+    assert (pile.pending, pile.held, pile.quarantined, pile.bytes) == (1, 1, 1, 6)
+    assert (pile.oldest_age_s, pile.max_bytes) == (90.0, 1000)
+    assert pile.free_bytes
 
 
 def test_a_session_that_was_cut_off_has_no_end(tmp_path: Path) -> None:
@@ -128,7 +158,7 @@ def test_a_session_that_was_cut_off_has_no_end(tmp_path: Path) -> None:
     spool.open()
     found = read(tmp_path / 'spool', 'thor', FakeClock())
     spool.close()
-    assert found['session'] == {'started': '2025-10-18T12:00:00.000000Z', 'ended': None}
+    assert found.session == NodeSession('2025-10-18T12:00:00.000000Z', None)
 
 
 def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
@@ -141,18 +171,20 @@ def test_the_session_is_that_of_the_node(tmp_path: Path) -> None:
         index.execute('UPDATE sessions SET pid = pid + 1 WHERE id = 2')
         index.commit()
     written(tmp_path, ended=True)
-    assert read(tmp_path, 'thor', FakeClock())['session']['started'] == '2025-10-18T12:00:00.000000Z'
+    session = read(tmp_path, 'thor', FakeClock()).session
+    assert session
+    assert session.started == '2025-10-18T12:00:00.000000Z'
 
 
 def test_no_spool_and_a_damaged_one_are_answers(tmp_path: Path) -> None:
     """Both are told among the findings, and leave the spool unknown."""
     found = read(tmp_path, 'thor', FakeClock())
-    assert found['spool'] is None
-    assert any(str(tmp_path) in line for line in found['findings'])
+    assert found.spool is None
+    assert any(str(tmp_path) in line for line in found.findings)
     (tmp_path / 'index.db').write_bytes(b'no database' * 1000)
     found = read(tmp_path, 'thor', FakeClock())
-    assert found['spool'] is None
-    assert any('cannot be read' in line for line in found['findings'])
+    assert found.spool is None
+    assert any('cannot be read' in line for line in found.findings)
 
 
 MANY = {'/a': {'missed': 1}, '/b': {'missed': 4_000}, '/c': {'missed': 1}, '/d': {'missed': 2}, '/e': {'missed': 0}}
@@ -205,14 +237,14 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
 def test_what_somebody_should_look_at(tmp_path: Path, changes: dict[str, Any], finding: str) -> None:
     """Each loss and each fault of a running node is a finding."""
     written(tmp_path, **changes)
-    assert finding in read(tmp_path, 'thor', FakeClock())['findings']
+    assert finding in read(tmp_path, 'thor', FakeClock()).findings
 
 
 @pytest.mark.parametrize('name', ['idle', 'shipping', 'not_draining'])
 def test_a_store_that_works_is_no_finding(tmp_path: Path, name: str) -> None:
     """Nor is one that another process delivers to, nor what lies in quarantine from before."""
     written(tmp_path, store={'state': name}, spool={'quarantined': 5}, topics={'/imu': {'skipped': 9, 'open': 3}})
-    assert read(tmp_path, 'thor', FakeClock())['findings'] == []
+    assert read(tmp_path, 'thor', FakeClock()).findings == ()
 
 
 def test_the_robots_that_have_written_here(tmp_path: Path) -> None:
@@ -227,7 +259,7 @@ def test_the_robots_that_have_written_here(tmp_path: Path) -> None:
 def test_a_clock_that_is_not_set_is_a_finding(tmp_path: Path, words: str, *, gave_up: bool) -> None:
     """And so is what that means for the objects."""
     written(tmp_path, clock={'is_set': False, 'gave_up': gave_up})
-    assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock())['findings']
+    assert f'the clock of this machine is not set: {words}' in read(tmp_path, 'thor', FakeClock()).findings
 
 
 def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
@@ -245,9 +277,8 @@ def test_an_age_that_nobody_knows(tmp_path: Path) -> None:
 
 def test_others_keep_to_what_the_node_was_told(tmp_path: Path) -> None:
     """The widest of several nodes' limits; where none has run, or an old one did not say, those of one's own."""
-    own = SpoolSettings(max_bytes=20 << 20, min_free_bytes=10)
-    assert limits(tmp_path, own) == own
+    assert limits(tmp_path, OWN) == OWN
     written(tmp_path, spool={'max_bytes': 9 << 20})
-    assert limits(tmp_path, own) == SpoolSettings(max_bytes=9 << 20, min_free_bytes=10)
+    assert limits(tmp_path, OWN) == SpoolSettings(max_bytes=9 << 20, min_free_bytes=10)
     written(tmp_path, robot='tachi', spool={'max_bytes': 50 << 20, 'min_free_bytes': 0, 'remember_days': 30.0})
-    assert limits(tmp_path, own) == SpoolSettings(max_bytes=50 << 20, min_free_bytes=0, remember_days=30.0)
+    assert limits(tmp_path, OWN) == SpoolSettings(max_bytes=50 << 20, min_free_bytes=0, remember_days=30.0)

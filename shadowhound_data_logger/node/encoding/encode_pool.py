@@ -12,12 +12,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.core.model import Batch, DataObject
 from shadowhound_data_logger.core.stamps import by_arrival
+from shadowhound_data_logger.core.status import QueueStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.registry import encode
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -37,18 +37,6 @@ Marking = Callable[[DataObject], DataObject]
 """Gives an object more metadata, or another name; from any thread."""
 Preview = Callable[[DataObject], 'DataObject | None']
 Observe = Callable[[Batch, 'DataObject | None'], None]
-
-
-@dataclass(frozen=True, slots=True)
-class QueueStatus:
-    """How full the queue is."""
-
-    batches: int
-    messages: int
-    bytes: int
-    finished: int = 0
-    """Batches that were taken from it and are done."""
-    max_messages: int = MAX_MESSAGES
 
 
 class BatchQueue:
@@ -137,7 +125,7 @@ class BatchQueue:
     def status(self) -> QueueStatus:
         with self._lock:
             batches = sum(len(lane) for lane in self._lanes.values())
-            return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages)
+            return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages, self._max_bytes)
 
     def _first(self) -> int:
         """The number of the oldest batch that is not done, or of the next one."""

@@ -16,11 +16,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.options import MEBI, RMW_AUTO, RMW_FASTRTPS, RMW_ROBOT, CaptureSettings
 from shadowhound_data_logger.core.ros_arguments import ParametersUnreadable, parameter
+from shadowhound_data_logger.core.status import MiddlewareStatus
 from shadowhound_data_logger.node.intake.dds_network import LOCALHOST_ONLY, PEERS, RANGE, Network, profile, robot_network
 from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED, TRANSPORTS
 
@@ -99,12 +100,9 @@ class Middleware:
                 else:
                     environ[self.profile_variable] = before
 
-    def status(self) -> dict[str, Any]:
-        """For the status of the node."""
-        found = sockets()
-        return {'rmw': self.rmw, 'robot': self.robot, 'why': self.why, 'asked': self.asked,
-                'network': self.network.describe() if self.network is not None else '',
-                'receive_bytes': found.receive_bytes, 'dropped_datagrams': found.dropped}  # fmt: skip
+    def status(self) -> MiddlewareStatus:
+        found, network = sockets(), self.network.describe() if self.network is not None else ''
+        return MiddlewareStatus(self.rmw, self.robot, self.why, self.asked, network, found.receive_bytes, found.dropped)
 
     def describe(self) -> str:
         """``rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: ...), on all interfaces, receive buffer 4.0 MB``."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.status import UnheardTopic
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class Unheard:
         self._monotonic = monotonic
         self._reported_s: float | None = None
         self._since_s: dict[tuple[str, str], float] = {}
-        self._rows: dict[str, dict[str, Any]] = {}
+        self._rows: dict[str, UnheardTopic] = {}
 
     def compare(self, report: _Report) -> dict[str, Any]:
         """Take a report of the publishers that the front finds beyond those told to it; what it needs to make the next one."""
@@ -71,7 +72,7 @@ class Unheard:
             del self._rows[topic]
         return {'topics': sorted(topics), 'gids': sorted(set().union(*known.values()))}
 
-    def rows(self) -> dict[str, dict[str, Any]] | None:
+    def rows(self) -> Mapping[str, UnheardTopic] | None:
         """The topics with such publishers, and what is to be said of each; None while nobody compares."""
         if self._reported_s is None or self._monotonic() - self._reported_s > SILENT_S:
             return None
@@ -90,8 +91,8 @@ class Unheard:
         count, what = (f'{len(publishers)}{more} publishers', 'they send') if len(publishers) > 1 else ('a publisher', 'it sends')
         text = (f'{topic} is not all heard: {self._robot} finds {count}{whose} that {self._rmw}, by which the node listens, '
                 f'has not found; what {what} is not logged')  # fmt: skip
-        self._rows[topic] = {'publishers': len(publishers), 'nodes': nodes, 'seconds': seconds, 'text': text}
-        if before is None or len(publishers) > before['publishers']:
+        self._rows[topic] = UnheardTopic(len(publishers), tuple(nodes), seconds, text)
+        if before is None or len(publishers) > before.publishers:
             log.error('%s, for %d s now: %s', text, seconds, REMEDY)
 
 

@@ -22,6 +22,7 @@ from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, Taken
 from shadowhound_data_logger.core.options import EventSettings
 from shadowhound_data_logger.core.rules import Rule, read_rule
+from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, TopicChoice
 from shadowhound_data_logger.node.recording.bags import profiles_offered
@@ -59,8 +60,8 @@ class UploadRules:
     """
 
     def __init__(self, node: Node, settings: Settings, types: MessageTypes, clock: ClockWatch,
-                 mission: Callable[[], Mapping[str, Any]]) -> None:  # fmt: skip
-        """``mission`` tells what is active (``MissionWatch.status``)."""
+                 mission: Callable[[], MissionStatus]) -> None:  # fmt: skip
+        """``mission`` returns the active mission (``MissionWatch.status``)."""
         texts = {UPLOAD_WHEN: settings.upload.when, EVENTS_WHEN: settings.events.when, KEEP_WHEN: settings.keep.when}
         read = {name: read_rule(text, name) for name, text in texts.items()}
         self._rules: dict[str, Rule] = {name: rule for name, rule in read.items() if rule is not None}
@@ -140,7 +141,7 @@ class UploadRules:
 
     def mission(self) -> str | None:
         active = self._mission()
-        return str(active.get('type', '')) if active else None
+        return active.type if active else None
 
 
 def wifi_networks(interfaces: Path = INTERFACES, ask: Callable[..., Any] = fcntl.ioctl) -> Collection[str] | str:

@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
 from shadowhound_data_logger.bags.local import RECORDS, local_files
-from shadowhound_data_logger.bags.manifest import Manifest
+from shadowhound_data_logger.bags.manifest import Manifest, MissionOf
 from shadowhound_data_logger.bags.naming import MANIFEST, unsynced_mark
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
@@ -229,7 +229,7 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
 def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worker], wanted: _Wanted,
                 stop: StopSignals) -> tuple[str, int]:  # fmt: skip
     """Record; the name of the bag when it began, and how many messages were dropped meanwhile."""
-    recorder.on_mission({'type': wanted.name, 'mission_id': None})
+    recorder.on_mission(MissionOf(wanted.name, None, None))
     done, bag = recorder.start()
     if not done:
         raise BagError(f'no bag was recorded: {bag}')

@@ -6,13 +6,13 @@ Messages come from the one subscription that serves objects and bags as well.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rclpy.node import Node
 
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
+from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import Lot
 from shadowhound_data_logger.bags.recovery import BagRecovery
@@ -100,11 +100,11 @@ class EventBuffer:
         if self._watch is not None:
             self._watch.update(settings.log_event)
 
-    def on_mission(self, told: Mapping[str, Any]) -> None:
-        """Which mission is active now; empty for none."""
-        self.events.on_mission(told)
+    def on_mission(self, mission: MissionOf | None) -> None:
+        """The mission that is active now."""
+        self.events.on_mission(mission)
         if self._watch is not None:
-            self._watch.on_mission(told)
+            self._watch.on_mission(mission)
 
     def _make_watch(self, options: EventSettings, home: Path, place: BagPlace, types: MessageTypes) -> EventWatch | None:
         if self.consumer is None:

@@ -11,12 +11,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject
+from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import now_ns
@@ -47,8 +48,8 @@ class MissionWatch:
     """
 
     def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, observer: MissionObserver,
-                 tell: Callable[[Mapping[str, Any]], None]) -> None:  # fmt: skip
-        """``tell`` is given what is active whenever that changes; empty when nothing is."""
+                 tell: Callable[[MissionStatus], None]) -> None:  # fmt: skip
+        """``tell`` is called with ``status()`` whenever it changes."""
         self._settings = settings.mission
         self._intake = intake
         self._sampler = sampler
@@ -83,13 +84,13 @@ class MissionWatch:
             self._log.close()
             self._log = None
 
-    def status(self) -> dict[str, Any]:
-        """What is active, as ``~/mission`` says it; empty when nothing is."""
+    def status(self) -> MissionStatus:
+        """The active mission, as ``~/mission`` reports it; false if there is none."""
         mission = self._mission
         if mission is None:
-            return {}
-        return {'mission_id': mission.id, 'run_id': self._marks.get(words.RUN_ID), 'type': mission.mission_type,
-                'started': iso(mission.start_ns), 'policy': self._policies.current()}  # fmt: skip
+            return MissionStatus()
+        run_id, policy = self._marks.get(words.RUN_ID), self._policies.current()
+        return MissionStatus(mission.id, run_id, mission.mission_type, iso(mission.start_ns), policy)
 
     # -- for the encoders ------------------------------------------------------------------------------------------
 
@@ -156,7 +157,7 @@ class MissionWatch:
         self._last = replace(over, end_ns=noticed_ns if over.end_ns is None else over.end_ns), self._marks
         self._mission, self._marks = None, {}
         log.info('mission %s has ended', mission.id)
-        self._tell({})
+        self._tell(MissionStatus())
 
     def _set_idle(self, *, idle: bool) -> bool:
         if self._settings.capture == 'mission':

@@ -11,10 +11,11 @@ import math
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.recorder import Answer
 from shadowhound_data_logger.core.clock import SECOND, Clock
 from shadowhound_data_logger.core.errors import Rejected
@@ -170,9 +171,9 @@ class EventWatch:
         """Go on by another expression."""
         self._wanted = _compiled(log_event)
 
-    def on_mission(self, told: Mapping[str, Any]) -> None:
-        """Which mission is active now (``MissionWatch.status``); empty for none."""
-        self._missions = (str(told['mission_id']),) if told else ()
+    def on_mission(self, mission: MissionOf | None) -> None:
+        """The mission that is active now."""
+        self._missions = (mission.mission_id,) if mission is not None and mission.mission_id else ()
 
     def _step(self) -> None:
         self._wake.wait(LOOK_S)

@@ -14,10 +14,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 from shadowhound_data_logger.bags.recorder import Answer
+from shadowhound_data_logger.core.dataclass_json import as_plain, fields_of
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.mailbox import RequestRefused
-from shadowhound_data_logger.node.reporting.diagnostics import told
+from shadowhound_data_logger.node.reporting.diagnostics import plain_entries
 from shadowhound_data_logger.node.reporting.status import Stages, Status
 from shadowhound_data_logger.spool.act_record import ActRecord
 
@@ -199,15 +200,15 @@ class Commands:
     def _tell_status(self) -> Answer | dict[str, Any]:
         """Of up to a second ago."""
         status = self._status.latest
-        return {'status': status} if status else (False, 'there is no status yet')
+        return {'status': as_plain(status)} if status else (False, 'there is no status yet')
 
     def _tell_mission(self) -> dict[str, Any]:
-        return {'mission': self._stages.mission.status()}
+        return {'mission': fields_of(self._stages.mission.status())}
 
     def _diagnose(self) -> Answer | dict[str, Any]:
         """What /diagnostics says of up to a second ago."""
         status = self._status.latest
-        return {'diagnostics': told(status, self._status.earlier)} if status else (False, 'there is no status yet')
+        return {'diagnostics': plain_entries(status, self._status.earlier)} if status else (False, 'there is no status yet')
 
     def _describe(self) -> dict[str, Any]:
         return {'node': self._node, 'pid': os.getpid(), 'version': self._status.version, 'commands': list(self._known)}

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any, Final
 
+from shadowhound_data_logger.core.status import NodeStatus, TopicStatus, WorkerStatus
+
 log = logging.getLogger(__name__)
 
 ENCODE_S: Final = 10.0
@@ -60,9 +62,9 @@ class Watchdog:
         self._encoding, self._delivering = _Progress(), _Progress()
         self._told: Stalls = {}
 
-    def look(self, status: Mapping[str, Any], now_s: float) -> Stalls:
+    def look(self, status: NodeStatus, now_s: float) -> Stalls:
         """What stands still; ``now_s`` is monotonic time."""
-        stuck = {name: text for name, row in status['workers'].items() if (text := _hanging(name, row))}
+        stuck = {name: text for name, row in status.workers.items() if (text := _hanging(name, row))}
         writes = 'spool-writer' not in stuck and not _failing(status, 'spool-writer')
         found = {name: text for name, text in stuck.items() if writes or not name.startswith('encode-')}
         found |= self._topics(status, now_s, takes='intake' not in stuck and not _failing(status, 'intake'))
@@ -79,27 +81,27 @@ class Watchdog:
             log.info('%s: working again', name)
         self._told = found
 
-    def _topics(self, status: Mapping[str, Any], now_s: float, *, takes: bool) -> dict[str, str]:
+    def _topics(self, status: NodeStatus, now_s: float, *, takes: bool) -> dict[str, str]:
         found = {}
-        for topic, row in status['topics'].items():
+        for topic, row in status.topics.items():
             text = self._detectors.setdefault(topic, SilenceDetector(topic)).look(row, now_s)
             if text and takes:  # else all of them seem to be silent
                 found[topic] = text
         return found
 
-    def _encode(self, status: Mapping[str, Any], now_s: float) -> str:
-        queue = status['queue']
-        idle_s = self._encoding.idle_s(queue['finished'], now_s, waiting=bool(queue['batches']))
+    def _encode(self, status: NodeStatus, now_s: float) -> str:
+        queue = status.queue
+        idle_s = self._encoding.idle_s(queue.finished, now_s, waiting=bool(queue.batches))
         if idle_s <= ENCODE_S:
             return ''
-        errors = {row['last_error'] for name, row in status['workers'].items() if name.startswith('encode-') and row['failing']}
+        errors = {row.last_error for name, row in status.workers.items() if name.startswith('encode-') and row.failing}
         why = f'the encoders fail ({"; ".join(sorted(errors))})' if errors else 'the encoders are busy with what they have'
-        return f'no batch was encoded for {idle_s:.0f} s and {queue["batches"]} wait: {why}; has this machine a core to spare?'
+        return f'no batch was encoded for {idle_s:.0f} s and {queue.batches} wait: {why}; has this machine a core to spare?'
 
-    def _deliver(self, status: Mapping[str, Any], now_s: float) -> str:
-        store, pending = status['store'], status['spool']['pending']
-        waiting = bool(pending) and store['state'] in {'idle', 'shipping'}
-        moved = store['delivered'], store['quarantined'], now_s if store['mbps'] else 0.0
+    def _deliver(self, status: NodeStatus, now_s: float) -> str:
+        store, pending = status.store, status.spool.pending
+        waiting = bool(pending) and store.state in {'idle', 'shipping'}
+        moved = store.delivered, store.quarantined, now_s if store.mbps else 0.0
         idle_s = self._delivering.idle_s(moved, now_s, waiting=waiting)
         if idle_s <= self._delivery_s:
             return ''
@@ -119,27 +121,28 @@ class _Progress:
         return now_s - self._since_s
 
 
-def _failing(status: Mapping[str, Any], name: str) -> bool:
-    return bool(status['workers'].get(name, {}).get('failing'))
+def _failing(status: NodeStatus, name: str) -> bool:
+    worker = status.workers.get(name)
+    return worker is not None and worker.failing
 
 
-def _hanging(name: str, row: Mapping[str, Any]) -> str:
+def _hanging(name: str, row: WorkerStatus) -> str:
     """What it means that this thread is stuck; empty where it is not."""
-    busy_s = row['busy_s']
-    if row['patience_s'] is None or busy_s <= row['patience_s']:
+    busy_s = row.busy_s
+    if row.patience_s is None or busy_s <= row.patience_s:
         return ''
     return _HANGING.get(name, _HANGS_ENCODING).format(s=f'{busy_s:.0f} s')
 
 
-def _why_undelivered(status: Mapping[str, Any]) -> str:
-    store = status['store']
-    errors = {row['last_error'] for name, row in status['workers'].items() if name.startswith('upload-') and row['failing']}
+def _why_undelivered(status: NodeStatus) -> str:
+    store = status.store
+    errors = {row.last_error for name, row in status.workers.items() if name.startswith('upload-') and row.failing}
     if errors:
         return f'the upload threads fail ({"; ".join(sorted(errors))})'
-    if store['in_flight']:
-        return f'{store["in_flight"]} uploads hang without an end; does the disk of the store hang, is the network too slow?'
-    if store['deferred']:
-        return f'{store["deferred"]} objects fail again and again: {store["last_error"]}'
+    if store.in_flight:
+        return f'{store.in_flight} uploads hang without an end; does the disk of the store hang, is the network too slow?'
+    if store.deferred:
+        return f'{store.deferred} objects fail again and again: {store.last_error}'
     return 'nothing is under way, which is a defect of this program; start the node again'
 
 
@@ -153,42 +156,42 @@ class SilenceDetector:
         self._heard_s: float | None = None
         self._received = 0
 
-    def look(self, row: Mapping[str, Any], now_s: float) -> str:
+    def look(self, row: TopicStatus, now_s: float) -> str:
         """Return what is wrong with the topic; empty where nothing is."""
-        if not row['enabled'] or not row['publishers']:
+        if not row.enabled or not row.publishers:
             self._since_s = None
             return ''
-        received = row['received'] - row['wrong_type']
+        received = row.received - row.wrong_type
         if self._since_s is None:  # a new publisher has a period of its own
             self._since_s, self._heard_s, self._received = now_s, None, received
             self._pauses.clear()
         if received > self._received:
             self._hear(row, received, now_s)
-        if row['unavailable']:
-            return f'it cannot be subscribed to here: {row["unavailable"]}'
+        if row.unavailable:
+            return f'it cannot be subscribed to here: {row.unavailable}'
         return self._unheard(row, now_s - self._since_s) if self._heard_s is None else self._stopped(row, now_s - self._heard_s)
 
-    def _hear(self, row: Mapping[str, Any], received: int, now_s: float) -> None:
-        heard_s = now_s - (row['age_s'] or 0.0)
+    def _hear(self, row: TopicStatus, received: int, now_s: float) -> None:
+        heard_s = now_s - (row.age_s or 0.0)
         if self._heard_s is not None:
             self._pauses.append((heard_s - self._heard_s, received - self._received))
         self._heard_s, self._received = heard_s, received
 
-    def _unheard(self, row: Mapping[str, Any], waited_s: float) -> str:
-        if not row['matched'] and waited_s > UNMATCHED_S:
+    def _unheard(self, row: TopicStatus, waited_s: float) -> str:
+        if not row.matched and waited_s > UNMATCHED_S:
             hint = f'compare type and QoS (ros2 topic info -v {self._topic}), and the firewall between the two machines'
             return f'its publisher has been there for {waited_s:.0f} s without a connection to it; {hint}'
-        if row['matched'] and not row['may_be_silent'] and waited_s > UNHEARD_S:
+        if row.matched and not row.may_be_silent and waited_s > UNHEARD_S:
             hint = f'does it publish (ros2 topic hz {self._topic}), and do large messages get through the network?'
             return f'its publisher has been connected for {waited_s:.0f} s and not one message came; {hint}'
         return ''
 
-    def _stopped(self, row: Mapping[str, Any], silent_s: float) -> str:
-        if row['may_be_silent'] or len(self._pauses) < ARRIVALS:
+    def _stopped(self, row: TopicStatus, silent_s: float) -> str:
+        if row.may_be_silent or len(self._pauses) < ARRIVALS:
             return ''
         pauses = [pause for pause, _ in self._pauses]
         period_s = sum(pauses) / sum(count for _, count in self._pauses)
         if max(pauses) > EVEN * median(pauses) or silent_s <= max(SILENT_S, SILENT_PERIODS * period_s):
             return ''
-        why = 'look at the program that publishes it' if row['matched'] else 'the connection to it is gone: look at the network'
+        why = 'look at the program that publishes it' if row.matched else 'the connection to it is gone: look at the network'
         return f'silent for {silent_s:.0f} s after {1 / period_s:.3g} Hz, though its publisher is there; {why}'

@@ -12,7 +12,6 @@ from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.node.intake.middleware import (
     FROM_PROFILE,
     MAX_BUFFER,
-    Middleware,
     choose,
     possible_buffer,
     requested_rmw,
@@ -165,9 +164,3 @@ def test_the_buffer_is_read_back() -> None:
         for _ in range(100):
             sender.sendto(bytes(1000), receiver.getsockname())
         assert sockets().dropped > before.dropped
-
-
-def test_the_status_tells_all_of_it() -> None:
-    """For ``shadowhound-data status --json`` and the doctor."""
-    said = Middleware('auto', 'rmw_fastrtps_cpp', 'rmw_fastrtps_cpp', "the robot's own").status()
-    assert said.keys() == {'rmw', 'robot', 'why', 'asked', 'network', 'receive_bytes', 'dropped_datagrams'}

@@ -33,7 +33,7 @@ class Robot:
     @property
     def texts(self) -> dict[str, str] | None:
         rows = self.unheard.rows()
-        return None if rows is None else {topic: row['text'] for topic, row in rows.items()}
+        return None if rows is None else {topic: row.text for topic, row in rows.items()}
 
 
 def test_it_is_said_after_a_while_and_ends_when_it_is_heard(caplog: pytest.LogCaptureFixture) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.keeping import upload_rules
 from shadowhound_data_logger.node.keeping.upload_rules import STALE_S, UploadRules, wifi_networks
@@ -69,7 +70,7 @@ def test_a_rule_about_a_topic_that_nobody_publishes_is_told(monkeypatch: pytest.
     monkeypatch.setattr(upload_rules, 'time', SimpleNamespace(monotonic=lambda: now_s[0]))
     node: Any = SimpleNamespace(resolve_topic_name=lambda topic: f'/{topic}', count_publishers=publishers.__getitem__)
     settings = Settings.load({'upload.when': 'lowstate:bms_state.soc > 30'}, {})
-    rules = UploadRules(node, settings, MessageTypes([]), SimpleNamespace(is_set=True), dict)  # type: ignore[arg-type]
+    rules = UploadRules(node, settings, MessageTypes([]), SimpleNamespace(is_set=True), MissionStatus)  # type: ignore[arg-type]
     for passed_s, is_told in ((0.0, False), (STALE_S - 1, False), (STALE_S, True), (STALE_S + 1, True)):
         now_s[0] = 1000.0 + passed_s
         assert 'upload.when' in rules.look()

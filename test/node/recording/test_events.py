@@ -15,6 +15,7 @@ from bags.recording import NOON_NS, lot, messages
 from clocks import Clocks
 from e2e.reading import STRING
 
+from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.ring import Held, Ring
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.model import Taken
@@ -191,13 +192,13 @@ def test_what_an_agent_logs_triggers_as_it_is_wanted(tmp_path: Path) -> None:
     folder.path.mkdir(parents=True)
     journal = Journal(folder.journal)
     journal.create()
-    watched.watch.on_mission({'mission_id': 'patrol_1', 'type': 'patrol'})
+    watched.watch.on_mission(MissionOf('patrol', 'patrol_1', None))
     journal.append({'k': 'event', 't': NOON_NS, 'name': 'way_point'})
     journal.append({'k': 'event', 't': NOON_NS, 'name': 'fall', 'data': {'leg': 2}})
     watched.watch._step()
     assert watched.triggered == [('fall', 'log_event', '{"leg": 2}')]
     journal.append({'k': 'event', 't': NOON_NS, 'name': 'failed'})
-    watched.watch.on_mission({})
+    watched.watch.on_mission(None)
     watched.watch._step()
     journal.append({'k': 'event', 't': NOON_NS, 'name': 'fifth'})
     watched.watch._step()

@@ -19,6 +19,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.core.options import POINT_CLOUD
+from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.formats.registry import encode
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions import journal
@@ -63,11 +64,9 @@ class Setting:
     def __init__(self, home: Path, **parameters: object) -> None:
         settings = given(parameters, home)
         self.intake: Any = Intake()
-        self.told: list[dict[str, Any]] = []
+        self.told: list[MissionStatus] = []
         queue = BatchQueue(settings.queue)
-        self.watch = MissionWatch(
-            settings, self.intake, self.intake, queue, new_observer(**parameters), lambda said: self.told.append(dict(said))
-        )
+        self.watch = MissionWatch(settings, self.intake, self.intake, queue, new_observer(**parameters), self.told.append)
         self.watch.open()
 
     def stop(self) -> None:
@@ -132,10 +131,10 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     assert setting.watch.mark(thing(NOON_NS)).metadata == {'robot': 'thor'}
     mission_id = logger.start_mission('patrol', '')
     until(setting.watch.status, 'the mission is noticed')
-    assert setting.watch.status()['policy'] is None
+    assert setting.watch.status().policy is None
     (tmp_path / 'policies').mkdir()
     (tmp_path / 'policies' / 'current').symlink_to('versions/go2_patrol@7#0123456789abcdef')
-    assert setting.watch.status()['policy'] == 'go2_patrol@7#0123456789abcdef'
+    assert setting.watch.status().policy == 'go2_patrol@7#0123456789abcdef'
     (folder,) = missions(tmp_path)
     start_ns = int(journal.first(folder.journal)['t'])
     marked = {'robot': 'thor', 'mission_id': mission_id, 'mission_type': 'patrol'}
@@ -148,7 +147,7 @@ def test_objects_of_the_missions_time_are_marked(tmp_path: Path, opened: ExitSta
     end_ns = int(journal.last(folder.journal)['t'])
     assert setting.watch.mark(thing(end_ns)).metadata == {**marked, 'run_id': 'run7'}, 'it was on its way'
     assert setting.watch.mark(thing(end_ns + 1)).metadata == {'robot': 'thor'}
-    assert [told.get('run_id', 'none') for told in setting.told] == [None, 'run7', 'none']
+    assert [(bool(told), told.run_id) for told in setting.told] == [(True, None), (True, 'run7'), (False, None)]
 
 
 def test_a_mark_has_the_agent_s_spelling(tmp_path: Path, opened: ExitStack) -> None:

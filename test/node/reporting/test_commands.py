@@ -11,8 +11,10 @@ import pytest
 from spool.making import NOON_NS, FakeClock
 
 from shadowhound_data_logger.core.config import KeepSettings
+from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.mailbox import request_id
+from shadowhound_data_logger.core.status import MissionStatus, NodeStatus
 from shadowhound_data_logger.node.intake.intake import _each
 from shadowhound_data_logger.node.reporting.commands import Commands
 from shadowhound_data_logger.node.reporting.interface import SWITCHES, TRIGGERS
@@ -32,7 +34,7 @@ class Stages:
         self.intake = self.queue = self.recorder = self.events = self.mission = self.uploader = self
         self.event_buffer = SimpleNamespace(events=self)
         self.writer = Writer(self)
-        self.latest: Mapping[str, Any] | None = None
+        self.latest: NodeStatus | None = None
         self.earlier: Mapping[str, Any] | None = None
         self.version = '1'
         self.requests: Any = None
@@ -76,8 +78,8 @@ class Stages:
         self.asked.append((*given, who))
         return True, 'event_1 begins'
 
-    def status(self) -> dict[str, Any]:
-        return {'mission_id': 'patrol_1'}
+    def status(self) -> MissionStatus:
+        return MissionStatus('patrol_1')
 
 
 class Writer:
@@ -255,9 +257,9 @@ def test_what_it_tells() -> None:
     """Parameters, the mission that is active, the last status, and itself."""
     stages = Stages()
     commands = stages.commands()
-    stages.latest = {'robot': 'thor', 'topics': {}}
-    assert commands.answer({'do': 'status'})['status'] == stages.latest
-    assert commands.answer({'do': 'mission'})['mission'] == {'mission_id': 'patrol_1'}
+    stages.latest = NodeStatus(robot='thor')
+    assert commands.answer({'do': 'status'})['status'] == as_plain(stages.latest)
+    assert commands.answer({'do': 'mission'})['mission']['mission_id'] == 'patrol_1'
     assert ask(commands, 'set', values={'camera.rate_hz': 5}) == (True, 'set')
     assert commands.answer({'do': 'get', 'names': ['camera.rate_hz']})['values'] == {'camera.rate_hz': 5}
     assert commands.answer({'do': 'parameters'})['parameters'] == [{'name': 'camera.rate_hz', 'value': 5}]

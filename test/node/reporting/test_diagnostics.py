@@ -11,7 +11,9 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from shadowhound_data_logger.core.stamps import describe
+from shadowhound_data_logger.core.dataclass_json import parse
+from shadowhound_data_logger.core.stamps import StampReport, describe
+from shadowhound_data_logger.core.status import NodeStatus
 from shadowhound_data_logger.node.reporting.diagnostics import ERROR, OK, STALE, WARN, _text, entries
 
 TOPIC = {
@@ -36,7 +38,7 @@ STATUS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def changed(**values: Any) -> dict[str, Any]:
+def changed(**values: Any) -> NodeStatus:
     """The status with other values: ``section__name``, or of the one topic ``topic__name``."""
     status = deepcopy(STATUS)
     for name, value in values.items():
@@ -47,7 +49,7 @@ def changed(**values: Any) -> dict[str, Any]:
             status[section][key] = value
         else:
             status[section] = value
-    return status
+    return parse(NodeStatus, status)
 
 
 LATE = {'publisher': 'p', 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.1, 'since_ns': 0, 'cause': 'late'}
@@ -55,7 +57,7 @@ LATE = {'publisher': 'p', 'state': 'offset', 'offset_s': 146.0, 'spread_s': 0.1,
 
 def told(name: str, **values: Any) -> tuple[Any, str]:
     """Level and words of an entry, after a while in which everything was fine."""
-    found = {entry[0]: entry for entry in entries(changed(**values), STATUS)}
+    found = {entry[0]: entry for entry in entries(changed(**values), changed())}
     return found[name][1], found[name][2]
 
 
@@ -70,7 +72,7 @@ def test_publishers_that_are_not_heard() -> None:
 
 def test_all_is_fine() -> None:
     """There is an entry for each topic, the bag, events, spool, store, clock, workers and the node; old losses are told once."""
-    found = list(entries(STATUS, STATUS))
+    found = list(entries(changed(), changed()))
     assert [entry[0] for entry in found] == ['node', '/imu', 'bag', 'events', 'spool', 'store', 'clock', 'workers']
     assert {entry[1] for entry in found} == {OK}
     assert told('/imu')[1] == '100 Hz'
@@ -92,7 +94,7 @@ def test_all_is_fine() -> None:
         ({'stalls': {'/imu': 'silent for 7 s'}, 'topic__publishers': 0}, STALE, 'nobody publishes it'),
         ({'stalls': {'/odom': 'silent for 7 s'}}, OK, '100 Hz'),
         ({'topic__age_s': None}, OK, '100 Hz'),
-        ({'topic__stamps': LATE}, WARN, describe(LATE)),
+        ({'topic__stamps': LATE}, WARN, describe(StampReport(**LATE))),
         ({'topic__stamps': LATE, 'topic__missed': 6}, WARN, '2 missed lately'),
         ({'topic__other_types': {'B': {}}}, WARN, 'it was published as B too; only go2_interfaces/msg/IMU is logged'),
     ],
@@ -149,7 +151,7 @@ def test_the_rest(name: str, values: dict[str, Any], level: Any, words: str) -> 
 
 def test_every_figure_fits_its_message() -> None:
     """What rclpy refuses in a message would end the node: levels are bytes, values text, and what is unknown is empty."""
-    for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), STATUS):
+    for name, level, text, figures in entries(changed(store__blocked_buckets={'b': 'why'}), changed()):
         values = [KeyValue(key=key, value=_text(value)) for key, value in figures.items()]
         message = DiagnosticStatus(name=name, level=bytes([level]), message=text, values=values)
         assert message.level[0] in {OK, WARN, ERROR, STALE}

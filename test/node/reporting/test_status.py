@@ -1,8 +1,7 @@
-"""The dict that tells what goes on, from stages that say what they are told to."""
+"""The status of the node, from stages that report what the test gives them."""
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,11 +13,10 @@ from spool.making import FakeClock, make, new_spool, put
 
 pytest.importorskip('rclpy')
 
-from shadowhound_data_logger.bags.events import EventStatus
-from shadowhound_data_logger.bags.recorder import BagStatus
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import QueueSettings, Settings
 from shadowhound_data_logger.core.model import Batch, Sample
+from shadowhound_data_logger.core.status import BagStatus, EventStatus, MissionStatus, NodeStatus, WorkerStatus
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake.middleware import FAST_DDS, Middleware
@@ -59,15 +57,15 @@ class Threads:
 class Missions(Threads):
     """None is active."""
 
-    def status(self) -> dict[str, Any]:
-        return {}
+    def status(self) -> MissionStatus:
+        return MissionStatus()
 
 
 class Recorders(Threads):
     """Records nothing."""
 
     def status(self) -> BagStatus:
-        return BagStatus(recording=False)
+        return BagStatus()
 
 
 class EventBuffers(Threads):
@@ -80,7 +78,7 @@ class EventBuffers(Threads):
         return self
 
     def status(self) -> EventStatus:
-        return EventStatus(enabled=False)
+        return EventStatus()
 
 
 class Uploader:
@@ -119,7 +117,7 @@ class Setting:
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
-    def look(self, seconds: float = 1.0) -> dict[str, Any]:
+    def look(self, seconds: float = 1.0) -> NodeStatus:
         """So much later."""
         self.now_s += seconds
         self.clock.now_ns += round(seconds * 1e9)
@@ -143,11 +141,11 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
 
 def test_a_topic_before_and_after_its_first_message(setting: Setting) -> None:
     """It is listed from the start; its age and whether anything was missed are unknown until something came."""
-    row = setting.look()['topics']['/imu']
-    assert (row['sensor'], row['publishers'], row['received'], row['age_s'], row['missed']) == ('imu', 1, 0, None, None)
+    row = setting.look().topics['/imu']
+    assert (row.sensor, row.publishers, row.received, row.age_s, row.missed) == ('imu', 1, 0, None, None)
     setting.receive(50)
-    row = setting.look(0.5)['topics']['/imu']
-    assert (row['received'], row['open'], row['age_s'], row['missed'], row['accounting']) == (50, 50, 0.5, 0, 'exact')
+    row = setting.look(0.5).topics['/imu']
+    assert (row.received, row.open, row.age_s, row.missed, row.accounting) == (50, 50, 0.5, 0, 'exact')
 
 
 def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
@@ -158,28 +156,27 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
         total += 100 if second < 10 else 10
         setting.uploader.told = replace(setting.uploader.told, sent_bytes=250_000 * second)
         found = setting.look()
-    assert found['topics']['/imu']['rate_hz'] == pytest.approx(10.0)
-    assert found['store']['mbps'] == pytest.approx(2.0)
+    assert found.topics['/imu'].rate_hz == pytest.approx(10.0)
+    assert found.store.mbps == pytest.approx(2.0)
     assert setting.status.earlier
-    assert setting.status.earlier['topics']['/imu']['received'] == total - 50
+    assert setting.status.earlier.topics['/imu'].received == total - 50
 
 
 def test_what_lies_in_the_spool(setting: Setting) -> None:
     """Objects and bytes that wait, for how long, and the room there is."""
     put(setting.spool, make('thor/a.jpg', b'12345'), make('thor/b.jpg', b'123', held='clock'))
-    spool = setting.look(3.0)['spool']
-    assert (spool['pending'], spool['held'], spool['bytes'], spool['oldest_age_s']) == (1, 1, 8, 3.0)
-    assert spool['free_bytes'] > 0
-    assert spool['max_bytes'] == 20 << 30
+    spool = setting.look(3.0).spool
+    assert (spool.pending, spool.held, spool.bytes, spool.oldest_age_s) == (1, 1, 8, 3.0)
+    assert spool.free_bytes
+    assert spool.max_bytes == 20 << 30
 
 
 def test_a_failing_worker_is_told(setting: Setting) -> None:
     """Each thread has its row: whether it lives and fails, how often it failed and died, and why."""
     worker = setting.intake.worker
     worker.failing, worker.last_error, worker.failures, worker.deaths = True, 'ValueError: x', 3, 1
-    workers = setting.look()['workers']
-    assert workers['intake'] == {'alive': False, 'failing': True, 'failures': 3, 'deaths': 1, 'last_error': 'ValueError: x',
-                                 'busy_s': 0.0, 'patience_s': None}  # fmt: skip
+    workers = setting.look().workers
+    assert workers['intake'] == WorkerStatus(alive=False, failing=True, failures=3, deaths=1, last_error='ValueError: x')
     others = {'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer', 'event-writer', 'control'}
     assert set(workers) == {'intake', *others}
 
@@ -187,8 +184,8 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
 def test_a_stall_is_told(setting: Setting) -> None:
     """What the watchdog finds stands in the status: here a batch that nobody takes from the queue."""
     setting.queue.put(Batch('imu', '/imu', 't', (Sample(1, b''),), 1), 5)
-    assert setting.look()['stalls'] == {}
-    assert 'no batch was encoded for 11 s' in setting.look(11.0)['stalls']['encode']
+    assert setting.look().stalls == {}
+    assert 'no batch was encoded for 11 s' in setting.look(11.0).stalls['encode']
 
 
 def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> None:
@@ -197,12 +194,12 @@ def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> 
     written = setting.look()
     setting.status.write(written)
     found = read(tmp_path / 'spool', 'thor', setting.clock)
-    assert found['state'] == 'running'
-    assert {name: found[name] for name in written} == written
+    assert found.running
+    assert found.node == written
     ended = setting.status.look(ended=True)
     assert ended
     setting.status.write(ended)
-    assert read(tmp_path / 'spool', 'thor', setting.clock)['state'] == 'not_running'
+    assert read(tmp_path / 'spool', 'thor', setting.clock).state == 'not_running'
     path = file(tmp_path / 'spool', 'thor')
     assert path.stat().st_mode & 0o777 == 0o600
     assert [each.name for each in path.parent.glob('status-*')] == [path.name]
@@ -231,9 +228,3 @@ def test_a_spool_that_cannot_be_read_is_said_once(setting: Setting, caplog: pyte
 
 def broken() -> Any:
     raise OSError(5, 'Input/output error')
-
-
-def test_it_can_be_written_as_json(setting: Setting) -> None:
-    """Nothing in it is anything but what JSON knows."""
-    found = setting.look()
-    assert json.loads(json.dumps(found)) == found

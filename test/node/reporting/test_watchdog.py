@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from shadowhound_data_logger.bags import events, recorder
+from shadowhound_data_logger.core.dataclass_json import parse
+from shadowhound_data_logger.core.status import NodeStatus
 from shadowhound_data_logger.node.reporting.watchdog import Watchdog
 
 REQUEST_S = 35.0
@@ -39,7 +41,7 @@ class Watch:
         """So much later."""
         self.now_s += seconds
         self.imu['age_s'] = None if self.heard_s is None else self.now_s - self.heard_s
-        return dict(self.dog.look(self.status, self.now_s))
+        return dict(self.dog.look(parse(NodeStatus, self.status), self.now_s))
 
     def hear(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
         """So many messages before each of so many looks."""
