@@ -21,6 +21,7 @@ from shadowhound_data_logger.core.errors import DataLoggerError, SettingError, U
 SECTIONS: Final[dict[str, Sequence[Verb]]] = {
     'On every machine': (Verb('doctor', 'Find out why it does not work, and what to do.'),),
     'On the robot': (
+        Verb('init', 'Write a parameter file for this robot.'),
         Verb('status', 'Show what the node on this machine does now.'),
         Verb('ledger', 'Account for every message: stored, or lost and why.'),
         Verb('spool', 'Show what is not in the store yet, and why.'),

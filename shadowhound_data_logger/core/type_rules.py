@@ -47,9 +47,22 @@ _LATCHED: Final = frozenset({COMPRESSED_IMAGE, IMAGE, POINT_CLOUD})
 """Types whose rule holds for latched publishers as well."""
 
 
+NOT_LOGGED: Final = frozenset({'/parameter_events', '/rosout', '/clock'})
+"""Topics of ROS itself: the node's own log is on one of them."""
+
+
 def is_of_go2(type_name: str) -> bool:
     """Whether only a Unitree robot publishes this type."""
     return type_name.partition('/')[0] in GO2_PACKAGES
+
+
+def not_logged(topic: str, type_name: str, graph: Mapping[str, Collection[str]]) -> str:
+    """Why no sensor is made for a topic, by the types of all topics; empty if one is."""
+    if type_name not in RULES:
+        return f'there is no rule for {type_name}; name a sensor for it in the settings'
+    if type_name == IMAGE and COMPRESSED_IMAGE in graph.get(f'{topic}/compressed', ()):
+        return f'{topic}/compressed is'
+    return ''
 
 
 def sensor_for(topic: str, type_name: str, taken: Collection[str], *, is_latched: bool) -> SensorSettings | None:

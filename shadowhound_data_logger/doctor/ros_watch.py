@@ -1,4 +1,4 @@
-"""What a node of our own sees and hears of the configured topics. The only module of the doctor that loads rclpy.
+"""What a node of our own finds and receives of topics. The only module of the doctor that loads rclpy.
 
 It subscribes as the logger does, takes what comes without decoding it, and publishes nothing.
 """
@@ -15,6 +15,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
+from shadowhound_data_logger.core.type_rules import NOT_LOGGED
 from shadowhound_data_logger.ros.endpoints import Endpoint, HistoryDepth, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
 from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
@@ -41,13 +42,18 @@ class Heard:
     unavailable: str = ''
     """Why nobody can listen to its type here."""
     received: int = 0
+    size: int = 0
+    """Bytes of the received messages, as serialized."""
+    newest: bytes = b''
+    """A message; it can be one that came before the time in which messages are counted."""
     sent: int | None = None
     """By the numbers of the messages; None where they have none."""
     window_s: float = 0.0
     _spans: dict[str, tuple[int, int]] = field(default_factory=dict)
 
-    def note(self, publisher: str | None, number: int | None) -> None:
+    def note(self, cdr: bytes, publisher: str | None, number: int | None) -> None:
         self.received += 1
+        self.size += len(cdr)
         if number is not None:
             first, last = self._spans.get(publisher or '', (number, number))
             self._spans[publisher or ''] = (min(first, number), max(last, number))
@@ -86,6 +92,20 @@ def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) ->
             break
         time.sleep(POLL_S)
     return found
+
+
+def published(of: Node, within: str = '/') -> dict[str, list[Endpoint]]:
+    """Each topic with publishers whose name begins with a namespace, once the graph has been quiet for a moment."""
+    end = time.monotonic() + DISCOVER_S
+    found: dict[str, list[Endpoint]] = {}
+    quiet_since = time.monotonic()
+    while (now := time.monotonic()) < end or now - quiet_since < SETTLE_S:
+        names = [name for name, _ in of.get_topic_names_and_types() if name.startswith(f'{within.rstrip("/")}/')]
+        seen = {name: endpoints(of, name) for name in names if name not in NOT_LOGGED}
+        if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
+            found, quiet_since = seen, now
+        time.sleep(POLL_S)
+    return {topic: publishers for topic, publishers in found.items() if publishers}
 
 
 def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[Heard]:
@@ -127,8 +147,9 @@ def _readers(of: Node, one: Heard) -> list[Reader]:
 def _drain(readers: Sequence[tuple[Heard, Reader]], *, count: bool) -> None:
     for one, reader in readers:
         for taken in reader.drain():
+            one.newest = taken.cdr
             if count:
-                one.note(taken.publisher, taken.number)
+                one.note(taken.cdr, taken.publisher, taken.number)
 
 
 def _deaf(of: Node, topic: str) -> list[str]:

@@ -10,8 +10,8 @@ from rclpy.node import Node
 
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.keys import printable
-from shadowhound_data_logger.core.options import AUTO, COMPRESSED_IMAGE, IMAGE
-from shadowhound_data_logger.core.type_rules import is_of_go2, sensor_for
+from shadowhound_data_logger.core.options import AUTO
+from shadowhound_data_logger.core.type_rules import NOT_LOGGED, is_of_go2, not_logged, sensor_for
 from shadowhound_data_logger.node.intake.consumers import is_plain_name
 from shadowhound_data_logger.ros.reader import endpoints
 
@@ -21,8 +21,6 @@ SETTLE_S: Final = 3.0
 """How long the graph is looked at before it is concluded that it is not that of a Go2."""
 MAX_FOUND: Final = 200
 """Sensors made of topics that no settings name: a subscription takes 100 KB, and who publishes decides how many there are."""
-NOT_LOGGED: Final = frozenset({'/parameter_events', '/rosout', '/clock'})
-"""Topics of ROS itself: the node's own log is on one of them."""
 
 
 class FoundTopics:
@@ -77,10 +75,10 @@ class FoundTopics:
         return str(self._node.get_fully_qualified_name())
 
     def _why_not(self, topic: str, type_name: str, sensor: SensorSettings | None, graph: Mapping[str, list[str]]) -> str:
+        if why := not_logged(topic, type_name, graph):
+            return why
         if sensor is None:
-            return f'there is no rule for {type_name}; name a sensor for it in the settings'
-        if type_name == IMAGE and COMPRESSED_IMAGE in graph.get(f'{topic}/compressed', ()):
-            return f'{topic}/compressed is'
+            return 'its name cannot be that of a sensor; name a sensor for it in the settings'
         if self._count >= MAX_FOUND:
             return f'{MAX_FOUND} topics that no settings name are logged already'
         return ''
