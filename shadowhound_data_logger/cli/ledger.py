@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 from rich.console import RenderableType
@@ -31,7 +31,17 @@ from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
-from shadowhound_data_logger.spool.ledger import imbalances, journal
+from shadowhound_data_logger.spool.ledger import (
+    ClockFigures,
+    GradeFigures,
+    Ledger,
+    OtherTypeFigures,
+    SpoolLedger,
+    TopicFigures,
+    imbalances,
+    journal,
+    rows_of,
+)
 from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.status import not_logged, robots
 
@@ -93,10 +103,12 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
         return verify_delivered(folder, deep=deep, again=again, as_json=as_json)
     if again:
         raise BadUsage('--again is for --verify and --deep', 'add --verify')
-    names = robots(folder)
-    found = read_ledger(folder, _robot(folder))
-    found['not_logged'] = not_logged(folder, found['robot'])
-    found['robots'] = names if len(names) > 1 else [found['robot']]  # a spool that several share has one ledger of them all
+    names, robot = robots(folder), _robot(folder)
+    found: LedgerPage = {
+        **read_ledger(folder, robot),
+        'not_logged': dict(not_logged(folder, robot)),
+        'robots': names if len(names) > 1 else [robot],  # a spool that several share has one ledger of them all
+    }
     if as_json:
         print_json(found)
     else:
@@ -145,26 +157,42 @@ def _is_apart(gap: Gap) -> bool:
     return any(stamp_ns and received_ns and abs(received_ns - stamp_ns) > SAME_NS for stamp_ns, received_ns in pairs)
 
 
-def page(found: Mapping[str, Any]) -> list[RenderableType]:
-    """The ledger as tables, what there is to say about single topics, and a verdict."""
-    titles = {'bags': 'Messages recorded into bags of', 'events': 'Messages that events asked for of'}
-    tables = [_table(f'{title} {_whose(found)}', found[sink]) for sink, title in titles.items() if found.get(sink)]
+class LedgerPage(SpoolLedger):
+    """What the command shows, and ``--json`` prints."""
+
+    not_logged: dict[str, str]
+    """Topics that the node found and does not log, and why."""
+    robots: list[str]
+
+
+def page(found: LedgerPage) -> list[RenderableType]:
+    """The ledger as tables, notes about topics, and a verdict."""
+    titles = {'Messages recorded into bags of': found['bags'], 'Messages that events requested of': found['events']}
+    tables = [_table(f'{title} {_whose(found)}', rows) for title, rows in titles.items() if rows]
     files = [part for table in tables for part in (table, '')]
-    return [topics_table(found), '', *files, objects_table(found), *_section(notes(found)), '', verdict(found)]
+    return [
+        topics_table(found),
+        '',
+        *files,
+        objects_table(found),
+        *_section(notes(found)),
+        '',
+        verdict(found, found['not_logged']),
+    ]
 
 
-def topics_table(found: Mapping[str, Any]) -> RenderableType:
+def topics_table(found: LedgerPage) -> RenderableType:
     """One row a topic; a dash is a figure that the middleware does not tell."""
     if not found['topics']:
         return Text(f'No message of {_whose(found)} has been received yet.')
     return _table(f'Messages of {_whose(found)}', found['topics'])
 
 
-def _whose(found: Mapping[str, Any]) -> str:
-    return ' and '.join(found.get('robots') or [found['robot']])
+def _whose(found: LedgerPage) -> str:
+    return ' and '.join(found['robots'])
 
 
-def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:
+def _table(title: str, topics: Mapping[str, TopicFigures]) -> RenderableType:
     rows = {topic: _figures(row) for topic, row in topics.items()}
     columns = [name for name in COLUMNS if name in ALWAYS or any(row[name] for row in rows.values())]
     graded = any(set(row['by_grade']) - {EXACT} for row in topics.values())
@@ -173,8 +201,10 @@ def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:
         grade = [topics[topic]['accounting'] or '-'] if graded else []
         table.add_row(plain(topic), *grade, *(_lossy(name, row) for name in columns))
         parts = topics[topic]['by_grade']
-        for part in parts if len(parts) > 1 else ():
-            table.add_row('', part, *(_lossy(name, parts[part]) if name in GRADED else '' for name in columns), style='dim')
+        for name, part in parts.items() if len(parts) > 1 else ():
+            graded_figures = _graded_figures(part)
+            cells = (_lossy(column, graded_figures) if column in GRADED else '' for column in columns)
+            table.add_row('', name, *cells, style='dim')
     if len(rows) > 1:
         table.add_section()
         total = _total([row for topic, row in rows.items() if topics[topic]['accounting']], columns)
@@ -182,7 +212,7 @@ def _table(title: str, topics: Mapping[str, Any]) -> RenderableType:
     return table
 
 
-def objects_table(found: Mapping[str, Any]) -> RenderableType:
+def objects_table(found: LedgerPage) -> RenderableType:
     """Where the objects are that the stored messages became."""
     first = ('spooled', 'delivered', 'pending')
     states = [*first, *(state for state, count in found['objects'].items() if count and state not in first)]
@@ -192,73 +222,78 @@ def objects_table(found: Mapping[str, Any]) -> RenderableType:
     return table
 
 
-def notes(found: Mapping[str, Any]) -> list[str]:
+def notes(found: LedgerPage) -> list[str]:
     """Causes of what was lost, where stored messages are that are not delivered, and accounting that is not exact."""
     lines = []
-    in_files = ((f'{topic} in {sink}', row) for sink in ('bags', 'events') for topic, row in found.get(sink, {}).items())
-    for topic, row in (*found['topics'].items(), *in_files):
+    for topic, row in rows_of(found).items():
         for grade, part in row['by_grade'].items():
             if part['missed_by']:
                 mark = '~' if part['missed'] is None else ''
                 lines.append(f'{topic}: missed by {_listed(part["missed_by"], mark)}{f" ({grade})" * (len(row["by_grade"]) > 1)}')
-        lines += [f'{topic}: {name} by {_listed(row[name])}' for name in ('rejected', 'dropped') if row[name]]
-        if row.get('corrected'):
+        lost = {'rejected': row['rejected'], 'dropped': row['dropped']}
+        lines += [f'{topic}: {name} by {_listed(counts)}' for name, counts in lost.items() if counts]
+        if row['corrected']:
             lines.append(f'{topic}: of the stored messages, corrected: {_listed(row["corrected"])}')
-        if row.get('stamps'):
+        if row['stamps']:
             lines.append(f'{topic}: {describe(parse(StampReport, row["stamps"]))}')
-        if row.get('by_arrival'):
+        if row['by_arrival']:
             lines.append(f'{topic}: dated by arrival, not by the message: {_listed(row["by_arrival"])}')
         elsewhere = {state: count for state, count in row['stored_in'].items() if count and state != 'delivered'}
         if elsewhere:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
-        lines += [f'{topic}: {_other_type(name, other)}' for name, other in row.get('other_types', {}).items()]
+        lines += [f'{topic}: {_other_type(name, other)}' for name, other in row['other_types'].items()]
         if not row['received']:
             lines.append(f'{topic}: not one message of it was received')
         elif row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
-    lines += [f'{topic}: not logged: {why}' for topic, why in found.get('not_logged', {}).items()]
-    return [*lines, *clock_notes(found.get('clock', {}))]
+    lines += [f'{topic}: not logged: {why}' for topic, why in found['not_logged'].items()]
+    return [*lines, *clock_notes(found['clock'])]
 
 
-def _other_type(name: str, other: Mapping[str, Any]) -> str:
+def _other_type(name: str, other: OtherTypeFigures) -> str:
     by = ', '.join(other['publishers']) or 'a program that is not a ROS node'
     if other['messages'] is None:
         return f'published as {name} too, by {by}; it was not listened to, so the number of messages is not known'
     return f'published as {name} too, by {by}; of that {other["messages"]:,} messages were rejected (wrong_type)'
 
 
-def clock_notes(clock: Mapping[str, Any]) -> Iterator[str]:
-    """What the clock of the robot did that somebody who reads dates should know."""
-    if clock.get('held'):
+def clock_notes(clock: ClockFigures) -> Iterator[str]:
+    """What the clock of the robot did that matters to a reader of dates."""
+    if clock['held']:
         yield f'{clock["held"]:,} objects wait for their date: the clock of the robot was not set when they were taken'
-    if clock.get('steps'):
+    if clock['steps']:
         by = '' if clock['last_step_s'] is None else f', last by {clock["last_step_s"]:,.3f} s at {clock["last_step_time"]}'
         yield f'the clock of the robot stepped {clock["steps"]:,} times{by}'
 
 
-def verdict(found: Mapping[str, Any]) -> Text:
+def verdict(found: Ledger, not_logged: Collection[str]) -> Text:
     """One line, or one for each identity that does not hold."""
     if found['balanced']:
-        return Text.assemble(('The ledger balances', 'green'), f': {_known(found)}')
-    return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(dict(found)))
+        return Text.assemble(('The ledger balances', 'green'), f': {_known(found, not_logged)}')
+    return Text('\n').join(Text.assemble(('Does not balance', 'red'), f': {line}') for line in imbalances(found))
 
 
-def _known(found: Mapping[str, Any]) -> str:
+def _known(found: Ledger, not_logged: Collection[str]) -> str:
     """What the ledger says of all messages: no more than the worst grade among them, and only of what was listened to."""
     topics = found['topics']
-    unheard = [other for row in topics.values() for other in row.get('other_types', {}).values() if other['messages'] is None]
-    if unheard or found.get('not_logged'):
+    unheard = [other for row in topics.values() for other in row['other_types'].values() if other['messages'] is None]
+    if unheard or not_logged:
         return 'every message that was received is stored, skipped, or listed as lost; what is not logged is listed above.'
-    graded = [{*row['by_grade'], row['accounting']} - {None} for row in topics.values()]
+    graded = [{*row['by_grade'], *filter(None, [row['accounting']])} for row in topics.values()]
     worst = [max(grades, key=GRADES.index) for grades in graded if grades]
     if not set(worst) - {EXACT}:
         return 'every message is stored, skipped, or listed as lost.'
     return f'every message that was received is stored, skipped, or listed as lost; what was missed is {unsure(worst)}.'
 
 
-def _figures(row: Mapping[str, Any]) -> dict[str, int | None]:
-    about = {f'{name}_estimated': row[f'{name}_estimated'] for name in ('published', 'missed')}
-    return about | {name: sum(row[name].values()) if isinstance(row[name], Mapping) else row[name] for name in COLUMNS}
+def _figures(row: TopicFigures) -> dict[str, int | None]:
+    return {**_graded_figures(row), 'skipped': row['skipped'], 'rejected': sum(row['rejected'].values()),
+            'dropped': sum(row['dropped'].values()), 'stored': row['stored'], 'open': row['open']}  # fmt: skip
+
+
+def _graded_figures(part: GradeFigures) -> dict[str, int | None]:
+    return {'published': part['published'], 'published_estimated': part['published_estimated'], 'received': part['received'],
+            'missed': part['missed'], 'missed_estimated': part['missed_estimated']}  # fmt: skip
 
 
 def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> dict[str, int | None]:
@@ -273,7 +308,7 @@ def _total(rows: Sequence[Mapping[str, int | None]], columns: Iterable[str]) -> 
     return total
 
 
-def _lossy(name: str, row: Mapping[str, Any]) -> str:
+def _lossy(name: str, row: Mapping[str, int | None]) -> str:
     exact, estimated = row[name], row.get(f'{name}_estimated')
     is_loss = name in LOSSES and (exact or estimated)
     return f'[yellow]{figure(exact, estimated)}[/]' if is_loss else figure(exact, estimated)

@@ -146,7 +146,7 @@ def _status_remedy(text: str) -> str:
     return next((remedy for start, remedy in remedies.items() if text.startswith(start)), 'shadowhound-data status')
 
 
-def _ledger(accounts: Mapping[str, Any], index: Path) -> Result:
+def _ledger(accounts: ledger.Ledger, index: Path) -> Result:
     wrong = ledger.imbalances(accounts)
     if not wrong:
         return ok(

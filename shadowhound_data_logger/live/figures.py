@@ -30,6 +30,7 @@ _HEAD: Final = (
     'session',
 )
 _OF_STORE: Final = ('target', 'state', 'last_error', 'mbps', 'max_mbps', 'in_flight', 'delivered', 'waits_for', 'left_s')
+_OF_LEDGER: Final = ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')
 _OF_STATUS: Final = ('sensor', 'rate_hz', 'age_s', 'publishers', 'unavailable', 'may_be_silent')
 MAX_GAPS: Final = 4000
 """Rows of the timeline; of more, neighbors of a topic and cause are one."""
@@ -41,7 +42,7 @@ class SpoolFigures:
 
     def __init__(self, spool: Path, robot: str, clock: Clock) -> None:
         self._spool, self._robot, self._clock = spool, robot, clock
-        self._ledger: dict[str, Any] = {}
+        self._ledger: ledger.Ledger | None = None
         self._problem = ''
 
     def now(self, *, with_ledger: bool) -> dict[str, Any]:
@@ -54,15 +55,16 @@ class SpoolFigures:
             try:
                 self._ledger, self._problem = ledger.read(self._spool, self._robot), ''
             except DataLoggerError as error:
-                self._ledger, self._problem = {}, str(error)
-        accounts, live, status = self._ledger.get('topics', {}), report.node.topics, report.as_dict()
+                self._ledger, self._problem = None, str(error)
+        found, live, status = self._ledger, report.node.topics, report.as_dict()
+        accounts = found['topics'] if found else {}
         return {
             **{name: status.get(name) for name in _HEAD},
             'findings': [*report.findings, *([self._problem] if self._problem else [])],
             'store': {name: status.get('store', {}).get(name) for name in _OF_STORE},
             'bag': _without(status.get('bag'), 'topics'), 'events': _without(status.get('events'), 'topics'),
-            'balanced': self._ledger.get('balanced'), 'objects': self._ledger.get('objects'), 'bytes': self._ledger.get('bytes'),
-            'topics': [_row(topic, accounts.get(topic, {}), live.get(topic)) for topic in sorted({*accounts, *live})],
+            **{name: found.get(name) if found else None for name in ('balanced', 'objects', 'bytes')},
+            'topics': [_row(topic, accounts.get(topic), live.get(topic)) for topic in sorted({*accounts, *live})],
         }  # fmt: skip
 
     def gaps(self, since_ns: int | None = None, until_ns: int | None = None, by: str = BY_STAMP) -> dict[str, Any]:
@@ -118,15 +120,16 @@ def _is_within(times: tuple[int | None, int | None], since_ns: int, until_ns: in
     return from_ns is not None and to_ns is not None and to_ns >= since_ns and from_ns <= until_ns
 
 
-def _row(topic: str, account: Mapping[str, Any], live: TopicStatus | None) -> dict[str, Any]:
+def _row(topic: str, account: ledger.TopicFigures | None, live: TopicStatus | None) -> dict[str, Any]:
     return {
-        'topic': topic, 'type': account.get('type') or (live.type if live is not None else ''),
-        **{name: account.get(name) for name in ('received', 'stored', 'skipped', 'missed', 'missed_estimated', 'accounting')},
-        'lost': sum(sum(account.get(name, {}).values()) for name in ('rejected', 'dropped')),
-        'pending': account.get('stored_in', {}).get('pending', 0),
+        'topic': topic,
+        'type': (account and account['type']) or (live.type if live is not None else ''),
+        **{name: account.get(name) if account else None for name in _OF_LEDGER},
+        'lost': sum(account['rejected'].values()) + sum(account['dropped'].values()) if account else 0,
+        'pending': account['stored_in']['pending'] if account else 0,
         'stamps': describe(live.stamps) if live is not None and live.stamps else '',
         **{name: getattr(live, name, None) for name in _OF_STATUS},
-    }  # fmt: skip
+    }
 
 
 def _without(section: Mapping[str, Any] | None, name: str) -> dict[str, Any] | None:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from rclpy.node import Node
 
@@ -388,7 +387,7 @@ class Pipeline:
     def _ledger(self) -> DataObject:
         """The ledger as an object of its own, for the store."""
         now_ns = self._clock.wall_ns() if self._clock.is_set else self._clock.boot_ns()
-        content: dict[str, Any] = ledger.read(self.spool.root, self._settings.robot)
+        content = ledger.read(self.spool.root, self._settings.robot)
         robot = self._settings.robot
         pattern = f'{robot}/_ledger/{{date}}/{{time}}_ledger.json'
         return DataObject(

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.errors import SpoolError
@@ -21,15 +21,88 @@ from shadowhound_data_logger.spool.index import Index
 STATES: Final = tuple(state.value for state in State)
 
 
-def read(spool: Path, robot: str) -> dict[str, Any]:
+class GradeFigures(TypedDict):
+    """Messages of one grade of accounting."""
+
+    published: int | None
+    published_estimated: int | None
+    received: int
+    missed: int | None
+    missed_estimated: int | None
+    missed_by: dict[str, int]
+    """By cause."""
+
+
+class OtherTypeFigures(TypedDict):
+    """A type under which a topic is published in addition to the one that is logged."""
+
+    publishers: list[str]
+    messages: int | None
+
+
+class TopicFigures(GradeFigures):
+    """A topic over all sessions, or what became of it in bags or events. No better than the worst of its grades."""
+
+    type: str
+    accounting: str | None
+    by_grade: dict[str, GradeFigures]
+    skipped: int
+    by_arrival: dict[str, int]
+    corrected: dict[str, int]
+    stamps: dict[str, Any] | None
+    """The fields of a ``StampReport``."""
+    rejected: dict[str, int]
+    other_types: dict[str, OtherTypeFigures]
+    dropped: dict[str, int]
+    stored: int
+    open: int
+    stored_in: dict[str, int]
+    """Messages by the state of their objects."""
+    gaps: dict[str, dict[str, int]]
+    """Messages in the gap journal by kind and cause."""
+
+
+class ClockFigures(TypedDict):
+    """The robot's wall clock."""
+
+    is_set: bool | None
+    steps: int
+    last_step_s: float | None
+    last_step_time: str | None
+    held: int
+    """Objects that wait for it to be set."""
+
+
+class Ledger(TypedDict):
+    """The ledger of an index."""
+
+    robot: str
+    balanced: bool
+    topics: dict[str, TopicFigures]
+    bags: dict[str, TopicFigures]
+    events: dict[str, TopicFigures]
+    objects: dict[str, int]
+    """By state, and ``spooled``."""
+    bytes: dict[str, int]
+
+
+class SpoolLedger(Ledger):
+    """The ledger of a spool folder."""
+
+    clock: ClockFigures
+    acts: list[dict[str, Any]]
+    """What operators requested (``act_record``)."""
+
+
+def read(spool: Path, robot: str) -> SpoolLedger:
     """The ledger of a spool folder, as ``shadowhound-data ledger --json`` prints it; works while a node runs.
 
-    Raises SpoolError when there is no spool or it cannot be read. Unknown figures are None, never 0.
+    Raises SpoolError if there is no spool or it cannot be read. Unknown figures are None, never 0.
     """
     with _reading(spool) as index:
         known = clock_record.read(spool, robot)
-        del known['offsets']
-        clock = {**known, 'held': index.objects.held_count('clock')}
+        clock = ClockFigures(is_set=known['is_set'], steps=known['steps'], last_step_s=known['last_step_s'],
+                             last_step_time=known['last_step_time'], held=index.objects.held_count('clock'))  # fmt: skip
         return {**of_index(index, robot), 'clock': clock, 'acts': act_record.read(spool, robot)}
 
 
@@ -64,46 +137,49 @@ def _reading(spool: Path) -> Iterator[Index]:
         index.close()
 
 
-def of_index(index: Index, robot: str) -> dict[str, Any]:
+def of_index(index: Index, robot: str) -> Ledger:
     """The ledger of an open index, all of one instant."""
     with index.snapshot():
         topics, publishers, others = index.accounts.topics(), index.accounts.publishers(), index.accounts.other_types()
         tally, journal = index.overview.tally(), index.gaps.sums()
     names = {row.topic for row in topics} | {row[0] for row in tally if row[0]}
-    accounts = {topic: _topic(topic, topics, publishers, tally, others) for topic in sorted(names)}
-    for topic, row in accounts.items():
-        row['gaps'] = _journaled(topic, journal)
+    accounts = {topic: _topic(topic, topics, publishers, tally, others, journal) for topic in sorted(names)}
     sensors = {topic: row for topic, row in accounts.items() if not topic.startswith(SINKS)}
     bags, events = ({topic.removeprefix(sink): row for topic, row in accounts.items() if topic.startswith(sink)}
                     for sink in SINKS)  # fmt: skip
     objects = {what: sum(row[2] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
     volume = {what: sum(row[3] for row in tally if row[1] == what) for what in ('spooled', *STATES)}
-    ledger: dict[str, Any] = {
+    ledger: Ledger = {
         'robot': robot, 'balanced': True, 'topics': sensors, 'bags': bags, 'events': events, 'objects': objects, 'bytes': volume,
     }  # fmt: skip
     ledger['balanced'] = not imbalances(ledger)
     return ledger
 
 
-def imbalances(ledger: Mapping[str, Any]) -> list[str]:
-    """One sentence for each identity that does not hold; empty when the ledger closes."""
+def rows_of(ledger: Ledger) -> dict[str, TopicFigures]:
+    """All rows: topics, topics in bags, topics in events."""
+    bags = {f'{topic} in bags': row for topic, row in ledger['bags'].items()}
+    return ledger['topics'] | bags | {f'{topic} in events': row for topic, row in ledger['events'].items()}
+
+
+def imbalances(ledger: Ledger) -> list[str]:
+    """One sentence for each identity that does not hold; empty if the ledger balances."""
     found: list[str] = []
-    in_files = [(f'{topic} in {sink}', row) for sink in ('bags', 'events') for topic, row in ledger.get(sink, {}).items()]
-    for topic, row in (*ledger['topics'].items(), *in_files):
+    for topic, row in rows_of(ledger).items():
         settled = row['skipped'] + sum(row['rejected'].values()) + sum(row['dropped'].values()) + row['stored'] + row['open']
         if row['received'] != settled or row['open'] < 0:
             found.append(f'{topic}: received {row["received"]}, but skipped + rejected + dropped + stored + open = {settled}')
         found += [f'{topic}: {sentence}' for sentence in (*_ungraded(row), *_undated(row))]
         if row['stored'] != sum(row['stored_in'].values()):
             found.append(f'{topic}: stored {row["stored"]}, but in objects there are {sum(row["stored_in"].values())}')
-    for what in ('objects', 'bytes'):
-        parts = sum(ledger[what][state] for state in STATES)
-        if ledger[what]['spooled'] != parts or min(ledger[what].values()) < 0:
-            found.append(f'{what}: spooled {ledger[what]["spooled"]}, but by state {parts} ({dict(ledger[what])})')
+    for what, counts in (('objects', ledger['objects']), ('bytes', ledger['bytes'])):
+        parts = sum(counts[state] for state in STATES)
+        if counts['spooled'] != parts or min(counts.values()) < 0:
+            found.append(f'{what}: spooled {counts["spooled"]}, but by state {parts} ({counts})')
     return found
 
 
-def _undated(row: Mapping[str, Any]) -> Iterator[str]:
+def _undated(row: TopicFigures) -> Iterator[str]:
     """One sentence for each account of losses that the rows of the gap journal do not add up to."""
     lost = {
         MISSED: _sum(part['missed_by'] for part in row['by_grade'].values()), REJECTED: row['rejected'], DROPPED: row['dropped'],
@@ -128,13 +204,15 @@ def _journaled(topic: str, journal: Mapping[tuple[str, str, str, str], int]) -> 
     return {kind: dict(causes) for kind, causes in found.items()}
 
 
-def _ungraded(row: Mapping[str, Any]) -> Iterator[str]:
+def _ungraded(row: TopicFigures) -> Iterator[str]:
     """One sentence for each identity of published and missed that does not hold, of the whole and by grade."""
     for part in (*row['by_grade'].values(), row):
-        about = '' if part['missed'] is not None else '_estimated'
-        published, missed, causes = part[f'published{about}'], part[f'missed{about}'], sum(part['missed_by'].values())
-        if published is not None and published != part['received'] + missed:
-            yield f'published {published}, but received + missed = {part["received"] + missed}'
+        published, missed, causes = part['published'], part['missed'], sum(part['missed_by'].values())
+        if missed is None:
+            published, missed = part['published_estimated'], part['missed_estimated']
+        total = part['received'] + (missed or 0)
+        if published is not None and published != total:
+            yield f'published {published}, but received + missed = {total}'
         if missed is not None and missed != causes:
             yield f'missed {missed}, but by cause {causes}'
     graded = sum(part['received'] for part in row['by_grade'].values())
@@ -143,7 +221,7 @@ def _ungraded(row: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tuple[str, str, int, int, int]],
-           others: list[OtherTypeRow]) -> dict[str, Any]:  # fmt: skip
+           others: list[OtherTypeRow], journal: Mapping[tuple[str, str, str, str], int]) -> TopicFigures:  # fmt: skip
     rows = [row for row in topics if row.topic == topic]
     spans = [row for row in publishers if row.topic == topic]
     received = sum(row.received for row in rows)
@@ -152,7 +230,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
     return {
         'type': rows[-1].type if rows else '',
         'accounting': heard[-1] if heard else None,
-        **(_whole(received, grades) if heard and heard[-1] != RECEIVED_ONLY else {**_UNKNOWN, 'received': received}),
+        **(_whole(received, grades) if heard and heard[-1] != RECEIVED_ONLY else _unknown(received)),
         'by_grade': grades,
         'skipped': sum(row.skipped for row in rows),
         'by_arrival': _sum(row.by_arrival for row in rows),
@@ -164,21 +242,23 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
         'stored': sum(row.stored for row in rows),
         'open': sum(row.open for row in rows),
         'stored_in': {state: sum(row[4] for row in tally if row[:2] == (topic, state)) for state in STATES},
+        'gaps': _journaled(topic, journal),
     }
 
 
-def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, dict[str, Any]]:
-    """Over all sessions; a count that is not known in one of them is not known."""
-    found: dict[str, dict[str, Any]] = {}
+def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, OtherTypeFigures]:
+    """Over all sessions; a count that is unknown in one of them is unknown."""
+    found: dict[str, OtherTypeFigures] = {}
     for row in rows:
         known = found.setdefault(row.type, {'publishers': [], 'messages': 0})
         nodes = [*known['publishers'], *row.publishers]
         known['publishers'] = list(dict.fromkeys(nodes))[:MAX_NODES]
-        known['messages'] = None if None in {known['messages'], row.messages} else known['messages'] + row.messages
+        before = known['messages']
+        known['messages'] = None if before is None or row.messages is None else before + row.messages
     return found
 
 
-def _by_grade(rows: list[Any], spans: list[Any]) -> dict[str, dict[str, Any]]:
+def _by_grade(rows: list[Any], spans: list[Any]) -> dict[str, GradeFigures]:
     """What is known of the messages of each grade that there is."""
     unknown, estimated = sum(row.unknown for row in rows), sum(row.estimated for row in rows)
     numbered = sum(row.received for row in rows) - estimated - unknown
@@ -186,30 +266,34 @@ def _by_grade(rows: list[Any], spans: list[Any]) -> dict[str, dict[str, Any]]:
     about = _sum(row.missed for row in rows)
     found = {
         EXACT: exact,
-        ESTIMATED: _counted(estimated, about, estimated + sum(about.values()), '_estimated'),
-        RECEIVED_ONLY: {**_UNKNOWN, 'received': unknown},
+        ESTIMATED: _counted(estimated, about, estimated + sum(about.values()), is_estimated=True),
+        RECEIVED_ONLY: _unknown(unknown),
     }
     return {grade: found[grade] for grade in GRADES if found[grade]['received'] or found[grade]['missed_by']}
 
 
-_UNKNOWN: Final[dict[str, Any]] = {
-    'published': None, 'published_estimated': None, 'received': 0, 'missed': None, 'missed_estimated': None, 'missed_by': {},
-}  # fmt: skip
+def _unknown(received: int) -> GradeFigures:
+    return {'published': None, 'published_estimated': None, 'received': received, 'missed': None, 'missed_estimated': None,
+            'missed_by': {}}  # fmt: skip
 
 
-def _counted(received: int, missed_by: dict[str, int], published: int, about: str = '') -> dict[str, Any]:
-    missed = sum(missed_by.values())
-    return {**_UNKNOWN, f'published{about}': published, 'received': received, f'missed{about}': missed, 'missed_by': missed_by}
+def _counted(received: int, missed_by: dict[str, int], published: int, *, is_estimated: bool = False) -> GradeFigures:
+    missed, found = sum(missed_by.values()), _unknown(received)
+    found['missed_by'] = missed_by
+    if is_estimated:
+        found['published_estimated'], found['missed_estimated'] = published, missed
+    else:
+        found['published'], found['missed'] = published, missed
+    return found
 
 
-def _whole(received: int, grades: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _whole(received: int, grades: Mapping[str, GradeFigures]) -> GradeFigures:
     """All grades as one: no better than the worst of them."""
     if not grades or RECEIVED_ONLY in grades:
-        return {**_UNKNOWN, 'received': received}
-    about = '_estimated' if ESTIMATED in grades else ''
-    parts = [(part, '_estimated' if grade == ESTIMATED else '') for grade, part in grades.items()]
-    published = sum(part[f'published{kind}'] for part, kind in parts)
-    return _counted(received, _sum(part['missed_by'] for part, _ in parts), published, about)
+        return _unknown(received)
+    published = sum(part['published'] or part['published_estimated'] or 0 for part in grades.values())
+    missed_by = _sum(part['missed_by'] for part in grades.values())
+    return _counted(received, missed_by, published, is_estimated=ESTIMATED in grades)
 
 
 def _sum(mappings: Any) -> dict[str, int]:

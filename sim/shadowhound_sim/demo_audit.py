@@ -19,6 +19,7 @@ from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.formats.rows.schema import SENSOR, is_row
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.ledger import Ledger
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BUCKET: Final = 'sensor-data'
@@ -45,7 +46,7 @@ class Messages:
     """By the robot's own account."""
     before_match: int | None
     """Published before the node had found the publisher."""
-    account: Mapping[str, Any] | None
+    account: ledger.TopicFigures | None
     """The topic's part of the ledger; None for a topic that is not logged."""
 
     @property
@@ -53,14 +54,14 @@ class Messages:
         """Messages after the match that the ledger does not know: published after the last one that arrived."""
         if self.account is None or self.before_match is None:
             return 0
-        return self.published - self.before_match - int(self.account['published'])
+        return self.published - self.before_match - (self.account['published'] or 0)
 
 
 @dataclass(frozen=True, slots=True)
 class DemoAudit:
     """What the audit of a demo found."""
 
-    ledger: Mapping[str, Any]
+    ledger: Ledger
     messages: Mapping[str, Messages]
     totals: Mapping[str, SensorTotals]
     read_back: int
@@ -100,7 +101,7 @@ def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectSt
     return DemoAudit(found, messages, _totals(rows), len(bodies), sum(samples.values()), bodies, catalog.total(), tuple(problems))
 
 
-def _messages(published: int, before: int, account: Mapping[str, Any] | None) -> Messages:
+def _messages(published: int, before: int, account: ledger.TopicFigures | None) -> Messages:
     known = account is not None and account['published'] is not None
     return Messages(published, before if known else None, account)
 
@@ -164,12 +165,12 @@ def _unaccounted(messages: Mapping[str, Messages]) -> list[str]:
     return found
 
 
-def _undelivered(found: Mapping[str, Any]) -> list[str]:
+def _undelivered(found: Ledger) -> list[str]:
     left = {state: count for state, count in found['objects'].items() if state not in {'spooled', 'delivered'} and count}
     return [f'{count:,} objects are {state}' for state, count in left.items()]
 
 
-def _uncounted(found: Mapping[str, Any], samples: Mapping[str, int]) -> list[str]:
+def _uncounted(found: Ledger, samples: Mapping[str, int]) -> list[str]:
     return [
         f'{topic}: {row["stored_in"]["delivered"]:,} messages are delivered, but {samples.get(topic, 0):,} lie in the bucket'
         for topic, row in found['topics'].items()

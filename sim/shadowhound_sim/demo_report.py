@@ -89,7 +89,7 @@ def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
     for remark in _remarks(audit, record):
         console.print(remark)
     console.print()
-    console.print(verdict(audit.ledger))
+    console.print(verdict(audit.ledger, ()))
     found = '[red]something is wrong' if audit.problems else '[green]all as spooled'
     console.print(f'{audit.read_back:,} objects with {audit.samples:,} messages read back from the S3 server: {found}')
     console.print(f'The catalog in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object but its own.')
@@ -119,9 +119,12 @@ def messages_table(audit: DemoAudit) -> Table:
     has_before = any(row.before_match for row in audit.messages.values())
     table = plain_table('What became of the messages', ('topic', 'published', *(['before match'] if has_before else ()), *fates))
     for topic, row in sorted(audit.messages.items()):
-        account = row.account or dict.fromkeys(fates)
         before = [number(row.before_match)] if has_before else []
-        counts = (figure(account[name], account.get(f'{name}_estimated')) for name in fates)
+        account = row.account
+        counts = [figure(None, None)] * len(fates)
+        if account is not None:
+            counts = [number(account['received']), number(account['stored']), number(account['skipped']),
+                      figure(account['missed'], account['missed_estimated'])]  # fmt: skip
         table.add_row(topic, number(row.published), *before, *counts)
     return table
 

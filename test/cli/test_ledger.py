@@ -27,7 +27,7 @@ def a_topic(**figures: Any) -> dict[str, Any]:
     row = {
         'type': 'x/msg/Y', 'accounting': 'exact', 'published': 100, 'received': 100, 'missed': 0, 'missed_by': {}, 'skipped': 40,
         'rejected': {}, 'dropped': {}, 'stored': 60, 'open': 0, 'stored_in': dict.fromkeys(STATES, 0) | {'delivered': 60},
-        'gaps': {},
+        'gaps': {}, 'by_arrival': {}, 'corrected': {}, 'stamps': None, 'other_types': {},
     }  # fmt: skip
     row = {'published_estimated': None, 'missed_estimated': None, **row, **figures}
     if 'by_grade' not in row:
@@ -48,7 +48,11 @@ def a_ledger(balanced: bool = True, **topics: dict[str, Any]) -> dict[str, Any]:
         'kept': 0,
     }
     named = {f'/{name}'.replace('__', '/'): row for name, row in topics.items()}
-    return {'robot': 'thor', 'balanced': balanced, 'topics': named, 'objects': counts, 'bytes': counts}
+    return {
+        'robot': 'thor', 'balanced': balanced, 'topics': named, 'bags': {}, 'events': {}, 'objects': counts, 'bytes': counts,
+        'clock': {'is_set': True, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'held': 0}, 'acts': [],
+        'not_logged': {}, 'robots': ['thor'],
+    }  # fmt: skip
 
 
 def shown(found: dict[str, Any], width: int = 80, *, terminal: bool = False) -> str:
