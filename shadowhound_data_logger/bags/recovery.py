@@ -256,7 +256,12 @@ class BagRecovery:
             path.unlink(missing_ok=True)
             return
         if state.folder not in self._own:
-            self._place.spool.accounts.find(item.counts, {f'{state.sink}{topic}': runs for topic, runs in _runs(path).items()})
+            runs, newest = _contents(path)
+            self._place.spool.accounts.find(
+                item.counts,
+                {f'{state.sink}{topic}': found for topic, found in runs.items()},
+                {f'{state.sink}{topic}': times for topic, times in newest.items()},
+            )
         self._handed.add(item.key)
         self._place.writer.put(item, rows=[rows], wait=False)
 
@@ -268,24 +273,30 @@ class BagRecovery:
         path.rename(next(target / name for name in names if not os.path.lexists(target / name)))
 
 
-def _runs(path: Path) -> dict[str, list[NumberRun]]:
-    """The numbers of a slice's messages, by topic; none of a topic where they do not rise, since several publishers have it."""
+def _contents(path: Path) -> tuple[dict[str, list[NumberRun]], dict[str, Times]]:
+    """The numbers of a slice's messages and the times of the last one, by topic.
+
+    A topic whose numbers do not rise, because it has several publishers, has none.
+    """
     found: dict[str, list[NumberRun]] = {}
+    newest: dict[str, Times] = {}
     try:
         source = LocalFile(path)
         for message in read_messages(source, read_index(source), MessageFilter(0, 1 << 64, lambda channel: not channel.repeated)):
             number, times = message.sequence, Times(message.publish_ns, message.log_ns)
+            newest[message.channel.topic] = times
             runs = found.setdefault(message.channel.topic, [])
             if runs and number == runs[-1].stop:
                 runs[-1] = runs[-1]._replace(stop=number + 1, last=times)
             elif len(runs) <= MAX_RANGES:
                 runs.append(NumberRun(number, number + 1, times, times))
     except (BagDamaged, OSError):
-        return {}  # the spool compares the file with its checksum
-    return {
+        return {}, {}  # the spool compares the file with its checksum
+    rising = {
         topic: runs for topic, runs in found.items()
         if len(runs) <= MAX_RANGES and all(one.stop < two.start for one, two in pairwise(runs))
     }  # fmt: skip
+    return rising, newest
 
 
 def _rows(place: BagPlace) -> dict[str, RecordingRows]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.core import metadata_words as words
-from shadowhound_data_logger.core.stamps import Times
+from shadowhound_data_logger.core.stamps import Times, by_arrival
 
 UPLOAD_WHEN: Final = 'upload.when'
 EVENTS_WHEN: Final = 'events.when'
@@ -131,7 +131,9 @@ class DataObject:
 
     @property
     def last_times(self) -> Times:
-        """Of its last message."""
+        """Of its last message. Files of several topics are bags, which are dated by arrival."""
+        if self.counts:
+            return by_arrival(self.t_end_ns)
         received = self.metadata.get(words.RECEIVED_END_NS, '')
         return Times(self.t_end_ns, int(received) if received.isdecimal() and len(received) < 20 else 0)
 

@@ -61,6 +61,13 @@ def by_arrival(received_ns: int) -> Times:
     return Times(received_ns, received_ns)
 
 
+def is_of_two_clocks(one: Times, other: Times) -> bool:
+    """Whether the offsets of two messages differ by more than a second; False if an arrival is unknown."""
+    if min(one.received_ns, other.received_ns) < EARLIEST_SANE_NS:
+        return False
+    return abs((one.received_ns - one.stamp_ns) - (other.received_ns - other.stamp_ns)) > SAME_NS
+
+
 class Dated(NamedTuple):
     """The time of a message."""
 
@@ -115,8 +122,8 @@ class StampTrack:
     """
 
     __slots__ = (
-        '_advanced_ns', '_agreeing', '_candidate_ns', '_doubted', '_is_erratic', '_newest_ns', '_rule', 'messages', 'offset_ns',
-        'received_ns', 'refused', 'sent_offset_ns', 'since_ns', 'spread_ns',
+        '_advanced_ns', '_agreeing', '_before_ns', '_candidate_ns', '_doubted', '_is_erratic', '_newest_ns', '_rule', 'messages',
+        'offset_ns', 'received_ns', 'refused', 'sent_offset_ns', 'since_ns', 'spread_ns',
     )  # fmt: skip
 
     def __init__(self, rule: StampRule) -> None:
@@ -137,6 +144,7 @@ class StampTrack:
         """Why the newest message was not dated by its stamp; empty where it was."""
         self._newest_ns = self._advanced_ns = 0  # the newest trusted stamp, and when it arrived
         self._candidate_ns = self._agreeing = 0  # an offset that may become the new one, and how many messages had it
+        self._before_ns: int | None = None  # the offset before a queue was held up: while it empties, offsets fall back to this
         self._doubted = 0  # one bit for each of the recent messages
         self._is_erratic = False
 
@@ -208,11 +216,15 @@ class StampTrack:
             self._agreeing += 1
         else:
             self._candidate_ns, self._agreeing = offset_ns, 1
+        before_ns = known_ns if self._before_ns is None else self._before_ns
+        is_late = before_ns is not None and stamp_ns > self._newest_ns and offset_ns > before_ns - SAME_NS
         if known_ns is None or abs(offset_ns) <= SAME_NS or self._agreeing >= CONFIRMING:
+            is_back = before_ns is not None and abs(offset_ns - before_ns) <= SAME_NS
+            self._before_ns = before_ns if is_late and not is_back else None
             self.offset_ns, self.spread_ns, self.since_ns, self._agreeing = offset_ns, 0, received_ns, 0
             self._newest_ns = 0
             return True
-        return offset_ns > known_ns and stamp_ns > self._newest_ns  # late, but in order: a queue that was held up
+        return is_late  # but in order: a queue that was held up, or one that empties
 
 
 @dataclass(frozen=True, slots=True)

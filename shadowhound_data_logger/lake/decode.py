@@ -18,6 +18,7 @@ import numpy as np
 import orjson
 import simplejpeg
 
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
 from shadowhound_data_logger.formats.statistics import INFINITE
@@ -68,6 +69,10 @@ _UNKNOWN: Final[Mapping[str, Mapping[str, str]]] = {
     'sensor_msgs/msg/NavSatFix': dict.fromkeys(('latitude', 'longitude', 'altitude'), 'status.status'),
 }  # fmt: skip
 """See ``marker_of``; by the comments in Imu.msg and NavSatStatus.msg."""
+
+
+STEADY_NS: Final = SECOND // 10
+"""In an object whose first and last message have offsets that differ by less, the offset is constant."""
 
 
 class ArchiveMember(NamedTuple):
@@ -249,10 +254,27 @@ class Table:
         return self.stamps.nbytes + self.values.nbytes
 
 
-def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str], offset_ns: int) -> Table:
-    """The numbers of these messages of a type, of JSON. Raises LakeError where a field is missing or not a number."""
+def arrivals(times_ns: NDArray[np.int64], first_ns: int, last_ns: int) -> NDArray[np.int64]:
+    """When the messages of an object arrived, in their stored order, if the first and the last of them arrived at these times.
+
+    ``times_ns`` are their stamps, all moved by as much as the first arrived later. If that fits the last one, they are their
+    arrivals; otherwise the offset changed (a stamp is stuck, a queue was held up), and the arrivals are evenly spread. Where the
+    two are the same, the last one is unknown.
+    """
+    if len(times_ns) < 2 or last_ns <= first_ns or abs(int(times_ns.max()) - last_ns) <= STEADY_NS:
+        return times_ns
+    return first_ns + np.arange(len(times_ns), dtype=np.int64) * (last_ns - first_ns) // (len(times_ns) - 1)
+
+
+def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str], offset_ns: int,
+          received_ns: tuple[int, int] | None = None) -> Table:  # fmt: skip
+    """The numbers of these messages of a type, of JSON. Raises LakeError where a field is missing or not a number.
+
+    With ``received_ns``, when the first and the last of them arrived, the times are those of ``arrivals``.
+    """
     asked = tuple(fields)
     stamps = np.array([sample['stamp_ns'] for sample in samples], np.int64) + offset_ns
+    stamps = stamps if received_ns is None else arrivals(stamps, *received_ns)
     try:
         asked = asked or _of_type(samples, kind)
         if kind == 'nav_msgs/msg/Odometry' and samples and 'pose' in samples[0]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -12,6 +12,7 @@ import numpy as np
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, ArchiveMember, Table, table
 from shadowhound_data_logger.lake.prefetch import Prefetch
@@ -74,6 +75,8 @@ class Selection:
     """(robot, sensor) -> what there is of an aligned sensor."""
     size: tuple[int, int] | None
     """(height, width) of images; None: as they are."""
+    by: str = BY_STAMP
+    """Which of the two times of messages the tracks have."""
 
     def like(self, robot: str, sensor: str) -> Track | None:
         """What says how many numbers a sensor has: the robot's own, or another robot's where it stored nothing."""
@@ -142,11 +145,21 @@ class Samples:
         if member >= len(found):
             raise LakeError(f'{wanted.key} has {len(found)} messages, the catalogue says {track.count[number]}', key=wanted.key)
         one = found[member]
-        return (*self._picture(wanted, one.body, one.extension), one.stamp_ns + int(track.offset_ns[number]))
+        return (*self._picture(wanted, one.body, one.extension), self._times(track, number, found)[member])
 
     def _picture(self, wanted: Object, body: bytes, extension: str) -> tuple[str, NDArray[Any]]:
         with _naming(wanted):
             return ('cloud', decode.cloud(body)) if extension in CLOUDS else ('image', decode.image(body, self._selection.size))
+
+    def _received(self, track: Track, number: int) -> tuple[int, int] | None:
+        """When the first and the last message of an object arrived, if arrivals are the times."""
+        return (int(track.start_ns[number]), int(track.end_ns[number])) if self._selection.by == BY_RECEIVED else None
+
+    def _times(self, track: Track, number: int, members: Sequence[ArchiveMember]) -> list[int]:
+        """Of the messages of an archive."""
+        times = np.array([each.stamp_ns for each in members], np.int64) + int(track.offset_ns[number])
+        received = self._received(track, number)
+        return [int(each) for each in (times if received is None else decode.arrivals(times, *received))]
 
     def _members(self, wanted: Object) -> list[ArchiveMember]:
         def read() -> list[ArchiveMember]:
@@ -193,11 +206,13 @@ class Samples:
         for least, number in side.nearest(stamp_ns, before, after):
             if best is not None and abs(best[0]) <= least:
                 break
-            wanted, offset = side.object(number), int(side.offset_ns[number])
-            is_packed = decode.extension_of(wanted.key) in ARCHIVES
-            options: list[ArchiveMember | None] = [*self._members(wanted)] if is_packed else [None]
-            for one in options:
-                away = (int(side.start_ns[number]) if one is None else one.stamp_ns + offset) - stamp_ns
+            wanted = side.object(number)
+            options: list[tuple[int, ArchiveMember | None]] = [(int(side.start_ns[number]), None)]
+            if decode.extension_of(wanted.key) in ARCHIVES:
+                members = self._members(wanted)
+                options = list(zip(self._times(side, number, members), members, strict=True))
+            for time_ns, one in options:
+                away = time_ns - stamp_ns
                 if -before <= away <= after and (best is None or abs(away) < abs(best[0])):
                     best = away, wanted, one
         if best is None:
@@ -230,7 +245,7 @@ class Samples:
 
         def read() -> Table:
             found = decode.records(self._prefetch.get(wanted))
-            return table(found, side.kind, fields, int(side.offset_ns[number]))
+            return table(found, side.kind, fields, int(side.offset_ns[number]), self._received(side, number))
 
         made: Table = self._once((side.sensor, wanted.bucket, wanted.key), wanted, read)
         return made

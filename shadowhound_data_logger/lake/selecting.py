@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.untrusted import MOST_MEMBERS
 from shadowhound_data_logger.formats.rows.schema import SENSOR
 from shadowhound_data_logger.lake import labels, query
@@ -81,7 +82,7 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
     del found, ends
     sides = _sides(source, list(anchors.values()), aligned, findings, flags) if anchors else {}
     pa.default_memory_pool().release_unused()  # of a million rows 1 GB
-    return Selection(tuple(anchors.values()), dict(aligned), sides, size)
+    return Selection(tuple(anchors.values()), dict(aligned), sides, size, flags.get('by', BY_STAMP))
 
 
 def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Window], findings: Findings,

@@ -228,7 +228,7 @@ class PastReader:
         late = _offsets(near) if by == BY_STAMP else [0]
         dates = sorted({date for late_ns in late for date in dates_between(at_ns + late_ns - PATH_NS, at_ns + late_ns + 1)})
         bag_files = [pair for date in dates for pair in self._source.day(robot, date, by).bag_files.items()]
-        for item, where in (*self._of_objects(near, at_ns), *self._of_bags(bag_files, at_ns, by, late)):
+        for item, where in (*self._of_objects(near, at_ns, by), *self._of_bags(bag_files, at_ns, by, late)):
             known = shown.get(item.topic)
             if known is None or (item.head or {})['at'] > (known[0].head or {})['at'] + 1:
                 shown[item.topic] = item, where
@@ -246,38 +246,40 @@ class PastReader:
         }  # fmt: skip
         return head, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
 
-    def _of_objects(self, near: Sequence[PastObject], at_ns: int) -> list[tuple[LiveItem, str]]:
+    def _of_objects(self, near: Sequence[PastObject], at_ns: int, by: str) -> list[tuple[LiveItem, str]]:
         chosen: dict[str, list[PastObject]] = {}
         for one in near:
             if '/rosbags/' not in one.key and '/missions/' not in one.key:
                 topic = one.topic or one.sensor
                 if topic in chosen or len(chosen) < MAX_TOPICS:
                     chosen.setdefault(topic, []).append(one)
-        found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns), chosen.items())
+        found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns, by), chosen.items())
         return [item for item in found if item is not None]
 
-    def _of_topic(self, topic: str, objects: Sequence[PastObject], at_ns: int) -> tuple[LiveItem, str] | None:
+    def _of_topic(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
         """The newest of a topic that can be read."""
         last = objects[-1]
         extension = decode.extension_of(last.key)
         with suppress(DataLoggerError, *_BROKEN):
             if extension == 'json':
-                return self._series(topic, [one for one in objects if one.end_ns >= at_ns - SERIES_NS], at_ns)
+                return self._series(topic, [one for one in objects if one.end_ns >= at_ns - SERIES_NS], at_ns, by)
             is_known = extension in decode.CLOUDS | decode.IMAGES | decode.ARCHIVES
             if not is_known or at_ns - last.begin_ns > STALE_NS:
                 return None
             body, stamp_ns = self._contents.get(last), last.begin_ns
             if extension in decode.ARCHIVES:
-                members = [one for one in decode.members(body, extension) if one.stamp_ns + last.offset_ns <= at_ns]
-                if not members:
+                members = decode.members(body, extension)
+                dated = zip(_message_times(last, [one.stamp_ns for one in members], by), members, strict=True)
+                shown = [(time_ns, one) for time_ns, one in dated if time_ns <= at_ns]
+                if not shown:
                     return None
-                newest = max(members, key=lambda one: one.stamp_ns)
-                body, stamp_ns, extension = newest.body, newest.stamp_ns + last.offset_ns, newest.extension
+                stamp_ns, newest = max(shown, key=lambda each: each[0])
+                body, extension = newest.body, newest.extension
             if item := _picture(topic, extension, body, stamp_ns / 1e6):
                 return item, _where(last)
         return None
 
-    def _series(self, topic: str, objects: Sequence[PastObject], at_ns: int) -> tuple[LiveItem, str] | None:
+    def _series(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
         if not objects or (objects[-1].type and objects[-1].type not in KINDS):
             return None
         rows: list[tuple[float, Mapping[str, float]]] = []
@@ -288,9 +290,11 @@ class PastReader:
             kind = KINDS.get(name)
             if kind is None or kind.values is None:
                 return None
+            times = _message_times(one, [sample['stamp_ns'] for sample in samples], by)
+            dated = [*zip(times, samples, strict=True)][-MAX_MESSAGES:]
             rows += [
-                ((sample['stamp_ns'] + one.offset_ns) / 1e6, _checked(kind.values(_message(name, sample))))
-                for sample in samples[-MAX_MESSAGES:] if at_ns - SERIES_NS <= sample['stamp_ns'] + one.offset_ns <= at_ns
+                (time_ns / 1e6, _checked(kind.values(_message(name, sample))))
+                for time_ns, sample in dated if at_ns - SERIES_NS <= time_ns <= at_ns
             ]  # fmt: skip
         if not rows:
             return None
@@ -563,6 +567,12 @@ def _samples(body: bytes) -> tuple[str, list[dict[str, Any]]]:
     found = decode.records(body)
     told = json.loads(body).get('type')
     return told if isinstance(told, str) else '', found
+
+
+def _message_times(one: PastObject, stamps_ns: Sequence[int], by: str) -> list[int]:
+    """Those of the messages of an object."""
+    times = np.array(stamps_ns, np.int64) + one.offset_ns
+    return [int(each) for each in (decode.arrivals(times, one.begin_ns, one.end_ns) if by == BY_RECEIVED else times)]
 
 
 def _message(type_name: str, sample: Mapping[str, Any]) -> Any:

@@ -17,7 +17,18 @@ from shadowhound_data_logger.core.stamps import NO_TIMES, StampReport, Times
 from shadowhound_data_logger.core.status import OtherType, Totals
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, OtherTypeRow, PublisherRow, RhythmRow, TopicRow
 from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation, TopicEstimate
-from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EXACT, LATELY_NS, MISSED, REJECTED, Figures, TopicGaps, latest
+from shadowhound_data_logger.spool.gaps import (
+    DROPPED,
+    ESTIMATED,
+    EXACT,
+    LATELY_NS,
+    MISSED,
+    REJECTED,
+    Figures,
+    TopicGaps,
+    latest,
+    latest_stamp,
+)
 from shadowhound_data_logger.spool.span import NumberRun, Span
 
 PAUSED: Final = 'paused'
@@ -423,9 +434,18 @@ class Accounts:
                 self._carried[row.topic] += row.received
                 self._carried_times[row.topic] = row.last_kept if any(row.last_kept) else row.heard, row.heard
 
-    def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[NumberRun]]) -> None:
-        """Messages of an earlier session turned up in a file that is about to be spooled; ``runs`` as in ``TopicAccount``."""
+    def find(self, counts: Mapping[str, int], runs: Mapping[str, Sequence[NumberRun]],
+             newest: Mapping[str, Times] | None = None) -> None:  # fmt: skip
+        """Messages of an earlier session turned up in a file that is about to be spooled.
+
+        ``runs`` are as in ``TopicAccount``, ``newest`` the times of the last message of each topic in it: what did not turn up
+        was lost after that.
+        """
         with self._lock:
+            for topic, times in (newest or {}).items():
+                if (carried := self._carried_times.get(topic)) is not None:
+                    since, heard = carried
+                    self._carried_times[topic] = max(since, times, key=lambda each: each.received_ns), heard
             for topic, count in counts.items():
                 known = min(count, self._carried[topic])
                 self._carried[topic] -= known
@@ -605,6 +625,7 @@ class Accounts:
     @staticmethod
     def _row(topic: str, account: TopicAccount, count: int, newest: Times, latest_ns: int) -> TopicRow:
         heard = account.gaps.heard
+        latest_ns = latest_stamp(heard, latest_ns)
         heard_ns = min(heard.stamp_ns, latest_ns)
         if not EARLIEST_SANE_NS <= account.first_ns <= latest_ns and account.gaps.has_received:
             account.first_ns = heard_ns

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, FUTURE_SLACK_NS, SECOND, Clock
-from shadowhound_data_logger.core.stamps import NO_TIMES, Times
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times, is_of_two_clocks
 
 MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped', 'evicted', 'quarantined'
 """Kinds."""
@@ -179,8 +179,11 @@ class TopicGaps:
         """Messages were lost between these two, or are these two and all between them. Returns the row's key.
 
         Stamps of a wall clock that was never set become those of the boot clock, as in ``stamps.StampRule``. What is not a time,
-        or more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts.
+        or more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts. Without a
+        publisher, the two messages may be of publishers with different clocks: then both times are by the clock of ``after``.
         """
+        if not publisher and is_of_two_clocks(before, after):
+            before = before._replace(stamp_ns=after.stamp_ns - (after.received_ns - before.received_ns))
         from_ns, to_ns = self._time(before.stamp_ns), self._time(after.stamp_ns)
         if (from_ns < EARLIEST_SANE_NS) != (to_ns < EARLIEST_SANE_NS):
             from_ns = to_ns = max(from_ns, to_ns)
@@ -280,6 +283,12 @@ def latest(clock: Clock | None) -> int:
     """The time until which anything can have happened: now, where the clock is set. A publisher may stamp as it likes."""
     now_ns = 0 if clock is None else clock.wall_ns()
     return now_ns if now_ns >= EARLIEST_SANE_NS else _LAST_NS
+
+
+def latest_stamp(newest: Times, now_ns: int) -> int:
+    """The latest stamp that counts by then: now, or as much later as the stamps of a topic are ahead of their arrival."""
+    ahead_ns = newest.stamp_ns - newest.received_ns if newest.received_ns else 0
+    return now_ns + ahead_ns if 0 < ahead_ns <= FUTURE_SLACK_NS else now_ns
 
 
 _LAST_NS: Final = (1 << 63) - 1

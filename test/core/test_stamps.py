@@ -144,6 +144,20 @@ def test_messages_that_a_queue_held_up_keep_their_stamps() -> None:
     assert set(found) == {''}
 
 
+@pytest.mark.parametrize('usual_ns', [5 * MS, 146 * SECOND])
+def test_messages_of_a_queue_that_empties_at_once_keep_their_stamps(usual_ns: int) -> None:
+    """Four seconds without any, then all of them within milliseconds, twice; after that the usual offset is known again."""
+    track = new_track()
+    follow(track, [usual_ns] * 60)
+    for begin_ns in (NOW_NS + 6 * SECOND, NOW_NS + 12 * SECOND):
+        burst = [usual_ns + 4 * SECOND - number * PERIOD_NS for number in range(120)]
+        assert set(follow(track, burst, MS // 10, begin_ns)) == {''}
+        assert set(follow(track, [usual_ns] * 50, PERIOD_NS, begin_ns + SECOND // 10)) == {''}
+        assert track.offset_ns == pytest.approx(usual_ns, abs=SAME_NS)
+    found = follow(track, [usual_ns - 60 * SECOND] * 50, PERIOD_NS, NOW_NS + 20 * SECOND)
+    assert sum(map(bool, found)) == CONFIRMING - 1, 'a clock that is set ahead has to be confirmed'
+
+
 @pytest.mark.parametrize('hz', [1, 30, 1000])
 def test_stamps_that_do_not_advance_are_stuck(hz: int) -> None:
     """A second after the last that did, at whatever rate; repeats within a second are none of our business."""

@@ -21,9 +21,10 @@ from PIL import Image
 from profiles import examples
 from pypcd4 import Encoding, PointCloud
 
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import decode
-from shadowhound_data_logger.lake.decode import table
+from shadowhound_data_logger.lake.decode import arrivals, table
 
 
 def packed(image: Any, kind: str) -> bytes:
@@ -148,3 +149,20 @@ def test_archives_that_are_broken() -> None:
     short = b'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nPOINTS 9\nDATA binary\n1234'
     with pytest.raises(LakeError):
         decode.cloud(short)
+
+
+@pytest.mark.parametrize(('stamps_s', 'received_s', 'expected_s'), [
+    pytest.param([0, 1, 1.5, 3], (146, 149.01), [146, 147, 147.5, 149], id='a constant offset'),
+    pytest.param([0, 0, 0, 0], (5, 8), [5, 6, 7, 8], id='a stamp that is stuck'),
+    pytest.param([0, 1, 2, 3], (9, 9.003), [9, 9.001, 9.002, 9.003], id='a queue that empties at once'),
+    pytest.param([0, 1, 2, 3], (9, 9), [9, 10, 11, 12], id='the last arrival is unknown'),
+    pytest.param([4], (9, 9), [9], id='one message'),
+])  # fmt: skip
+def test_arrivals_follow_from_those_of_first_and_last(
+    stamps_s: list[float], received_s: tuple[float, float], expected_s: list[float]
+) -> None:
+    """As far apart as the stamps where the offset is constant, otherwise evenly spread."""
+    first, last = (round(each * SECOND) for each in received_s)
+    stamps = np.array([round(each * SECOND) for each in stamps_s], np.int64)
+    found = arrivals(stamps + first - stamps[0], first, last)
+    assert found.tolist() == [round(each * SECOND) for each in expected_s]

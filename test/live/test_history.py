@@ -190,6 +190,29 @@ def test_the_timeline_is_of_the_clock_that_was_chosen(store: ObjectStore, opened
         opened(StorePast()).answer({'do': 'timeline', 'robot': 'thor', 'by': 'log', **span})
 
 
+def test_messages_of_a_batch_are_shown_when_they_arrived(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """A batch whose stamp was stuck, and one that a queue held up: their offsets from the arrival change within them."""
+    rows = []
+    for begin_s, stamps_s, arrival in ((0, [0] * 5, (1, 5)), (20, [20, 21, 22, 23, 24], (31, 31.004))):
+        samples = [json.loads(odometry(at_s)) for at_s in stamps_s]
+        for number, sample in enumerate(samples):
+            sample['position']['x'] = begin_s + number
+        start, end = (str(NOON_NS + round(at_s * SECOND)) for at_s in arrival)
+        ends = str(NOON_NS + stamps_s[-1] * SECOND)
+        rows.append(told(begin_s, 'odom', '/odom', ODOMETRY, 'json', count='5', t_end_ns=ends, received_start_ns=start,
+                         received_end_ns=end))  # fmt: skip
+        add(store, tmp_path / 'tmp', rows[-1]['key'], json.dumps({'type': ODOMETRY, 'samples': samples}).encode())
+    add_part(store, rows, 'a', tmp_path / 'tmp')
+    history = opened(StorePast())
+    for at_s, shown_x, age_s in ((3.5, 2, 0.5), (5.5, 4, 0.5), (31.5, 24, 0.496)):
+        head, shown = asked(history, at_s, 'received')
+        (_, _, before_ms, _) = next(row for row in head['shown'] if row[0] == '/odom')
+        told_head, body = shown['/odom']
+        rows_shown = np.frombuffer(body, '<f4', offset=8 * told_head['rows']).reshape(told_head['rows'], -1)
+        assert rows_shown[-1][told_head['names'].index('x')] == shown_x
+        assert before_ms == pytest.approx(1000 * age_s, abs=0.2)
+
+
 @pytest.mark.parametrize('is_compact', [False, True])
 def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_path: Path, *, is_compact: bool) -> None:
     """Also what has a short row only, and what arrived on another day than its stamp."""

@@ -10,9 +10,10 @@ import pytest
 from spool.conftest import Open
 from spool.making import FakeClock, clear_uncataloged, index_of, make, new_spool, receive, settle
 
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, State
-from shadowhound_data_logger.core.stamps import NO_TIMES
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.span import NumberRun
@@ -132,6 +133,33 @@ def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
     assert after.accounts.drop_carried('restart') == max(0, 10 - recorded)
     after.close()
     assert bags(left) == {'/imu': expected}
+
+
+def test_what_a_slice_lacks_was_lost_after_its_last_message(opened: Open, root: Path, clock: FakeClock) -> None:
+    """On both clocks: bags are dated by arrival, so a slice that is durable alone does not say which stamp its messages have."""
+    spool = opened()
+
+    def at(second: float) -> Times:
+        return Times(clock.now_ns + round((second - 146) * SECOND), clock.now_ns + round(second * SECOND))
+
+    with spool.accounts.entry(IMU) as account:
+        for second in range(20):
+            account.receive('p', second + 1, at(second))
+            account.gaps.heard = at(second)
+    spool.commit([make('thor/rosbags/b/b_0.mcap', b'0', sensor='bag', topic=None, samples=5, counts={IMU: 5},
+                       t_end_ns=clock.now_ns + 4 * SECOND)])  # fmt: skip
+    left = die(spool, root)
+    for newest, begin_s in (({}, 4), ({IMU: at(16)}, 16)):
+        copy = left.with_name(f'from-{begin_s}')
+        shutil.copytree(left, copy)
+        after = started(copy, clock)
+        after.accounts.find({IMU: 12}, {}, newest)
+        after.accounts.drop_carried('restart')
+        after.commit()
+        after.close()
+        (gap,) = [each for each in ledger.journal(copy, 'thor') if each.sink == 'bags']
+        assert (gap.from_ns, gap.received_from_ns) == at(begin_s)
+        assert (gap.to_ns, gap.received_to_ns) == at(19)
 
 
 def test_each_settles_its_own(opened: Open, root: Path, clock: FakeClock) -> None:

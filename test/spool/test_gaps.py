@@ -188,6 +188,49 @@ def test_a_loss_is_not_timed_by_two_clocks() -> None:
     assert (row.from_ns, row.to_ns) == (NOON_NS, NOON_NS)
 
 
+def test_a_restart_with_a_publisher_ahead_is_timed_by_its_clock(root: Path) -> None:
+    """An hour ahead: the messages that the restart cost, and the watermark, have stamps after now."""
+    clock = FakeClock()
+    spool = new_spool(root, clock)
+    spool.open()
+    for second in range(4):
+        clock.now_ns = NOON_NS + second * SECOND
+        times = Times(clock.now_ns + 3600 * SECOND, clock.now_ns)
+        with spool.accounts.entry(CAMERA) as account:
+            account.receive('p', second, times)
+            account.gaps.heard = times
+        if second < 2:
+            deliver(spool, *put_newest(spool, times, f'n{second}'))
+            assert watermark(spool) == (3600, 3600 + second)
+    spool.commit()
+    abandon(spool)
+    spool = new_spool(root, clock)
+    spool.open()
+    spool.commit()
+    spool.close()
+    (gap,) = journal(root)
+    seconds = [((at or 0) - NOON_NS) / SECOND for at in (gap.from_ns, gap.to_ns, gap.received_from_ns, gap.received_to_ns)]
+    assert (gap.kind, gap.cause, gap.count, seconds) == ('dropped', 'restart', 2, [3601, 3603, 1, 3])
+
+
+def put_newest(spool: Spool, times: Times, key: str) -> list[SpooledObject]:
+    received = str(times.received_ns)
+    metadata = {'received_start_ns': received, 'received_end_ns': received}
+    return spool.commit([make(key, t_start_ns=times.stamp_ns, t_end_ns=times.stamp_ns, metadata=metadata)])
+
+
+def test_a_loss_of_unknown_publishers_is_not_from_one_clock_to_the_other() -> None:
+    """Two publishers with clocks five minutes apart: the loss is as long as it took, by the clock of the message after it."""
+    found = TopicGaps(clock=FakeClock(now_ns=NOON_NS + 10 * SECOND))
+    right, behind = Times(NOON_NS, NOON_NS), Times(NOON_NS - 298 * SECOND, NOON_NS + 2 * SECOND)
+    found.add('dropped', 'restart', 10, right, behind)
+    found.add('missed', 'transport', 3, right, behind, 'p')
+    rows, _ = found.settle(CAMERA, {('dropped', 'restart', 'exact'): 10, ('missed', 'transport', 'exact'): 3})
+    spans = {row.key.kind: ((row.from_ns or 0) - NOON_NS, (row.to_ns or 0) - NOON_NS) for row in rows}
+    assert spans == {'dropped': (-300 * SECOND, -298 * SECOND), 'missed': (-298 * SECOND, 0)}
+    assert {(row.received_from_ns, row.received_to_ns) for row in rows} == {(NOON_NS, NOON_NS + 2 * SECOND)}
+
+
 def test_a_clock_that_is_set_back_takes_the_watermark_along(spool: Spool) -> None:
     """What was complete by the wrong clock says nothing of the same time by the right one."""
     hear(spool, 100)
@@ -313,7 +356,7 @@ def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) ->
     spool.open()
     with spool.accounts.entry(CAMERA) as account:
         account.receive(None, None)
-        account.appraise(1, {'restart': 4}, by_arrival(NOON_NS + 5 * SECOND))
+        account.appraise(1, {'restart': 4}, Times(NOON_NS + 5 * SECOND, NOON_NS + 5 * SECOND + LATE_NS))
     spool.commit()
     found = [gap for gap in journal(root) if gap.grade == 'estimated']
     spool.close()
