@@ -171,7 +171,7 @@ class World:
         given = [word for parameter in parameters for word in ('-p', parameter)]
         return self.program('sim_go2_node', *SIM, *(['--ros-args', *given] if given else []))
 
-    def ledger(self) -> dict[str, Any]:
+    def ledger(self) -> Mapping[str, Any]:
         """Of now; empty of topics while there is none."""
         try:
             return ledger.read(self.spool, ROBOT)

@@ -109,7 +109,7 @@ class Node(Process):
         """As the ledger tells a figure that only numbers let it know: None without them."""
         return count if self.hears_numbers else None
 
-    def ledger(self) -> dict[str, Any]:
+    def ledger(self) -> Mapping[str, Any]:
         """As ``shadowhound-data ledger --json`` prints it; it balances at any time."""
         found = ledger.read(self.home / 'spool', self.robot)
         assert ledger.imbalances(found) == []

@@ -197,7 +197,7 @@ def test_whom_the_robot_finds_is_compared_by_a_front_alone(nodes: dict[str, Node
 
     def unheard(space: str) -> Any:
         node = nodes[space]
-        return read(node.home / 'spool', node.robot, SystemClock.of_this_machine())['middleware']['unheard']
+        return read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).node.middleware.unheard
 
     until(lambda: unheard(BESIDE) == {}, 'the front has reported, and all is heard')
     assert unheard(DIRECT) is None

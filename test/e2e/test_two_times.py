@@ -101,7 +101,7 @@ def test_the_operator_is_told_which_clocks_are_off(node: Node, objects: Objects)
     assert objects.contents
 
     def findings() -> str:
-        return '\n'.join(read(node.home / 'spool', node.robot, SystemClock.of_this_machine())['findings'])
+        return '\n'.join(read(node.home / 'spool', node.robot, SystemClock.of_this_machine()).findings)
 
     until(lambda: '/late: stamps' in findings(), findings)
     found = findings()
