@@ -165,7 +165,7 @@ def _pull(source: Bucket, arrivals: Arrivals, seconds: float) -> tuple[float, fl
     while time.monotonic() - began_s < seconds and arrived_s is None:
         arrivals.look()
         answer = pull.newest_answer(source, ROBOT, request.id)
-        if answer is not None and answer['state'] in pull.FINAL:
+        if answer is not None and answer.state in pull.FINAL:
             arrived_s = time.monotonic() - began_s
         time.sleep(1.0)
     store.close()

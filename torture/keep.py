@@ -35,7 +35,7 @@ from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
-from shadowhound_data_logger.core.mailbox import KeptFilter
+from shadowhound_data_logger.core.mailbox import KeptFilter, RequestAnswer
 from shadowhound_data_logger.core.model import LOST
 from shadowhound_data_logger.formats.mcap.index import read_index
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
@@ -334,7 +334,7 @@ class Campaign:
         def are_answered() -> bool:
             for name, made_ns in list(made.items()):
                 answer = pull.newest_answer(self._source, ROBOT, name)
-                if answer is not None and answer['state'] in pull.FINAL and answer['made_ns'] >= made_ns:
+                if answer is not None and answer.state in pull.FINAL and answer.made_ns >= made_ns:
                     del made[name]
             return not made
 
@@ -392,37 +392,37 @@ def _answers(campaign: Campaign, source: Bucket, store: S3Store, in_store: set[s
     answered = Counter[str](served=0)
     for name, askings in campaign.asked().items():
         answer = pull.newest_answer(source, ROBOT, name)
-        if answer is None or answer['state'] not in pull.FINAL:
+        if answer is None or answer.state not in pull.FINAL:
             wrong['unanswered or contradictory'].append(name)
             continue
-        states[answer['state']] += 1
-        outcomes = {state: each['objects'] for state, each in answer['outcomes'].items()}
+        states[answer.state] += 1
+        outcomes = {state: each.objects for state, each in answer.outcomes.items()}
         objects.update(outcomes)
         answered.update({
-            'served': bool(outcomes.get('delivered')), 'found nothing': not answer['objects'] and not answer['gone'],
-            'found that some is gone': bool(answer['gone']) or bool(answer['lost']),
-            'expired or taken back in the middle': answer['state'] in {'expired', 'cancelled'} and 'delivered' in outcomes,
+            'served': bool(outcomes.get('delivered')), 'found nothing': not answer.objects and not answer.gone,
+            'found that some is gone': bool(answer.gone) or bool(answer.lost),
+            'expired or taken back in the middle': answer.state in {'expired', 'cancelled'} and 'delivered' in outcomes,
         })  # fmt: skip
         # What a request that is over did not get may go from then on, before the last answer can be made.
-        is_over = set(outcomes) <= {'delivered', 'quarantined', *(() if answer['state'] == 'done' else ('unsent', 'evicted'))}
-        went_early = answer['state'] == 'expired' and any(each['when'] < answer['expires'] for each in answer['lost'])
-        if not is_over or went_early or sum(outcomes.values()) != answer['objects']:
-            wrong['unanswered or contradictory'].append(f'{name} {answer["state"]} {answer["objects"]} {outcomes}')
-        if answer['state'] == 'done':
+        is_over = set(outcomes) <= {'delivered', 'quarantined', *(() if answer.state == 'done' else ('unsent', 'evicted'))}
+        went_early = answer.state == 'expired' and any(each.when and each.when < answer.expires for each in answer.lost)
+        if not is_over or went_early or sum(outcomes.values()) != answer.objects:
+            wrong['unanswered or contradictory'].append(f'{name} {answer.state} {answer.objects} {outcomes}')
+        if answer.state == 'done':
             missing = {key for each in askings for key in each['keys']} - in_store - lost
             slices = {key for key in missing if key.endswith('.mcap')}
             missing -= slices
-            cut.update(bags=len(answer['bags']), slices=len(slices))
+            cut.update(bags=len(answer.bags), slices=len(slices))
             wrong['cut out of slices and not their messages'] += _miscut(campaign, store, answer, slices)
             wrong['seen and neither stored nor accounted for'] += sorted(missing)
     return {'requests': dict(states), 'answered': dict(answered), 'asked for': dict(objects), 'cut': dict(cut)}
 
 
-def _miscut(campaign: Campaign, store: S3Store, answer: dict[str, Any], slices: set[str]) -> list[str]:
+def _miscut(campaign: Campaign, store: S3Store, answer: RequestAnswer, slices: set[str]) -> list[str]:
     """Slices of which a request wanted a part that is not in the bags that were cut for it; as far as they are kept still."""
-    wanted = MessageFilter(answer['want'].get('since_ns', 0), answer['want'].get('until_ns', 1 << 62), lambda _: True)
+    wanted = MessageFilter(answer.want.get('since_ns', 0), answer.want.get('until_ns', 1 << 62), lambda _: True)
     there = Counter[tuple[str, int, bytes]]()
-    for bag in answer['bags']:
+    for bag in answer.bags:
         remote = find_bag(store, ROBOT, bag)
         if not verify_remote(store, remote, deep=True).is_intact:
             return [f'{bag} is not sound']
@@ -432,7 +432,7 @@ def _miscut(campaign: Campaign, store: S3Store, answer: dict[str, Any], slices: 
     for key in sorted(slices):
         path = campaign.home / 'spool' / 'kept' / 'sensor-data' / key
         if path.exists() and Counter(_messages(LocalFile(path), wanted)) - there:
-            found.append(f'{answer["id"]}: {key}')
+            found.append(f'{answer.id}: {key}')
     return found
 
 

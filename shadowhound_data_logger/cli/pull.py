@@ -13,12 +13,22 @@ import click
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
+from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.keys import is_name
-from shadowhound_data_logger.core.mailbox import BAG_SENSOR, DEFAULT_PRIORITY, LONGEST_NS, MAX_KEYS, KeptFilter, offer
+from shadowhound_data_logger.core.mailbox import (
+    BAG_SENSOR,
+    DEFAULT_PRIORITY,
+    LONGEST_NS,
+    MAX_KEYS,
+    KeptFilter,
+    RequestAnswer,
+    offer,
+)
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import visible
 
 if TYPE_CHECKING:
+    from shadowhound_data_logger.lake.pull import PullState
     from shadowhound_data_logger.lake.select import Wanted
 
 _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
@@ -79,7 +89,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
             offered = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
             if not as_json:
                 click.echo(_found_sentence(offered))
-            answer: dict[str, Any] | None = None
+            answer: RequestAnswer | None = None
             offered['id'] = None
             if not dry_run and offered['objects']:
                 request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
@@ -88,10 +98,10 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
                     click.echo(f'Requested: request {request.id}.')
                 if is_waiting:
                     answer = lake.wait(source, robot, request.id, tell=AnswerPrinter(is_quiet=as_json), made_ns=request.made_ns)
-                    if answer['state'] == 'done':
+                    if answer.state == 'done':
                         lake.await_rows(source, robot, want, rows, left_out)
     if as_json:
-        print_json({**offered, 'answer': answer})
+        print_json({**offered, 'answer': as_plain(answer)})
     code = report_skipped(left_out)
     return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
 
@@ -116,30 +126,26 @@ class AnswerPrinter:
         self._is_quiet = is_quiet
         self._number = 0
 
-    def __call__(self, answer: Mapping[str, Any] | None) -> None:
-        if answer is not None and not self._is_quiet and answer.get('number', 0) != self._number:
-            self._number = answer.get('number', 0)
+    def __call__(self, answer: RequestAnswer | None) -> None:
+        if answer is not None and not self._is_quiet and answer.number != self._number:
+            self._number = answer.number
             click.echo(visible(_sentence(answer)), err=True)
 
 
-def _sentence(answer: Mapping[str, Any]) -> str:
+def _sentence(answer: RequestAnswer) -> str:
     """An answer as a sentence."""
-    outcomes = answer.get('outcomes')
-    known = outcomes if isinstance(outcomes, dict) else {}
-    parts = [f'{state} {each.get("objects")}' for state, each in known.items() if isinstance(each, dict)]
-    why = f' ({answer["why"]})' if answer.get('why') else ''
-    bags = answer.get('bags')
-    cut = f'; cut out as bag {", ".join(map(str, bags))}' if isinstance(bags, list) and bags else ''
-    return f'{answer.get("time")}  {answer["state"]}{why}: of {answer.get("objects")} objects {", ".join(parts) or "none"}{cut}'
+    counts = ', '.join(f'{state} {count.objects}' for state, count in answer.outcomes.items()) or 'none'
+    why = f' ({answer.why})' if answer.why else ''
+    cut = f'; cut out as bag {", ".join(answer.bags)}' if answer.bags else ''
+    return f'{answer.time}  {answer.state}{why}: of {answer.objects} objects {counts}{cut}'
 
 
-def _is_finding(answer: Mapping[str, Any]) -> bool:
-    """Whether something of a request did not arrive, or never will."""
-    return answer['state'] != 'done' or bool(answer.get('lost'))
+def _is_finding(answer: RequestAnswer) -> bool:
+    """Whether some of a request did not arrive, or never will."""
+    return answer.state != 'done' or bool(answer.lost)
 
 
-def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
-    from shadowhound_data_logger.lake import pull as lake  # noqa: PLC0415
+def _list(found: Sequence[PullState], *, is_json: bool) -> ExitCode:
 
     if is_json:
         print_json([asdict(one) for one in found])
@@ -147,8 +153,8 @@ def _list(found: Sequence[Any], *, is_json: bool) -> ExitCode:
     table = plain_table('', ('request', 'by', 'priority', 'state', 'objects', 'delivered'), {'request', 'by', 'state'})
     table.title = None
     for one in found:
-        counts = lake.told_by(one.answer) if one.answer else None
-        cells = (one.id, one.by, one.priority, one.state, *((counts.objects, counts.sent) if counts else ('-', '-')))
+        counts = (one.answer.objects, one.answer.delivered.objects) if one.answer else ('-', '-')
+        cells = (one.id, one.by, one.priority, one.state, *counts)
         table.add_row(*(plain(str(cell)) for cell in cells))
     print_page(*([table] if found else ['Nothing is requested.']))
     return ExitCode.FINE

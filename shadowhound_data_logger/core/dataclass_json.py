@@ -52,6 +52,8 @@ def _hints(kind: type[Any]) -> dict[str, Any]:
 
 
 def _value(hint: Any, given: Any, name: str) -> Any:
+    if hint is Any:
+        return given
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in {Union, UnionType}:
         (hint,) = (kind for kind in arguments if kind is not NoneType)
@@ -62,6 +64,7 @@ def _value(hint: Any, given: Any, name: str) -> Any:
         return tuple(_value(arguments[0], part, name) for part in given)
     if origin is not None and issubclass(origin, Mapping) and isinstance(given, dict):
         return {key: _value(arguments[1], part, name) for key, part in given.items()}
-    if origin is not None or not isinstance(given, (float, int) if hint is float else hint):
+    kinds = (float, int) if hint is float else hint
+    if origin is not None or not isinstance(given, kinds) or (isinstance(given, bool) and hint is not bool):
         raise ValueError(f'{name} is not {getattr(hint, "__name__", hint)}, but {given!r}')
     return given

@@ -14,7 +14,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_words as words
@@ -151,6 +151,65 @@ class PullCancel:
 
     def to_json(self) -> dict[str, Any]:
         return {'cancel': self.id, 'by': self.by, 'made_ns': self.made_ns}
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectCount:
+    """Objects and their bytes."""
+
+    objects: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LostObject:
+    """A requested object that will not arrive."""
+
+    key: str
+    state: str
+    reason: str | None
+    when: str | None
+    """None if unknown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RequestAnswer:
+    """An answer of a robot to a request, as JSON in ``answer_key``."""
+
+    format: int = FORMAT
+    id: str
+    number: int = 0
+    """Of the answers to this request, from 1."""
+    robot: str = ''
+    by: str = ''
+    """The requester."""
+    state: str
+    """``accepted``, ``sending``, ``done``, ``expired``, ``cancelled`` or ``refused``."""
+    time: str = ''
+    made_ns: int = 0
+    """When the request was made."""
+    expires: str = ''
+    why: str = ''
+    """Why it was refused."""
+    want: Mapping[str, Any] = field(default_factory=dict)
+    """The ``KeptFilter``."""
+    objects: int = 0
+    """That the request found."""
+    bytes: int = 0
+    gone: Mapping[str, Any] = field(default_factory=dict)
+    """What had left the robot before the request; empty if nothing had."""
+    mbps: float | None = None
+    """The pace of the link."""
+    outcomes: Mapping[str, ObjectCount] = field(default_factory=dict)
+    """By state: ``delivered``, ``pending``, ``unsent``, ..."""
+    lost: tuple[LostObject, ...] = ()
+    """The first of them."""
+    bags: tuple[str, ...] = ()
+    """Bags that were cut for the request."""
+
+    @property
+    def delivered(self) -> ObjectCount:
+        return self.outcomes.get('delivered', ObjectCount())
 
 
 def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:

@@ -16,11 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from shadowhound_data_logger.core.dataclass_json import parse
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.mailbox import (
     BAG_SENSOR,
@@ -31,6 +32,7 @@ from shadowhound_data_logger.core.mailbox import (
     KeptFilter,
     PullCancel,
     PullRequest,
+    RequestAnswer,
     RequestRefused,
     answers_prefix,
     decode_inbox,
@@ -82,7 +84,7 @@ class PullState:
     """``asked`` until the robot has answered; then that of its newest answer."""
     priority: int | None
     want: dict[str, Any]
-    answer: dict[str, Any] | None
+    answer: RequestAnswer | None
     """The newest one."""
 
 
@@ -158,9 +160,9 @@ def listed(source: Bucket, robot: str) -> list[PullState]:
         answers = pool.map(lambda request: newest_answer(source, robot, request.id), requests)
     found = []
     for request, newest in zip(requests, answers, strict=True):
-        is_of_it = newest is not None and (newest['state'] not in FINAL or _is_last(newest, request.made_ns))
+        is_of_it = newest is not None and (newest.state not in FINAL or _is_last(newest, request.made_ns))
         answer = newest if is_of_it else None
-        state = 'asked' if answer is None else str(answer['state'])
+        state = 'asked' if answer is None else answer.state
         found.append(PullState(request.id, request.by, state, request.priority, request.want.to_json(), answer))
     return found
 
@@ -184,7 +186,7 @@ def _entries(source: Bucket, robot: str) -> list[Any]:
         ) from error
 
 
-def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | None:
+def newest_answer(source: Bucket, robot: str, request: str) -> RequestAnswer | None:
     """The newest valid answer to a request; None before the first one. Raises StoreError."""
     numbers = []
     for entry in source.list(answers_prefix(robot, request)):
@@ -193,16 +195,17 @@ def newest_answer(source: Bucket, robot: str, request: str) -> dict[str, Any] | 
             numbers.append(int(name))
     for number in sorted(numbers, reverse=True)[:ANSWERS_TRIED]:
         try:
-            answer = from_json(source.get(f'{answers_prefix(robot, request)}{number}.json', MOST_ANSWER_BYTES), MOST_ANSWER_BYTES)
+            body = source.get(f'{answers_prefix(robot, request)}{number}.json', MOST_ANSWER_BYTES)
+            answer = parse(RequestAnswer, from_json(body, MOST_ANSWER_BYTES))
         except (ObjectRefused, ValueError):
             continue
-        if isinstance(answer, dict) and answer.get('id') == request and isinstance(answer.get('state'), str):
+        if answer.id == request:
             return answer
     return None
 
 
-def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[dict[str, Any] | None], None] = lambda _: None,
-         made_ns: int = 0) -> dict[str, Any]:  # fmt: skip
+def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[RequestAnswer | None], None] = lambda _: None,
+         made_ns: int = 0) -> RequestAnswer:  # fmt: skip
     """Wait for the final answer to a request made at that time; ``tell`` gets the newest answer. Raises StoreError."""
     while True:
         answer = newest_answer(source, robot, request)
@@ -264,47 +267,23 @@ def _await(source: Bucket, request: PullRequest, rows: Sequence[Mapping[str, Any
            findings: Findings) -> None:  # fmt: skip
     """Wait until a request is done, and the store has rows of its objects."""
 
-    def tell(answer: Mapping[str, Any] | None) -> None:
+    def tell(answer: RequestAnswer | None) -> None:
         say(f'waiting for {request.robot}: {request.want.sensor}, {visible(_how_far(answer))}')
 
     answer = wait(source, request.robot, request.id, tell=tell, made_ns=request.made_ns)
-    if answer['state'] != 'done':
+    if answer.state != 'done':
         raise LakeError(f'{request.robot} did not send all of {request.want.sensor}: {visible(_how_far(answer))}',
                         remedy='`shadowhound-data pull --list`, or ask again')  # fmt: skip
     await_rows(source, request.robot, request.want, rows, findings, say)
 
 
-def _how_far(answer: Mapping[str, Any] | None) -> str:
-    if answer is None:
-        return 'asked'
-    told = told_by(answer)
-    return f'{answer["state"]}, {told.sent} of {told.objects} objects'
+def _how_far(answer: RequestAnswer | None) -> str:
+    return 'asked' if answer is None else f'{answer.state}, {answer.delivered.objects} of {answer.objects} objects'
 
 
-class RequestFigures(NamedTuple):
-    """The numbers of an answer; 0 for invalid ones."""
-
-    objects: int
-    """That the request found."""
-    bytes: int
-    sent: int
-    """Of them, the store has so many."""
-    sent_bytes: int
-
-
-def told_by(answer: Mapping[str, Any]) -> RequestFigures:
-    """The numbers of an answer, which can contain anything."""
-    outcomes = answer.get('outcomes')
-    delivered = outcomes.get('delivered') if isinstance(outcomes, dict) else None
-    sent = delivered if isinstance(delivered, dict) else {}
-    said = answer.get('objects'), answer.get('bytes'), sent.get('objects'), sent.get('bytes')
-    return RequestFigures(*(count if type(count) is int else 0 for count in said))
-
-
-def _is_last(answer: dict[str, Any], made_ns: int) -> bool:
+def _is_last(answer: RequestAnswer, made_ns: int) -> bool:
     """Whether it ends a request made at that time; a request that ended can be made again."""
-    answered = answer.get('made_ns')
-    return answer['state'] in FINAL and type(answered) is int and answered >= made_ns
+    return answer.state in FINAL and answer.made_ns >= made_ns
 
 
 def _requests(robot: str, entries: Iterable[Any]) -> list[PullRequest]:

@@ -19,7 +19,7 @@ from typing import Any, Final, Protocol, TypeVar
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import LakeError, SpoolError
-from shadowhound_data_logger.core.mailbox import KeptFilter, offer
+from shadowhound_data_logger.core.mailbox import KeptFilter, RequestAnswer, offer
 from shadowhound_data_logger.core.model import ON_ROBOT, State
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.formats.rows.schema import BUCKET
@@ -162,10 +162,10 @@ class StoreKept:
 
         found = []
         for one in pull.listed(self._source, robot)[-MAX_REQUESTS:]:
-            answer = one.answer or {}
-            why = answer.get('why')
-            found.append({'id': one.id, 'by': one.by, 'state': one.state, 'why': why if isinstance(why, str) else '',
-                          'want': one.want, **pull.told_by(answer)._asdict()})  # fmt: skip
+            answer = one.answer or RequestAnswer(id=one.id, state=one.state)
+            found.append({'id': one.id, 'by': one.by, 'state': one.state, 'why': answer.why, 'want': one.want,
+                          'objects': answer.objects, 'bytes': answer.bytes, 'sent': answer.delivered.objects,
+                          'sent_bytes': answer.delivered.bytes})  # fmt: skip
         return found
 
     def ask(self, robot: str, want: KeptFilter, by: str) -> str:

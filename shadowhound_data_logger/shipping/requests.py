@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import KeepSettings
+from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.errors import AccessDenied, DataLoggerError, ObjectRefused, StoreError
 from shadowhound_data_logger.core.mailbox import (
     DEFAULT_EXPIRY_NS,
@@ -28,8 +29,11 @@ from shadowhound_data_logger.core.mailbox import (
     LATEST_NS,
     MAILBOX_BUCKET,
     MOST_INBOX_BYTES,
+    LostObject,
+    ObjectCount,
     PullCancel,
     PullRequest,
+    RequestAnswer,
     RequestRefused,
     answer_key,
     decode_inbox,
@@ -439,21 +443,21 @@ class RequestServer:
             return  # what was released goes on its way, and the last answer tells of it
         number = row.answers + 1
         self._answering[row.id] = number
-        said: dict[str, Any] = {
-            'format': 1, 'id': row.id, 'number': number, 'robot': self._robot, 'by': row.requester,
-            'state': 'accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
-            'time': iso(now_ns), 'made_ns': row.made_ns, 'expires': iso(row.expires_ns), 'why': row.why,
-            'want': json.loads(row.wanted),
-            'objects': row.objects, 'bytes': row.bytes, 'gone': json.loads(row.gone), 'mbps': self._mbps(),
-            'outcomes': {state: {'objects': count, 'bytes': size} for state, (count, size) in progress.outcomes.items()},
-            'lost': [{'key': key, 'state': state, 'reason': reason, 'when': iso(settled_ns) if settled_ns else None}
-                     for key, state, reason, settled_ns in progress.lost],
-            'bags': [key.split('/')[2] for key in progress.manifests],
-        }  # fmt: skip
+        answer = RequestAnswer(
+            id=row.id, number=number, robot=self._robot, by=row.requester,
+            state='accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
+            time=iso(now_ns), made_ns=row.made_ns, expires=iso(row.expires_ns), why=row.why, want=json.loads(row.wanted),
+            objects=row.objects, bytes=row.bytes, gone=json.loads(row.gone), mbps=self._mbps(),
+            outcomes={state: ObjectCount(*counts) for state, counts in progress.outcomes.items()},
+            lost=tuple(LostObject(key, state, reason, iso(settled_ns) if settled_ns else None)
+                       for key, state, reason, settled_ns in progress.lost),
+            bags=tuple(key.split('/')[2] for key in progress.manifests),
+        )  # fmt: skip
         self._put(DataObject(
-            bucket=MAILBOX_BUCKET, key=answer_key(self._robot, row.id, number), body=json.dumps(said, indent=1).encode(),
-            content_type='application/json', sensor=ANSWERS, topic=None, type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns,
-            priority=0, protected=True, metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
+            bucket=MAILBOX_BUCKET, key=answer_key(self._robot, row.id, number),
+            body=json.dumps(as_plain(answer), indent=1).encode(), content_type='application/json', sensor=ANSWERS, topic=None,
+            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True,
+            metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
         ))  # fmt: skip
 
 

@@ -61,6 +61,7 @@ def test_a_false_dataclass_is_an_empty_object() -> None:
         (3, 'NodeStatus is not an object, but 3'),
         ({'pid': '3'}, "pid is not int, but '3'"),
         ({'pid': None}, 'pid is not int, but None'),
+        ({'pid': True}, 'pid is not int, but True'),
         ({'uptime_s': 'long'}, "uptime_s is not float, but 'long'"),
         ({'topics': []}, r'topics is not .*, but \[\]'),
         ({'topics': {'/imu': {'age_s': '1'}}}, "age_s is not float, but '1'"),

@@ -24,7 +24,7 @@ from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
-from shadowhound_data_logger.core.mailbox import KeptFilter, PullRequest
+from shadowhound_data_logger.core.mailbox import KeptFilter, ObjectCount, PullRequest
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.formats.rows import parts, schema
@@ -167,7 +167,7 @@ def test_what_is_lost_on_the_robot_is_told(field: Field) -> None:
     field.passes()
     answer = lake.newest_answer(field.source, 'thor', said['id'])
     assert answer
-    assert (answer['gone']['objects'], answer['gone']['reasons']) == (3, {'evicted: no_room': 3})
+    assert (answer.gone['objects'], answer.gone['reasons']) == (3, {'evicted: no_room': 3})
     assert field.kept() == [4, 5, 6, 7]
     for _ in range(2):
         merge(field.settings)
@@ -189,7 +189,7 @@ def test_a_request_is_taken_back(field: Field) -> None:
     assert field.kept() == [1]
     answer = lake.newest_answer(field.source, 'thor', request)
     assert answer
-    assert (answer['state'], answer['outcomes']) == ('cancelled', {'unsent': {'objects': 1, 'bytes': 1000}})
+    assert (answer.state, answer.outcomes) == ('cancelled', {'unsent': ObjectCount(1, 1000)})
 
 
 def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: Path) -> None:
@@ -324,6 +324,7 @@ def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
         {'state': 'sending', 'objects': '\x1b[2J', 'outcomes': {'delivered': [1]}, 'number': {}},
         {'state': 'done\x07', 'objects': 10**30, 'outcomes': {'x': 1}, 'bags': {}, 'made_ns': 'x'},
         {'state': 'sending', 'outcomes': [], 'bags': [['x']], 'why': {'a': 1}, 'time': []},
+        {'state': 'done\x07', 'objects': 10**30, 'outcomes': {'\x1b': {}}, 'bags': ['\x1b[2J'], 'why': '\x07', 'time': '\x1b'},
     ), 50):  # fmt: skip
         place = field.settings.directory / 'sensor-data' / 'thor' / '_answers' / said['id'] / f'{number}.json'
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -332,4 +333,7 @@ def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
         assert done.exception is None
         assert '\x1b' not in done.output
         assert '\x07' not in done.output
-        assert '\x1b' not in visible(_sentence({'time': None, **answer}))
+    newest = lake.newest_answer(field.source, 'thor', said['id'])
+    assert newest
+    assert newest.state == 'done\x07'
+    assert '\x1b' not in visible(_sentence(newest))
