@@ -36,6 +36,7 @@ from shadowhound_data_logger.cli.common import (
     robot_name,
     store_hint,
     the_home,
+    the_robot,
     the_store,
 )
 from shadowhound_data_logger.cli.output import (
@@ -113,7 +114,7 @@ def _in_store(name: str) -> Iterator[None]:
 
 
 _robot = click.option(
-    '--robot', envvar='SHADOWHOUND_ROBOT', default='thor', show_default=True, callback=robot_name, help='Robot of the bags.'
+    '--robot', callback=robot_name, help='Robot of the bags  [default: SHADOWHOUND_ROBOT, else that of this machine or store]'
 )
 _bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
@@ -138,7 +139,7 @@ def bag() -> None:
 )
 @_robot
 @as_json
-def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
+def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
     """List the bags in the store and on this machine.
 
     \b
@@ -151,6 +152,7 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
     Exit code 1 when something is wrong with a bag, or when the store cannot be reached: then only what is on this machine is
     listed.
     """  # noqa: D301 - click's mark for lines that stay as they are
+    robot = the_robot(robot, in_store=True)
     begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
     with the_store(STORE_THREADS) as store:
         where, away = store.describe(), ''
@@ -176,7 +178,7 @@ def bag_list(*, since: str, robot: str, as_json: bool) -> ExitCode:
 @_bag_or_folder
 @_robot
 @as_json
-def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
+def bag_info(*, bag: str | Path, robot: str | None, as_json: bool) -> ExitCode:
     """Show topics, rates, times and files of a bag.
 
     It downloads almost nothing, except of MCAP files whose summary does not have the message counts: those are read as a whole.
@@ -187,7 +189,7 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
             found = info_folder(bag)
     else:
         with _in_store(bag), the_store(STORE_THREADS) as store:
-            found = info_of(store, robot, bag, the_home())
+            found = info_of(store, the_robot(robot, in_store=True), bag, the_home())
     if as_json:
         print_json(_info_json(found))
     else:
@@ -200,7 +202,7 @@ def bag_info(*, bag: str | Path, robot: str, as_json: bool) -> ExitCode:
 @_bag_or_folder
 @_robot
 @as_json
-def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> ExitCode:
+def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool) -> ExitCode:
     """Check that a bag is there as it was recorded.
 
     Exit code 0 only when every file is sound and the bag is not growing.
@@ -214,7 +216,7 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str, as_json: bool) -> Exi
                 found = verify_folder(bag, deep=deep, told=bar.have)
         else:
             with _in_store(bag), the_store(STORE_THREADS) as store:
-                found = verify_remote(store, find_bag(store, robot, bag), deep=deep, told=bar.have)
+                found = verify_remote(store, find_bag(store, the_robot(robot, in_store=True), bag), deep=deep, told=bar.have)
     if as_json:
         checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
         facts = {'bag': found.bag, 'state': found.state, 'checks': checks, 'read_bytes': found.read_bytes,
@@ -259,14 +261,14 @@ def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged:
 )
 @_robot
 @as_json
-def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
+def bag_fetch(*, bag: str, to: Path, robot: str | None, as_json: bool) -> ExitCode:
     """Download a bag, verified.
 
     It becomes TO/BAG. Run it again after an interruption: files that are already complete are skipped. A bag that is still
     growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
-        there = find_bag(store, robot, bag)
+        there = find_bag(store, the_robot(robot, in_store=True), bag)
         found = fetch(store, there, to, progress=bar)
     if as_json:
         print_json({**asdict(found), 'folder': str(found.folder)})
@@ -302,7 +304,7 @@ def bag_fetch(*, bag: str, to: Path, robot: str, as_json: bool) -> ExitCode:
 @click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='New folder for the bag.')
 @_robot
 @as_json
-def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str, as_json: bool, ranges: list[Any] | None,
+def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str | None, as_json: bool, ranges: list[Any] | None,
             **wanted: str) -> ExitCode:  # fmt: skip
     """Copy a span of time or some topics into a new bag.
 
@@ -323,7 +325,7 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
             found = cut_folder(bag, output, choice)
     else:
         with _in_store(bag), the_store(STORE_THREADS) as store:
-            found = cut_remote(store, find_bag(store, robot, bag), output, choice)
+            found = cut_remote(store, find_bag(store, the_robot(robot, in_store=True), bag), output, choice)
     if as_json:
         print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))
     else:
@@ -351,7 +353,9 @@ def _spans(ranges: list[Any]) -> tuple[tuple[int, int], ...]:
 @click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
 @_robot
 @as_json
-def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: str, as_json: bool, tar_gz: bool) -> ExitCode:
+def bag_upload(
+    *, folder: Path, name: str, now: bool, deadline: float, robot: str | None, as_json: bool, tar_gz: bool
+) -> ExitCode:
     """Upload a finished bag.
 
     SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
@@ -360,7 +364,7 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
     before the deadline, the exit code is 1 and the bag stays safely in the spool: the node that runs here, or the next upload,
     delivers it. DIR itself is never changed.
     """
-    folder = folder.absolute()
+    robot, folder = the_robot(robot), folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
     with (
         _in_folder(),
@@ -391,7 +395,7 @@ def bag_upload(*, folder: Path, name: str, now: bool, deadline: float, robot: st
 @click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end: for a timer.')
 @_robot
 @as_json
-def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: bool, remove: bool) -> ExitCode:
+def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_json: bool, remove: bool) -> ExitCode:
     """Upload each finished bag in DIR, until Ctrl-C.
 
     For example those of `ros2 bag record`. Each is sent once.
@@ -400,7 +404,7 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: b
     DIR/.shadowhound-bags.json lists what was sent, so that a restart does not send it again. With --once, exit code 1 means that
     a bag is not in the store yet.
     """
-    settings = Settings.load({'robot': robot}, os.environ)
+    settings = Settings.load({'robot': the_robot(robot)}, os.environ)
     watching = Watch(folder.absolute(), settings, SystemClock.of_this_machine(), settle_s=settle, is_removing=remove)
     with watching.alone():
         try:
@@ -425,7 +429,7 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str, as_json: b
 )
 @_robot
 @as_json
-def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> ExitCode:
+def bag_record(*, topics: tuple[str, ...], robot: str | None, as_json: bool, **wanted: Any) -> ExitCode:
     """Record topics into a bag and upload it.
 
     The bag is NAME_YYYYMMDD_HHMMSS; without --topic it has the topics that the node logs by default.
@@ -435,7 +439,7 @@ def bag_record(*, topics: tuple[str, ...], as_json: bool, **wanted: Any) -> Exit
     """
     names = [name.strip() for each in topics for name in each.split(',') if name.strip()]
     duration, deadline = wanted.pop('duration'), wanted.pop('deadline')
-    found = record(duration_s=duration, deadline_s=deadline, topics=names, **wanted)
+    found = record(duration_s=duration, deadline_s=deadline, topics=names, robot=the_robot(robot), **wanted)
     if as_json:
         print_json({**asdict(found), 'where': found.where})
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, MutableMapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from shadowhound_data_logger.core.config import UploadSettings, home, store_settings
-from shadowhound_data_logger.core.errors import NameRefused
-from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.errors import NameRefused, StoreError
+from shadowhound_data_logger.core.keys import check_name, is_name
+from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.options import StoreSettings
 
 if TYPE_CHECKING:
@@ -114,6 +115,42 @@ as_json = click.option('--json', 'as_json', is_flag=True, help='Print JSON.')
 spool_folder = click.option(
     '--spool', type=click.Path(path_type=Path, file_okay=False), help='The spool  [default: $SHADOWHOUND_HOME/spool]'
 )
+
+
+def the_robot(named: str | None, spool: Path | None = None, *, in_store: bool = False, must_exist: bool = False) -> str:
+    """The robot that a verb is about.
+
+    The named one, else SHADOWHOUND_ROBOT, else the one whose node runs here, or the only one whose node has run here; with
+    ``in_store`` else the only one of the store. Without any of these it is the default of the node, ``thor``. Raises BadUsage
+    if there are several, or none and it ``must_exist``.
+    """
+    if named := named or os.environ.get('SHADOWHOUND_ROBOT'):
+        return named
+    found = running(the_spool(spool))
+    if not found and in_store:
+        found = the_store_robots()
+    if len(found) > 1 or (must_exist and not found):
+        raise BadUsage(f'which robot? There are {", ".join(found) or "none"}', '--robot NAME, or set SHADOWHOUND_ROBOT')
+    return found[0] if found else DEFAULT
+
+
+def running(spool: Path) -> list[str]:
+    """The robots whose nodes run here; if none does, those whose nodes have run here."""
+    from shadowhound_data_logger.core.clock import SystemClock  # noqa: PLC0415 - SQLite
+    from shadowhound_data_logger.spool.status import read  # noqa: PLC0415
+
+    names = robots(spool)
+    if len(names) < 2:
+        return names
+    clock = SystemClock.of_this_machine()
+    return [name for name in names if read(spool, name, clock).running] or names
+
+
+def the_store_robots() -> list[str]:
+    """Robots with data in the store; none if it cannot be read, which the verb reports itself."""
+    with suppress(StoreError), the_store(1) as store:
+        return [name for name in store.folders('sensor-data') if is_name(name)]
+    return []
 
 
 def the_home() -> Path:

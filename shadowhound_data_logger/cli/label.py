@@ -18,6 +18,7 @@ from shadowhound_data_logger.cli.common import (
     exit_code,
     robot_name,
     store_hint,
+    the_robot,
     the_store,
     the_store_settings,
 )
@@ -84,11 +85,20 @@ def label_add(*, name: str, robot: str | None, since: str | None, until: str | N
 
         of: dict[str, Any] = {'label': name, 'note': note}
         if ranges is not None:
-            found = [Label(robot=span.robot or _named(robot), since_ns=span.since_ns, until_ns=span.until_ns, **of)
-                     for span in spans_of(ranges)]  # fmt: skip
+            found = [Label(robot=span.robot or _named(robot), since_ns=span.since_ns,
+                           until_ns=span.until_ns, **of) for span in spans_of(ranges)]  # fmt: skip
         elif key is not None:
             bucket, key = _place(key, _named(robot))
-            found = [Label(robot=_named(robot), since_ns=0, until_ns=0, bucket=bucket, key=key, **{**of, **_box(box)})]
+            found = [
+                Label(
+                    robot=_named(robot),
+                    since_ns=0,
+                    until_ns=0,
+                    bucket=bucket,
+                    key=key,
+                    **{**of, **_box(box)},
+                )
+            ]
         else:
             now_ns = SystemClock.of_this_machine().wall_ns()
             found = [Label(robot=_named(robot), since_ns=moment('--since', since or '', now_ns),
@@ -114,7 +124,7 @@ def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool)
         from shadowhound_data_logger.lake import labels  # noqa: PLC0415
 
         is_json = body.lstrip()[:1] == b'{'
-        found = labels.from_coco(body, robot) if is_json else labels.from_csv(body, robot or _only_robot(), now_ns)
+        found = labels.from_coco(body, robot) if is_json else labels.from_csv(body, _named(robot), now_ns)
     return _add(found, by, is_json=as_json)
 
 
@@ -224,18 +234,7 @@ def _me() -> str:
 
 
 def _named(robot: str | None) -> str:
-    return robot or os.environ.get('SHADOWHOUND_ROBOT') or _only_robot()
-
-
-def _only_robot() -> str:
-    """The only robot of the store. Raises BadUsage if there are several."""
-    from shadowhound_data_logger.lake import row_files  # noqa: PLC0415
-    from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-
-    found = row_files.robots(default_source(the_store_settings()))
-    if len(found) != 1:
-        raise BadUsage(f'which robot? The store has {", ".join(found) or "none"}', '--robot NAME')
-    return found[0]
+    return the_robot(robot, in_store=True, must_exist=True)
 
 
 def _place(key: str, robot: str) -> tuple[str, str]:

@@ -19,12 +19,13 @@ from shadowhound_data_logger.cli.common import (
     robot_name,
     spool_folder,
     the_home,
+    the_robot,
     the_spool,
     the_store_settings,
 )
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.core import heap
-from shadowhound_data_logger.spool.status import robots
+from shadowhound_data_logger.core.local_robot import DEFAULT
 
 PORT = 8765
 RTSP_PORT = 8554
@@ -92,8 +93,9 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
         parts = urlsplit(robot_url)
         if parts.scheme not in ('http', 'https') or not parts.hostname or '@' in parts.netloc:
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
+    robot = robot or (DEFAULT if is_of_store else the_robot(robot, folder))
     settings = LiveSettings(
-        spool=folder, robot=robot or next(iter(robots(folder)), 'thor'), tokens=tokens, bind=bind, port=port, names=names,
+        spool=folder, robot=robot, tokens=tokens, bind=bind, port=port, names=names,
         certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, is_of_store=is_of_store,
         robot_url=robot_url or '', robot_token=robot_token,
     )  # fmt: skip

@@ -14,7 +14,7 @@ import click
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_home
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_home, the_robot
 from shadowhound_data_logger.cli.output import (
     duration,
     number,
@@ -112,8 +112,7 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
         else:
             click.echo('Nothing is left to send.')
         return ExitCode.FINE
-    robot = os.environ.get('SHADOWHOUND_ROBOT') or 'thor'
-    replayer = Replayer(where, experiment or f'{robot}_missions', os.environ)
+    replayer = Replayer(where, experiment or f'{the_robot(None)}_missions', os.environ)
     replayer.start()
     replayer.wake()
     try:

@@ -23,6 +23,7 @@ from shadowhound_data_logger.cli.common import (
     exit_code,
     robot_name,
     the_home,
+    the_robot,
     the_store,
 )
 from shadowhound_data_logger.cli.output import plain_table, print_json, print_page
@@ -306,7 +307,7 @@ def _follows(verb: _Verb) -> _Verb:
     """The options of what a robot follows."""
     for option in reversed((
         click.option('--name', envvar='SHADOWHOUND_POLICY', required=True, help='Registered model  [$SHADOWHOUND_POLICY]'),
-        click.option('--robot', envvar='SHADOWHOUND_ROBOT', default='thor', callback=robot_name, show_default=True),
+        click.option('--robot', default=lambda: the_robot(None), callback=robot_name, show_default='that of this machine'),
         click.option('--robot-type', default='go2', show_default=True, help='What the manifest has to be for.'),
         click.option('--max-mbps', type=click.FloatRange(0.0, 1e5), default=0.0, show_default=True,
                      help='Most megabits a second to download; 0: no limit.'),
@@ -551,7 +552,7 @@ def _telling() -> Iterator[None]:
 
 
 def _no_mission(robot: str = '') -> Callable[[], bool]:
-    missions = MissionFinder(the_home(), robot or os.environ.get('SHADOWHOUND_ROBOT') or 'thor')
+    missions = MissionFinder(the_home(), the_robot(robot or None))
     return lambda: missions.look() is None
 
 

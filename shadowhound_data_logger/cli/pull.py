@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, the_store, the_store_settings
+from shadowhound_data_logger.cli.common import (
+    BadUsage,
+    ExitCode,
+    as_json,
+    examples,
+    exit_code,
+    the_robot,
+    the_store,
+    the_store_settings,
+)
 from shadowhound_data_logger.cli.output import duration, number, plain, plain_table, print_json, print_page, volume
 from shadowhound_data_logger.cli.question import asking, question, quietly, report_skipped
 from shadowhound_data_logger.core.dataclass_json import as_plain
@@ -69,7 +78,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         source, left_out = default_source(the_store_settings()), quietly()
-        robot = flags.get('robot') or _only_robot(source)
+        robot = the_robot(flags.get('robot'), in_store=True, must_exist=True)
         check_name_of('robot', robot, robots(source))
         name = by or lake.requester()
         if not is_name(name):
@@ -217,12 +226,3 @@ def _expiry_ns(text: str) -> int:
     if not 0 < age_ns <= LONGEST_NS:
         raise BadUsage(f'--expires {text!r} is not an age of at most 90 days', 'such as 2h or 7d')
     return age_ns
-
-
-def _only_robot(source: Any) -> str:
-    from shadowhound_data_logger.lake import row_files  # noqa: PLC0415
-
-    found = row_files.robots(source)
-    if len(found) != 1:
-        raise BadUsage(f'there are {len(found)} robots in {source.describe()}', 'name one: --robot NAME')
-    return str(found[0])

@@ -41,12 +41,13 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
 from shadowhound_data_logger.core.errors import PolicyError
+from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.status import BagStatus, EventStatus, NodeStatus, SpoolStatus, TopicStatus
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX
 from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 from shadowhound_data_logger.spool.gaps import EXACT
-from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, NodeReport, NodeSession, robots
+from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, NodeReport, NodeSession
 from shadowhound_data_logger.spool.status import read as read_status
 
 LOSSES: Final = ('dropped', 'rejected')
@@ -109,7 +110,7 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
 
 def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     """The requested robot, or the first that runs, or the first that has a status."""
-    names = [robot] if robot else robots(spool) or ['thor']
+    names = [robot] if robot else robots(spool) or [DEFAULT]
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each.running), found[0])
     others = tuple(each.robot for each in found if each.running and each is not chosen)

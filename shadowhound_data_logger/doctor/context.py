@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from shadowhound_data_logger.core.config import ENDPOINTS, Settings
+from shadowhound_data_logger.core.config import ENDPOINTS, Settings, home
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.local_robot import local_robot
 from shadowhound_data_logger.core.ros_arguments import NODE, read_parameters
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
@@ -35,6 +36,8 @@ def make(
     node = f'/{namespace.strip("/")}/{NODE}' if namespace.strip('/') else None
     given = dict(parameters if parameters is not None else read_parameters(parameter_file, node) if parameter_file else {})
     known, left, refused = dict(environ), dict(given), []
+    if not left.get('robot') and not namespace.strip('/') and (robot := local_robot(environ, home(environ))):
+        known['SHADOWHOUND_ROBOT'] = robot
     while True:
         try:
             settings = Settings.load(left, known, namespace)

@@ -22,6 +22,7 @@ from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import home as home_of
 from shadowhound_data_logger.core.errors import NameRefused, SettingError
 from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.local_robot import DEFAULT, local_robot
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
@@ -54,15 +55,16 @@ class MissionDataLogger:
         experiment: str | None = None, start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
         replay: bool = True,
     ) -> None:  # fmt: skip
-        """Defaults: SHADOWHOUND_ROBOT, SHADOWHOUND_HOME and MLFLOW_TRACKING_URI; experiment: ROBOT_missions.
+        """Defaults: SHADOWHOUND_HOME, MLFLOW_TRACKING_URI; robot: SHADOWHOUND_ROBOT, else the one whose node has run here, else
+        ``thor``; experiment: ROBOT_missions.
 
         Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
         journals: another logger of the same home sends them.
         """
         uri = _text('tracking_uri', tracking_uri)
         environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': uri} if uri else {})
-        self.robot = _robot(_text('robot', robot) or environ.get('SHADOWHOUND_ROBOT') or 'thor')
         self.home = _home(environ | ({'SHADOWHOUND_HOME': given} if (given := _text('home', home)) else {}))
+        self.robot = _robot(_text('robot', robot) or local_robot(environ, self.home) or DEFAULT)
         experiment = _text('experiment', experiment) or f'{self.robot}_missions'
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)

@@ -18,6 +18,7 @@ from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.local_robot import robots
 from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.core.status import NodeStatus, OtherType, SpoolStatus, TopicStatus, Totals
 from shadowhound_data_logger.spool.index import Index
@@ -80,11 +81,6 @@ class NodeReport:
 def file(spool: Path, robot: str) -> Path:
     """The status file of the node of a robot."""
     return spool / f'status-{robot}.json'
-
-
-def robots(spool: Path) -> list[str]:
-    """The robots whose nodes have written a status here."""
-    return sorted(path.stem.removeprefix('status-') for path in spool.glob('status-*.json'))
 
 
 def targets(spool: Path) -> list[str]:

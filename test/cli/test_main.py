@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import pkgutil
 import re
 import shlex
@@ -11,16 +12,20 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import click
 import pytest
+from spool.test_status import written
 
 import shadowhound_data_logger
+from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.cli import main as main_module
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, the_robot
 from shadowhound_data_logger.cli.main import PROGRAM, SECTIONS, cli, described, main, verb_of
 from shadowhound_data_logger.core.errors import BagError, DataLoggerError, PolicyRefused, SettingError, UnknownName
+from shadowhound_data_logger.doctor.context import make
 
 
 def verbs(command: click.Command = cli, path: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
@@ -319,3 +324,41 @@ def test_the_help_imports_no_verb() -> None:
     loaded = {name for name in names if name.startswith('shadowhound_data_logger.cli.')}
     assert loaded == {'shadowhound_data_logger.cli.common', 'shadowhound_data_logger.cli.main'}
     assert not {'rich', 'numpy', 'pyarrow', 'sqlite3.dbapi2', 'mcap'} & {name.partition('.')[0] for name in names}
+
+
+# -- the robot ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of a machine on which nothing says which robot it is."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    for name in ('SHADOWHOUND_ROBOT', 'AWS_ENDPOINT_URL'):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / 'spool').mkdir()
+    return tmp_path / 'spool'
+
+
+def test_verbs_are_about_the_robot_of_this_machine(spool: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The one whose node has run here; if there are several, they ask."""
+    written(spool, robot='turtle')
+    assert the_robot(None) == 'turtle'
+    assert cli(['bag', 'list'], standalone_mode=False) == ExitCode.FINE
+    assert 'no bag of turtle' in capsys.readouterr().out
+    assert make(os.environ).settings.robot == 'turtle'
+    with closing(MissionDataLogger(replay=False)) as logger:
+        assert logger.robot == 'turtle'
+    written(spool, robot='tachi')
+    with pytest.raises(BadUsage, match='which robot'):
+        the_robot(None)
+    assert the_robot('tachi') == 'tachi'
+    with pytest.raises(BadUsage, match='which robot'):
+        cli(['bag', 'list'], standalone_mode=False)
+
+
+def test_nothing_says_which_robot(spool: Path) -> None:
+    """Not even the store: it is the node's default, unless something must exist."""
+    assert the_robot(None, in_store=True) == 'thor'
+    with pytest.raises(BadUsage, match='none'):
+        the_robot(None, in_store=True, must_exist=True)
+    assert not list(spool.iterdir())
