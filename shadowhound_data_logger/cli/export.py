@@ -248,6 +248,10 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
     for episode in result.added[:SHOWN]:
         stale = max((each['stale_share'] for each in episode['streams'].values()), default=0.0)
         yield plain(f'  {episode["mission_id"]}: {number(episode["frames"])} frames, {stale:.1%} stale')
+        for name, each in episode['streams'].items():
+            if each['offset_changed']:
+                span = f'{each["offset_min_s"]:,.1f} to {each["offset_max_s"]:,.1f} s'
+                yield plain(f'    {name}: the offset between stamps and arrivals changed, from {span}', 'yellow')
     for mission, why in list(result.refused.items())[:SHOWN]:
         yield plain(f'  {mission} is refused: {why}', 'red')
     for mission, why in list(result.waiting.items())[:SHOWN]:

@@ -11,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any, Final
@@ -25,6 +25,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.errors import BagDamaged, LakeError, ObjectRefused, Rejected
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
+from shadowhound_data_logger.core.stamps import SAME_NS
 from shadowhound_data_logger.datasets.clocks import ClockOffset
 from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions
 from shadowhound_data_logger.datasets.plan import BEFORE_NS, ArmPlan, EpisodePlan, StreamPlan, refusal
@@ -63,9 +64,10 @@ SOURCE_SCHEMA: Final = pa.schema([
     pa.field(EPISODE, pa.string(), nullable=False), pa.field('frame', pa.int64(), nullable=False),
     pa.field('stream', pa.string(), nullable=False), pa.field('bucket', pa.string(), nullable=False),
     pa.field('key', pa.string(), nullable=False), pa.field('sha256', pa.string(), nullable=False),
-    pa.field('stamp_ns', pa.int64(), nullable=False), pa.field('held_s', pa.float64(), nullable=False),
+    pa.field('stamp_ns', pa.int64(), nullable=False), pa.field('received_ns', pa.int64()),
+    pa.field('held_s', pa.float64(), nullable=False),
 ])  # fmt: skip
-"""One row per frame and source message: ``held_s`` is how much older than the tick the message was."""
+"""One row per frame and source message: its stamp, its arrival (null if unknown), and how much older than the tick it was."""
 GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
 """The statements of the gap journal that were used (formats/rows/gaps.py)."""
 LABEL_SCHEMA: Final = narrow(labels.FIELDS, catalogue_labels.LABELS).insert(0, GAP_SCHEMA.field(EPISODE))
@@ -179,8 +181,7 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, R
         good = np.isfinite(one.values).all(axis=1)
         if not good.any():
             raise LakeError(f'{each.recording.topic} has no finite numbers')
-        own = None if one.own_stamps is None else one.own_stamps[good]
-        one = Series(one.recording, one.stamps[good], one.values[good], one.file[good], one.files, one.names, own_stamps=own)
+        one = one.only(np.flatnonzero(good))
         found.append(_derived(one, options) if each.part.is_derived else one)
     return found
 
@@ -189,16 +190,15 @@ def _moved(series: Series, clock: ClockOffset, span: tuple[int, int]) -> Series:
     """By the robot's clock."""
     stamps = clock.robot_ns(series.stamps)
     inside = (stamps >= span[0]) & (stamps <= span[1])
-    return Series(series.recording, stamps[inside], series.values[inside], series.file[inside], series.files, series.names,
-                  own_stamps=series.stamps[inside])  # fmt: skip
+    return replace(series, stamps=stamps, own_stamps=series.stamps).only(inside)
 
 
 def _derived(poses: Series, options: ExportOptions) -> Series:
     later, values = motion(poses.stamps, poses.values, round(options.max_gap_s * SECOND))
     if not len(later):
         raise LakeError(f'{poses.recording.topic} has no two poses from which a velocity could be derived')
-    previous = np.column_stack([poses.stamps[later - 1], poses.file[later - 1]])
-    return Series(poses.recording, poses.stamps[later], values, poses.file[later], poses.files, previous=previous)
+    previous = np.column_stack([poses.stamps[later - 1], poses.received[later - 1], poses.file[later - 1]])
+    return replace(poses.only(later), values=values, names=(), previous=previous)
 
 
 def _ticks(plan: EpisodePlan, series: Sequence[Series], fps: int) -> NDArray[np.int64]:
@@ -252,11 +252,30 @@ def _description(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence
                 'stale_share': round(float(each.sampled.stale.mean()), 6),
                 'longest_gap_s': round(float(each.sampled.age_s[each.sampled.stale].max(initial=0.0)), 3),
                 'causes': dict(sorted(Counter(why.values()).items())), 'names': list(_names(each)),
-                'known': _grades(each, plan.arm, ticks),
+                'known': _grades(each, plan.arm, ticks), **_offsets(each),
             }
             for each, why in zip(streams, causes, strict=True)
         },
     }  # fmt: skip
+
+
+def _offsets(stream: _Stream) -> dict[str, Any]:
+    """The smallest and the largest offset between stamp and arrival of the messages in the episode, and whether it changed.
+
+    Null if no arrival is known. A change of more than a second means that the stream was aligned by two clocks, or came late.
+    """
+    series, used = stream.series, stream.sampled.message
+    inside = slice(int(used.min()), int(used.max()) + 1)
+    stamps, received = (series.stamps if series.own_stamps is None else series.own_stamps)[inside], series.received[inside]
+    offsets = (received - stamps)[received > 0]
+    if not len(offsets):
+        return {'offset_min_s': None, 'offset_max_s': None, 'offset_changed': False}
+    low, high = int(offsets.min()), int(offsets.max())
+    return {
+        'offset_min_s': round(low / SECOND, 3),
+        'offset_max_s': round(high / SECOND, 3),
+        'offset_changed': high - low > SAME_NS,
+    }
 
 
 def _grades(stream: _Stream, arm: ArmPlan | None, ticks: NDArray[np.int64]) -> list[str]:
@@ -408,23 +427,24 @@ def _sources(mission_id: str, stream: _Stream, ticks: NDArray[np.int64]) -> Iter
     used = np.where(is_line, sampled.other + 1, sampled.message)
     own = series.stamps if series.own_stamps is None else series.own_stamps
     held = (ticks - series.stamps[used]) / SECOND
-    yield _source_rows(mission_id, stream, frames, own[used], series.file[used], held)
+    yield _source_rows(mission_id, stream, frames, own[used], series.received[used], series.file[used], held)
     if is_line.any():
         other = sampled.other[is_line]
         held = (ticks[is_line] - series.stamps[other]) / SECOND
-        yield _source_rows(mission_id, stream, frames[is_line], own[other], series.file[other], held)
+        yield _source_rows(mission_id, stream, frames[is_line], own[other], series.received[other], series.file[other], held)
     if series.previous is not None:
         earlier = series.previous[sampled.message]
         held = (ticks - earlier[:, 0]) / SECOND
-        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], held)
+        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], earlier[:, 2], held)
 
 
 def _source_rows(mission_id: str, stream: _Stream, frames: NDArray[np.int64], stamps: NDArray[np.int64],
-                 files: NDArray[np.int64], held: NDArray[np.float64]) -> pa.Table:  # fmt: skip
+                 received: NDArray[np.int64], files: NDArray[np.int64], held: NDArray[np.float64]) -> pa.Table:  # fmt: skip
     known = stream.series.files
     named = {name: pa.array([getattr(known[int(number)], name) for number in files]) for name in ('bucket', 'key', 'sha256')}
     return pa.table({
         EPISODE: pa.array([mission_id] * len(frames)), 'frame': pa.array(frames, pa.int64()),
         'stream': pa.array([stream.plan.name] * len(frames)), **named, 'stamp_ns': pa.array(stamps, pa.int64()),
+        'received_ns': pa.array(received, pa.int64(), mask=received == 0),
         'held_s': pa.array(held, pa.float64()),
     }, schema=SOURCE_SCHEMA)  # fmt: skip

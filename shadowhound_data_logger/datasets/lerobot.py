@@ -449,7 +449,9 @@ def _ours(episode: Mapping[str, Any], split: str) -> EpisodeRow:
     row[f'{OURS}split'] = split
     row |= {f'{OURS}clock/{name}': value for name, value in episode.get('clock', {}).items()}
     for stream, each in episode['streams'].items():
-        row |= {f'{OURS}{stream}/{name}': each[name] for name in ('from', 'topic', 'stale_share', 'longest_gap_s')}
+        row |= {
+            f'{OURS}{stream}/{name}': each[name] for name in ('from', 'topic', 'stale_share', 'longest_gap_s', 'offset_changed')
+        }
         row[f'{OURS}{stream}/causes'] = json.dumps(each['causes'])
     return row
 

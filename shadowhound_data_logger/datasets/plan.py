@@ -43,7 +43,7 @@ from shadowhound_data_logger.lake.gaps import OBJECTS, Known, downsampled_times,
 from shadowhound_data_logger.lake.labels import Label
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.lake.tables import among, narrow
-from shadowhound_data_logger.lake.track import NEEDED, Track
+from shadowhound_data_logger.lake.track import NEEDED, RECEIVED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BEFORE_NS: Final = 10 * SECOND
@@ -243,7 +243,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     sensors = [*options.cameras, *(part.sensor for part in parts), *(part.sensor for part in actions if part)]
     used = f'{among("sensor", sorted({*sensors, *RECORDED}))} OR {among("type", sorted(DETECTIONS))}'
     found = query.objects(
-        source, findings=findings, columns=(*NEEDED, 'topic'), where=used, robot=mission.robot,
+        source, findings=findings, columns=(*NEEDED, *RECEIVED, 'topic'), where=used, robot=mission.robot,
         since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000),
     ).to_pylist()  # fmt: skip
     seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
@@ -292,7 +292,7 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
         wanted = [topics[sensor] for sensor in sensors]
         mine = f'{among("topic", wanted)} AND {among("robot", sorted({mission.robot, options.arm}))}'
         found = query.objects(
-            source, findings=findings, columns=(*NEEDED, 'topic'), where=mine, since=utc(begin - LONGEST_BATCH_NS),
+            source, findings=findings, columns=(*NEEDED, *RECEIVED, 'topic'), where=mine, since=utc(begin - LONGEST_BATCH_NS),
             until=utc(end + 1000),
         ).to_pylist()  # fmt: skip
         rows_of = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
@@ -336,7 +336,7 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
 def _track_of(rows: Sequence[Row], begin_ns: int, end_ns: int) -> Track:
     """Of one machine, the one that has most in this time: an arm may be recorded by its own and by the robot."""
     best = _most_frequent([row['robot'] for row in _within(rows, begin_ns, end_ns)] or [row['robot'] for row in rows])
-    return Track.of(pa.Table.from_pylist([row for row in rows if row['robot'] == best], schema=narrow(NEEDED)))
+    return Track.of(pa.Table.from_pylist([row for row in rows if row['robot'] == best], schema=narrow((*NEEDED, *RECEIVED))))
 
 
 def _within(rows: Sequence[Row], begin_ns: int, end_ns: int) -> list[Row]:
@@ -379,7 +379,7 @@ def _tracks(rows: Sequence[Row], mission: ChosenMission) -> tuple[dict[str, Trac
         counted = _within(ours, mission.begin_ns, mission.end_ns) or ours
         best = _most_frequent([_topic_and_type(row) for row in counted])
         mine = [row for row in ours if _topic_and_type(row) == best]
-        tracks[sensor] = Track.of(pa.Table.from_pylist(mine, schema=narrow(NEEDED)))
+        tracks[sensor] = Track.of(pa.Table.from_pylist(mine, schema=narrow((*NEEDED, *RECEIVED))))
         topics[sensor] = best[0]
     return tracks, topics
 

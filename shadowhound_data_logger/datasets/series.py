@@ -148,10 +148,12 @@ class Series:
     file: NDArray[np.int64]
     """Of each message, its place in ``files``."""
     files: Sequence[SourceFile]
+    received: NDArray[np.int64]
+    """When each arrived, by the clock of the machine that recorded it; 0 where that is unknown."""
     names: tuple[str, ...] = ()
     """Of joints, by the first message."""
     previous: NDArray[np.int64] | None = None
-    """Of values that are derived from two messages, (messages, 2): stamp of the earlier one, and its place in ``files``."""
+    """Of values that are derived from two messages, (messages, 3): stamp and arrival of the earlier one, its file."""
     picture: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
     """Content and extension (``jpg``, ``png``) of a message of a camera."""
     own_stamps: NDArray[np.int64] | None = None
@@ -159,6 +161,12 @@ class Series:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def only(self, chosen: NDArray[Any]) -> Series:
+        """These messages of numbers."""
+        own = None if self.own_stamps is None else self.own_stamps[chosen]
+        return replace(self, stamps=self.stamps[chosen], values=self.values[chosen], file=self.file[chosen],
+                       received=self.received[chosen], own_stamps=own)  # fmt: skip
 
     @property
     def period_ns(self) -> int:
@@ -249,6 +257,7 @@ class Recordings:
 
     def _numbers(self, recording: RecordedSensor, track: Track, fields: Sequence[str]) -> Series:
         tables: list[decode.Table] = []
+        arrived: list[NDArray[np.int64]] = []
         counts: list[int] = []
         names: tuple[str, ...] = ()
         with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
@@ -259,6 +268,8 @@ class Recordings:
                 if found and not names and isinstance(found[0].get('name'), list):
                     names = tuple(map(str, found[0]['name']))
                 tables.append(decode.table(found, track.kind, tuple(fields), int(track.offset_ns[number])))
+                stamped = np.array([each['stamp_ns'] for each in found], np.int64) + int(track.offset_ns[number])
+                arrived.append(_arrivals(track, number, stamped)[np.argsort(stamped, kind='stable')])
                 counts.append(len(found))
         width = tables[0].values.shape[1] if tables else 0
         if any(each.values.shape[1] != width for each in tables):
@@ -266,23 +277,26 @@ class Recordings:
         stamps = np.concatenate([np.empty(0, np.int64), *(each.stamps for each in tables)])
         values = np.concatenate([np.empty((0, width)), *(each.values for each in tables)])
         file = np.repeat(np.arange(len(tables)), counts)
-        return self._ordered(recording, stamps, values, file, [_file(each) for each in objects], names)
+        received = np.concatenate([np.empty(0, np.int64), *arrived])
+        return self._ordered(recording, stamps, values, file, [_file(each) for each in objects], received, names)
 
     def _pictures(self, recording: RecordedSensor, track: Track) -> Series:
         """The content of an object is read for its stamps only where it is an archive."""
         prefetch = self._stack.enter_context(Prefetch(self._place.read, KEEP_BYTES, THREADS))
         stamps: list[int] = []
+        arrived: list[int] = []
         where: list[tuple[int, int]] = []
         objects = [track.object(number) for number in range(len(track))]
         members = lru_cache(maxsize=2)(partial(_unpacked, prefetch))
         for number, wanted in enumerate(objects):
             if decode.extension_of(wanted.key) in decode.ARCHIVES:
-                for member, each in enumerate(members(wanted)):
-                    stamps.append(each.stamp_ns + int(track.offset_ns[number]))
-                    where.append((number, member))
+                times = np.array([each.stamp_ns for each in members(wanted)], np.int64) + int(track.offset_ns[number])
+                where += [(number, member) for member in range(len(times))]
             else:
-                stamps.append(int(track.start_ns[number]))
+                times = track.start_ns[number : number + 1]
                 where.append((number, -1))
+            stamps += times.tolist()
+            arrived += _arrivals(track, number, times).tolist()
         order = np.argsort(np.array(stamps, np.int64), kind='stable')
 
         def picture(message: int) -> tuple[bytes, str]:
@@ -296,15 +310,16 @@ class Recordings:
 
         file = np.array([number for number, _ in where], np.int64)
         made = self._ordered(
-            recording, np.array(stamps, np.int64), np.empty((len(stamps), 0)), file, [_file(each) for each in objects]
-        )
+            recording, np.array(stamps, np.int64), np.empty((len(stamps), 0)), file, [_file(each) for each in objects],
+            np.array(arrived, np.int64),
+        )  # fmt: skip
         return _with_pictures(made, picture, order, np.array(stamps, np.int64), self._span)
 
     def _ordered(self, recording: RecordedSensor, stamps: NDArray[np.int64], values: NDArray[np.float64], file: NDArray[np.int64],
-                 files: Sequence[SourceFile], names: tuple[str, ...] = ()) -> Series:  # fmt: skip
+                 files: Sequence[SourceFile], received: NDArray[np.int64], names: tuple[str, ...] = ()) -> Series:  # fmt: skip
         order = np.argsort(stamps, kind='stable')
         inside = order[(stamps[order] >= self._span[0]) & (stamps[order] <= self._span[1])]
-        return Series(recording, stamps[inside], values[inside], file[inside], files, names)
+        return Series(recording, stamps[inside], values[inside], file[inside], files, received[inside], names)
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
@@ -356,6 +371,7 @@ class Recordings:
         rows: list[NDArray[np.float64]] = []
         where: list[tuple[int, int, str]] = []
         file: list[int] = []
+        arrived: list[int] = []
         files: list[SourceFile] = []
         names: tuple[str, ...] = ()
         bodies = self._stack.enter_context(tempfile.TemporaryFile(dir=self._work)) if is_picture else None  # noqa: SIM115
@@ -378,10 +394,11 @@ class Recordings:
                 except Rejected:
                     continue
                 stamps.append(stamp)
+                arrived.append(message.log_ns + step)
                 file.append(len(files) - 1)
         values = np.array(rows, np.float64).reshape(len(stamps), -1) if rows else np.empty((len(stamps), 0))
         stamped = np.array(stamps, np.int64)
-        made = self._ordered(recording, stamped, values, np.array(file, np.int64), files, names)
+        made = self._ordered(recording, stamped, values, np.array(file, np.int64), files, np.array(arrived, np.int64), names)
         if bodies is None:
             return made
         order = np.argsort(stamped, kind='stable')
@@ -461,6 +478,14 @@ def _is_of_mission(bag: Manifest, mission_id: str | None, run_id: str | None) ->
 
 def _file(wanted: Object) -> SourceFile:
     return SourceFile(wanted.bucket, wanted.key, wanted.sha256)
+
+
+def _arrivals(track: Track, number: int, times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """When the messages of an object arrived, in their stored order; zeros if that is unknown."""
+    first, last = (0, 0) if track.received_ns is None else map(int, track.received_ns[number])
+    if not first:
+        return np.zeros(len(times), np.int64)
+    return decode.arrivals(times + (first - int(track.start_ns[number])), first, last)
 
 
 def _unpacked(prefetch: Prefetch, wanted: Object) -> list[decode.ArchiveMember]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 NEEDED: Final = ('robot', 'sensor', 'type', 'bucket', 'key', 'bytes', 'sha256', 't_start', 't_start_ns', 't_end_ns', 'count',
                  'x', 'y', 'yaw', 'battery_pct', 'clock_offset_ns')  # fmt: skip
 """Columns of the catalogue."""
+RECEIVED: Final = ('received_start_ns', 'received_end_ns')
+"""Two more, for those who need the arrival of single messages (``Track.received_ns``)."""
 _WORDS: Final = ('robot', 'sensor', 'type', 'bucket')
 """Those of which many rows have the same text."""
 _DIGEST: Final = pa.binary(32)
@@ -59,10 +61,14 @@ class Track:
     battery_pct: NDArray[np.float64]
     latest_ns: NDArray[np.int64] = field(repr=False)
     """The latest end of this object and those before it."""
+    received_ns: NDArray[np.int64] | None = None
+    """(n, 2): when the first and the last message of each object arrived, 0 where that is unknown; None without ``RECEIVED``."""
 
     @classmethod
     def of(cls, rows: pa.Table) -> Track:
-        """Of rows of one robot and sensor, at least one, each once even where it is in two parts; the columns are ``NEEDED``."""
+        """Of rows of one robot and sensor, at least one, each once even where it is in two parts; the columns are ``NEEDED``,
+        and ``RECEIVED`` where arrivals are needed.
+        """
         if rows.schema.field('sha256').type != _DIGEST:
             rows = packed(rows)
         order = _order(rows)
@@ -89,6 +95,7 @@ class Track:
             offset_ns=_narrow(numbers('clock_offset_ns')),
             pose=np.column_stack([real(name) for name in ('x', 'y', 'yaw')]), battery_pct=real('battery_pct'),
             latest_ns=_shared(np.maximum.accumulate(end), end),
+            received_ns=np.column_stack([numbers(name) for name in RECEIVED]) if {*RECEIVED} <= {*rows.column_names} else None,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -96,7 +103,11 @@ class Track:
 
     def only(self, numbers: NDArray[np.intp]) -> Track:
         """These objects of it, in their order."""
-        columns = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in {'robot', 'sensor', 'kind'}}
+        columns = {
+            each.name: getattr(self, each.name)
+            for each in fields(self)
+            if each.name not in {'robot', 'sensor', 'kind'} and getattr(self, each.name) is not None
+        }
         kept = {name: column.take(pa.array(numbers)) if isinstance(column, pa.Array) else column[numbers]
                 for name, column in columns.items()}  # fmt: skip
         kept['end_ns'] = _shared(kept['end_ns'], kept['start_ns'])

@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from lake.training import COMPRESSED, IMU, JOINTS, ODOMETRY, Drive
 
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.config import UploadSettings
+from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.formats.rows.gaps import GAP, Statement, complete, statement
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -74,6 +75,8 @@ class Mission:
     sensors: Sequence[str] = ('camera', 'odom', 'imu', 'joints')
     uncounted: Sequence[str] = ()
     """Sensors of which the robot cannot tell what is missing: it never speaks of them."""
+    late_ns: Callable[[str, int], int] | None = None
+    """Sensor and stamp -> how much later the message arrived; None for all at once."""
     skipped: int = 0
     """Messages of each sensor that its settings left out, by the watermark."""
 
@@ -111,13 +114,15 @@ class House:
         for sensor in mission.sensors:
             stamps = mission.stamps(sensor)
             if sensor == 'camera' and not archives:
-                made += [self.drive.one(COMPRESSED, [stamp], [self._cdr(sensor, stamp)], rate_hz=1000.0) for stamp in stamps]
+                singles = [self.drive.one(COMPRESSED, [stamp], [self._cdr(sensor, stamp)], rate_hz=1000.0) for stamp in stamps]
+                made += [_arrived(mission, sensor, [stamp], one) for stamp, one in zip(stamps, singles, strict=True)]
                 continue
             for second in sorted({stamp // SECOND for stamp in stamps}):
                 some = [stamp for stamp in stamps if stamp // SECOND == second]
                 how: dict[str, Any] = {'format': 'tar'} if sensor == 'camera' else {}
                 cdrs = [self._cdr(sensor, stamp) for stamp in some]
-                made.append(self.drive.one(self._type(sensor), some, cdrs, batch_s=1.0, rate_hz=0.0, sensor=sensor, **how))
+                one = self.drive.one(self._type(sensor), some, cdrs, batch_s=1.0, rate_hz=0.0, sensor=sensor, **how)
+                made.append(_arrived(mission, sensor, some, one))
         marks = {'mission_id': mission.name, 'run_id': f'run{mission.name}', 'mission_type': 'patrol'}
         self.drive.store(made, **marks)
         told = {
@@ -145,6 +150,15 @@ class House:
 
     def _cdr(self, sensor: str, stamp: int) -> bytes:
         return cdr_of(self.drive._ros, sensor, stamp)
+
+
+def _arrived(mission: Mission, sensor: str, stamps: Sequence[int], made: DataObject) -> DataObject:
+    """With the pair of arrivals."""
+    if mission.late_ns is None:
+        return made
+    received = [stamp + mission.late_ns(sensor, stamp) for stamp in stamps]
+    pair = {'received_start_ns': str(min(received)), 'received_end_ns': str(max(received))}
+    return replace(made, metadata={**made.metadata, **pair})
 
 
 def cdr_of(ros: Any, sensor: str, stamp: int) -> bytes:

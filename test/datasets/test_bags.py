@@ -68,6 +68,7 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     assert matrix(table['observation.state'])[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
     sources = pq.read_table(tmp_path / 'set/meta/shadowhound_sources.parquet')
     assert set(sources['key'].to_pylist()) == {key}
+    assert set((sources['received_ns'].to_numpy() - sources['stamp_ns'].to_numpy()).tolist()) == {2_000_000}
     proved = verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None)
     assert (proved.wrong, proved.frames) == ([], len(table))
 

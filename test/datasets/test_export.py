@@ -249,6 +249,44 @@ def test_numbers_between_two_messages(house: House, tmp_path: Path) -> None:
     assert yaw == pytest.approx(np.sin(state[:, 0].astype(float)), abs=1e-3)
 
 
+LATE_NS, LATER_NS = 146 * SECOND, 149 * SECOND
+
+
+def late(mission: Mission, sensor: str, stamp: int) -> int:
+    """How much later than its stamp a message arrives: odometry is three seconds later in the second half of a mission."""
+    return LATER_NS if sensor == 'odom' and stamp >= mission.begin_ns + 3 * SECOND else LATE_NS
+
+
+def test_every_source_has_both_times_and_a_changed_offset_is_flagged(tmp_path: Path) -> None:
+    """Of the pictures, of poses and of both poses of a velocity; a mission that is late all the time is not flagged."""
+    house = House(tmp_path)
+    changed, steady = Mission('changed', seconds=6), Mission('steady', begin_s=60, seconds=6)
+    changed.late_ns = lambda sensor, stamp: late(changed, sensor, stamp)
+    steady.late_ns = lambda _sensor, _stamp: LATE_NS
+    for mission in (changed, steady):
+        house.record(mission)
+    options = ExportOptions(state=('pose', 'velocity', 'joints'))
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, options)
+    assert (found.refused, found.waiting) == ({}, {})
+    rows = pq.read_table(tmp_path / 'set' / SOURCE_TABLE).to_pylist()
+    assert {row['stream'] for row in rows} == {'images.front', 'state.pose', 'state.velocity', 'state.joints', 'action'}
+    for row in rows:
+        sensor = {'images.front': 'camera', 'state.joints': 'joints'}.get(row['stream'], 'odom')
+        mission = changed if row['episode_mission'] == 'changed' else steady
+        assert mission.late_ns is not None
+        assert row['received_ns'] - row['stamp_ns'] == mission.late_ns(sensor, row['stamp_ns'])
+    told = {each['mission_id']: each['streams'] for each in found.added}
+    flagged = {(name, stream) for name, streams in told.items() for stream, each in streams.items() if each['offset_changed']}
+    assert flagged == {('changed', 'state.pose'), ('changed', 'state.velocity'), ('changed', 'action')}
+    assert [told['changed']['state.pose'][name] for name in ('offset_min_s', 'offset_max_s')] == [146.0, 149.0]
+    made = Lerobot(tmp_path / 'set')
+    columns = {row[f'{OURS}mission_id']: row[f'{OURS}state.pose/offset_changed'] for row in made.rows}
+    assert columns == {'changed': True, 'steady': False}
+    lines = [line.plain for line in verb._report(found, 'set', is_dry=False)]
+    assert '    state.pose: the offset between stamps and arrivals changed, from 146.0 to 149.0 s' in lines
+    assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
+
+
 def test_a_share_of_the_missions_is_for_validation() -> None:
     """Chosen by the mission's id alone: about the share, and the same whoever else is there."""
     names = [f'mission_{number}' for number in range(400)]

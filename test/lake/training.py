@@ -93,9 +93,9 @@ class Drive:
                 middle = seconds_of((one.t_start_ns + one.t_end_ns) // 2)
                 metadata = {**one.metadata, 'pose': f'{middle:.6f} {-middle:.6f} 0.5 odom', 'battery_pct': '77.5', **more}
                 late_ns = self.late_ns.get(one.sensor, 0)
-                metadata |= {
-                    'received_start_ns': str(one.t_start_ns + late_ns), 'received_end_ns': str(one.t_end_ns + late_ns),
-                }  # fmt: skip
+                received = {name: str(at_ns + late_ns) for name, at_ns in
+                            (('received_start_ns', one.t_start_ns), ('received_end_ns', one.t_end_ns))}  # fmt: skip
+                metadata = {**received, **metadata}
                 add(store, self._folder, one.key, body, metadata, content_type=one.content_type)
                 told = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
                 rows.append(schema.row_of(one.bucket, one.key, len(body), one.content_type, told))
