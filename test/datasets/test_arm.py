@@ -146,7 +146,6 @@ def test_the_arm_is_a_source_like_ours(house: House, exported: Exported) -> None
     assert {each['key'].split('/')[0] for each in of_arm} == {'soarm'}
     own = {CLOCK.of(stamp) for number in range(EPISODES) for stamp in arm_stamps(Mission('', begin_s=2000.0 * number, seconds=2))}
     assert {each['stamp_ns'] for each in of_arm} <= own
-    assert {each['received_ns'] for each in of_arm} == {None}, 'nobody recorded when these arrived'
     assert all(len(each['sha256']) == 64 for each in of_arm)
     found = verify(exported.folder, DirectoryStore(house.settings.directory), is_read=True)
     assert found.wrong == []

@@ -287,6 +287,16 @@ def test_every_source_has_both_times_and_a_changed_offset_is_flagged(tmp_path: P
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
 
 
+def test_arrivals_that_are_unknown_are_null(tmp_path: Path) -> None:
+    """Not 0; and no stream is flagged."""
+    house = House(tmp_path)
+    house.drive.has_arrivals = False
+    house.record(Mission('old', seconds=2))
+    (episode,) = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions()).added
+    assert set(pq.read_table(tmp_path / 'set' / SOURCE_TABLE)['received_ns'].to_pylist()) == {None}
+    assert {(each['offset_min_s'], each['offset_changed']) for each in episode['streams'].values()} == {(None, False)}
+
+
 def test_a_share_of_the_missions_is_for_validation() -> None:
     """Chosen by the mission's id alone: about the share, and the same whoever else is there."""
     names = [f'mission_{number}' for number in range(400)]

@@ -74,6 +74,7 @@ class Drive:
         self.rows: list[schema.Row] = []
         self.late_ns: dict[str, int] = {}
         """Sensor -> how much later than their stamps its messages arrive."""
+        self.has_arrivals = True
 
     def record(self, seconds: int, *, frames: str = 'jpeg', without: Sequence[str] = (), first: int = 0) -> None:
         """``frames``: jpeg, one a second; tar or zip, ``FRAMES_HZ`` of them in an archive a second."""
@@ -95,7 +96,7 @@ class Drive:
                 late_ns = self.late_ns.get(one.sensor, 0)
                 received = {name: str(at_ns + late_ns) for name, at_ns in
                             (('received_start_ns', one.t_start_ns), ('received_end_ns', one.t_end_ns))}  # fmt: skip
-                metadata = {**received, **metadata}
+                metadata = {**(received if self.has_arrivals else {}), **metadata}
                 add(store, self._folder, one.key, body, metadata, content_type=one.content_type)
                 told = {**metadata, 'sha256': hashlib.sha256(body).hexdigest()}
                 rows.append(schema.row_of(one.bucket, one.key, len(body), one.content_type, told))
