@@ -6,7 +6,7 @@ import csv
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -27,10 +27,20 @@ from shadowhound_data_logger.cli.output import (
 )
 from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.dataclass_json import as_plain
 from shadowhound_data_logger.core.untrusted import csv_cell
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder
-from shadowhound_data_logger.missions.overview import ACTIVE, export, find, is_sending, overview, overviews
+from shadowhound_data_logger.missions.overview import (
+    ACTIVE,
+    MissionBrief,
+    MissionOverview,
+    export,
+    find,
+    is_sending,
+    overview,
+    overviews,
+)
 
 POLL_S: Final = 0.5
 STYLES: Final = {'FINISHED': 'green', ACTIVE: 'cyan'}
@@ -70,7 +80,7 @@ def list_(*, as_json: bool) -> ExitCode:
     where = the_home()
     found = overviews(where)
     if as_json:
-        print_json(found)
+        print_json(as_plain(found))
     elif not found:
         click.echo(f'No mission has been logged in {where / MISSIONS} yet. SHADOWHOUND_HOME names the folder above it.')
     else:
@@ -90,7 +100,7 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
     if found is None:
         raise BadUsage(f'{folder.path} does not contain a mission', 'shadowhound-data missions list shows the missions')
     if as_json:
-        print_json(found)
+        print_json(as_plain(found))
     else:
         print_page(*_page(found))
     return exit_code(finding=_late([found]))
@@ -120,7 +130,7 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
     finally:
         replayer.release()
     if as_json:
-        print_json({'left': left})
+        print_json({'left': as_plain(left)})
         return exit_code(finding=left)
     for each in left:
         print_page(*_reason(each), console=Console(highlight=False, stderr=True))
@@ -158,31 +168,31 @@ def _rows(found: Mapping[str, Any]) -> Iterator[tuple[object, ...]]:
         yield event['time'], 'event', event['name'], json.dumps(event['data']), '', 'agent'
 
 
-def _late(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _late(found: Sequence[MissionBrief]) -> list[MissionBrief]:
     """The ended missions that are not sent."""
-    return [each for each in found if each['result'] != ACTIVE and not each['complete']]
+    return [each for each in found if each.result != ACTIVE and not each.complete]
 
 
-def _wait(where: Path, end_s: float) -> list[dict[str, Any]]:
+def _wait(where: Path, end_s: float) -> list[MissionBrief]:
     """Returns what is left."""
     with progress(of='seconds') as bar:
         while (left := _late(overviews(where))) and time.monotonic() < end_s:
-            records = sum(each['unsent']['records'] for each in left)
+            records = sum(each.unsent['records'] for each in left)
             bar.say(f'{number(len(left))} missions, {number(records)} records to send')
             time.sleep(POLL_S)
     return left
 
 
-def _table(found: list[dict[str, Any]]) -> RenderableType:
+def _table(found: Sequence[MissionBrief]) -> RenderableType:
     left = ('mission', 'type', 'started', 'result', 'run')
     table = plain_table('Missions', ('mission', 'type', 'started', 'duration', 'result', 'unsent', 'run'), left)
     for each in found:
-        table.add_row(plain(each['mission_id']), plain(each['type']), shown_iso(each['started']), duration(each['duration_s']),
-                      _result(each), _unsent(each), plain(each['run_id'] or '-'))  # fmt: skip
+        table.add_row(plain(each.mission_id), plain(each.type), shown_iso(each.started), duration(each.duration_s),
+                      _result(each), _unsent(each), plain(each.run_id or '-'))  # fmt: skip
     return table
 
 
-def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[RenderableType]:
+def _verdict(found: Sequence[MissionBrief], *, is_sending: bool) -> Iterator[RenderableType]:
     late = _late(found)
     if late:
         how = 'being sent' if is_sending else 'shadowhound-data missions resume sends it'
@@ -191,44 +201,44 @@ def _verdict(found: list[dict[str, Any]], *, is_sending: bool) -> Iterator[Rende
         yield from _reason(late[-1])
 
 
-def _page(found: Mapping[str, Any]) -> Iterator[RenderableType]:
-    yield Text.assemble(plain(found['mission_id'], 'bold'), '  ', _result(found))
+def _page(found: MissionOverview) -> Iterator[RenderableType]:
+    yield Text.assemble(plain(found.mission_id, 'bold'), '  ', _result(found))
     lines = {
-        'type': found['type'], 'command': found['command'], 'robot': found['robot'], 'policy': found['policies'] or '-',
-        'started': shown_iso(found['started']),
-        'ended': shown_iso(found['ended']) if found['ended'] else '-', 'duration': duration(found['duration_s']),
-        'distance': '-' if found['distance_m'] is None else f'{found["distance_m"]:.2f} m',
-        'battery used': '-' if found['battery_consumed_pct'] is None else f'{found["battery_consumed_pct"]:.1f} %',
-        'MLflow run': found['run_id'] or '-', 'folder': found['folder'],
+        'type': found.type, 'command': found.command, 'robot': found.robot, 'policy': found.policies or '-',
+        'started': shown_iso(found.started),
+        'ended': shown_iso(found.ended) if found.ended else '-', 'duration': duration(found.duration_s),
+        'distance': '-' if found.distance_m is None else f'{found.distance_m:.2f} m',
+        'battery used': '-' if found.battery_consumed_pct is None else f'{found.battery_consumed_pct:.1f} %',
+        'MLflow run': found.run_id or '-', 'folder': found.folder,
     }  # fmt: skip
     yield value_table('', lines)
     yield ''
-    yield value_table('Logged', {name.replace('_', ' '): number(count) for name, count in found['counts'].items()})
-    if found['last']:
+    yield value_table('Logged', {name.replace('_', ' '): number(count) for name, count in found.counts.items()})
+    if found.last:
         yield ''
-        yield value_table('Last values', {name: f'{value:g}' for name, value in found['last'].items()})
-    yield from (plain(f'Error: {error}', 'red') for error in found['errors'])
-    yield from (plain(f'Not logged: {count} by {reason}', 'yellow') for reason, count in found['refused'].items())
+        yield value_table('Last values', {name: f'{value:g}' for name, value in found.last.items()})
+    yield from (plain(f'Error: {error}', 'red') for error in found.errors)
+    yield from (plain(f'Not logged: {count} by {reason}', 'yellow') for reason, count in found.refused.items())
     yield ''
     yield from _reason(found)
 
 
-def _reason(found: Mapping[str, Any]) -> Iterator[RenderableType]:
+def _reason(found: MissionBrief) -> Iterator[RenderableType]:
     """Whether it is sent; otherwise what is left, and why."""
-    if found['complete']:
+    if found.complete:
         yield Text.assemble(('Sent', 'green'), ': everything is in the run and the spool.')
     else:
-        unsent = ', '.join(f'{number(count)} {name}' for name, count in found['unsent'].items() if count) or 'the end of it'
-        yield plain(f'{found["mission_id"]}: not sent yet: {unsent}', 'yellow')
-    if found['refused_by_server']:
-        yield plain(f'Refused by the tracking server: {number(found["refused_by_server"])}', 'red')
-    if found['last_error']:
-        yield plain(f'Last error: {found["last_error"]}', 'red' if found['complete'] else 'yellow')
+        unsent = ', '.join(f'{number(count)} {name}' for name, count in found.unsent.items() if count) or 'the end of it'
+        yield plain(f'{found.mission_id}: not sent yet: {unsent}', 'yellow')
+    if found.refused_by_server:
+        yield plain(f'Refused by the tracking server: {number(found.refused_by_server)}', 'red')
+    if found.last_error:
+        yield plain(f'Last error: {found.last_error}', 'red' if found.complete else 'yellow')
 
 
-def _result(found: Mapping[str, Any]) -> Text:
-    return plain(found['result'], STYLES.get(found['result'], 'red'))
+def _result(found: MissionBrief) -> Text:
+    return plain(found.result, STYLES.get(found.result, 'red'))
 
 
-def _unsent(found: Mapping[str, Any]) -> str:
-    return '-' if found['complete'] else number(sum(found['unsent'].values()))
+def _unsent(found: MissionBrief) -> str:
+    return '-' if found.complete else number(sum(found.unsent.values()))

@@ -28,22 +28,22 @@ def check(context: Context) -> Iterator[Result]:
             'docs/missions.md',
         )
         return
-    stuck = [each for each in found if not each['complete'] and each['last_error']]
-    refused = [each for each in found if each['refused_by_server']]
+    stuck = [each for each in found if not each.complete and each.last_error]
+    refused = [each for each in found if each.refused_by_server]
     for each in stuck[-1:]:
         yield warning(
             'missions.sent',
-            f'{len(stuck)} of {len(found)} missions are not sent; the last one: {each["last_error"]}',
+            f'{len(stuck)} of {len(found)} missions are not sent; the last one: {each.last_error}',
             'MLflow or the store does not take it',
-            each['remedy'] or 'shadowhound-data doctor --only mlflow',
+            each.remedy or 'shadowhound-data doctor --only mlflow',
         )
     for each in refused[-1:]:
         yield warning(
             'missions.refused',
             f'MLflow refused a part of {len(refused)} missions',
-            f'the last one is {each["mission_id"]}',
-            f'shadowhound-data missions show {each["mission_id"]}',
+            f'the last one is {each.mission_id}',
+            f'shadowhound-data missions show {each.mission_id}',
         )
     if not stuck and not refused:
-        waiting = sum(not each['complete'] for each in found)
+        waiting = sum(not each.complete for each in found)
         yield ok(NAME, f'{len(found)} missions, {waiting} of them still on their way')

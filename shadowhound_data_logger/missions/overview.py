@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import iso
+from shadowhound_data_logger.core.dataclass_json import as_plain, fields_of, parse
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json
@@ -15,11 +16,6 @@ from shadowhound_data_logger.missions.state import MissionState, Point
 
 ACTIVE, UNFINISHED = 'active', 'unfinished'
 """Results of missions without an end: the agent runs; it was killed, and no sender has closed the mission yet."""
-BRIEF: Final = (
-    'mission_id', 'run_id', 'type', 'command', 'robot', 'started', 'ended', 'duration_s', 'result', 'errors', 'distance_m',
-    'battery_consumed_pct', 'complete', 'unsent', 'refused_by_server', 'last_error', 'remedy', 'folder',
-)  # fmt: skip
-"""The fields of a mission in a list."""
 FILES: Final = frozenset({'frame', 'trajectory', 'artifact'})
 """Records with a file."""
 STATE: Final = 'replay.json'
@@ -28,10 +24,49 @@ LOCK: Final = 'replay.lock'
 """Next to the missions: its owner sends them."""
 
 
-def overviews(home: Path) -> list[dict[str, Any]]:
-    """All missions of a home in the order of their starts, ``BRIEF`` of each. Raises OSError."""
-    found = [each for folder in missions(home) if (each := _summarized(folder) or overview(folder)) is not None]
-    return sorted(({name: each[name] for name in BRIEF} for each in found), key=lambda each: str(each['started']))
+@dataclass(frozen=True, slots=True)
+class MissionBrief:
+    """A mission in a list; the field names are those of ``missions list --json``."""
+
+    mission_id: str
+    run_id: str | None
+    type: str
+    command: str
+    robot: str
+    started: str
+    ended: str | None
+    duration_s: float
+    result: str
+    """``FINISHED``, ``FAILED``, ``KILLED``, ``active`` or ``unfinished``."""
+    errors: tuple[Any, ...]
+    distance_m: float | None
+    battery_consumed_pct: float | None
+    complete: bool
+    """Whether it is completely sent."""
+    unsent: Mapping[str, int]
+    """``records`` that are not in the run, ``artifacts`` that are not attached, ``objects`` that are not in the spool."""
+    refused_by_server: int
+    last_error: str
+    remedy: str
+    folder: str
+
+
+@dataclass(frozen=True, slots=True)
+class MissionOverview(MissionBrief):
+    """Everything about a mission, as ``missions show --json`` prints it."""
+
+    policies: str | None
+    last: Mapping[str, float]
+    """The last value of each metric."""
+    counts: Mapping[str, int]
+    refused: Mapping[str, int]
+    """What could not be logged, by reason."""
+
+
+def overviews(home: Path) -> list[MissionBrief]:
+    """All missions of a home in the order of their starts. Raises OSError."""
+    found = [_summarized(folder) or _brief(folder, state_of(folder)) for folder in missions(home)]
+    return sorted((each for each in found if each is not None), key=lambda each: each.started)
 
 
 def find(home: Path, wanted: str) -> list[MissionFolder]:
@@ -41,40 +76,46 @@ def find(home: Path, wanted: str) -> list[MissionFolder]:
     return exact or [folder for folder, ids in names.items() if any(name.startswith(wanted) for name in ids)]
 
 
-def overview(folder: MissionFolder) -> dict[str, Any] | None:
+def overview(folder: MissionFolder) -> MissionOverview | None:
     """Everything about a mission; None for a folder without a first record. Raises OSError."""
     state = state_of(folder)
+    brief = _brief(folder, state)
+    if brief is None:
+        return None
+    return MissionOverview(
+        **fields_of(brief), policies=state.policy_names or None, last=dict(sorted(state.newest.items())), counts=_counts(state),
+        refused=dict(state.refused),
+    )  # fmt: skip
+
+
+def _brief(folder: MissionFolder, state: MissionState) -> MissionBrief | None:
     if not state.start:
         return None
     sent, run, far = folder.sent(), folder.run(), report(folder)
-    return {
-        'mission_id': folder.mission_id, 'run_id': run.run_id if run else None, 'type': state.start['type'],
-        'command': state.start['command'], 'robot': state.start['robot'], 'policies': state.policy_names or None,
-        'started': iso(int(state.start['t'])),
-        'ended': iso(int(state.end['t'])) if state.end else None, 'duration_s': round(state.duration_s, 3),
-        'result': state.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
-        'errors': [*state.errors, *([state.end['error']] if state.end.get('error') else [])],
-        'distance_m': state.distance_m, 'battery_consumed_pct': state.battery_consumed_pct,
-        'last': dict(sorted(state.newest.items())), 'counts': _counts(state), 'refused': dict(state.refused),
-        'complete': sent.complete, 'unsent': _unsent(folder, sent), 'refused_by_server': sent.refused,
-        'last_error': far.last_error, 'remedy': far.remedy, 'folder': str(folder.path),
-    }  # fmt: skip
+    return MissionBrief(
+        mission_id=folder.mission_id, run_id=run.run_id if run else None, type=state.start['type'],
+        command=state.start['command'], robot=state.start['robot'], started=iso(int(state.start['t'])),
+        ended=iso(int(state.end['t'])) if state.end else None, duration_s=round(state.duration_s, 3),
+        result=state.end.get('status') or (ACTIVE if _is_locked(folder) else UNFINISHED),
+        errors=(*state.errors, *([state.end['error']] if state.end.get('error') else [])),
+        distance_m=state.distance_m, battery_consumed_pct=state.battery_consumed_pct,
+        complete=sent.complete, unsent=_unsent(folder, sent), refused_by_server=sent.refused,
+        last_error=far.last_error, remedy=far.remedy, folder=str(folder.path),
+    )  # fmt: skip
 
 
-def _summarized(folder: MissionFolder) -> dict[str, Any] | None:
-    """The same of a mission that is completely sent, from its summary, because its journal may be long. None for any other."""
+def _summarized(folder: MissionFolder) -> MissionBrief | None:
+    """Of a mission that is completely sent, from its summary, because its journal may be long. None for any other."""
     sent, summary = folder.sent(), read_json(folder.summary)
     if not sent.complete:
         return None
     try:
-        return {
-            'type': summary['mission_type'], 'command': summary['mission_command'], 'started': summary['start'],
+        return parse(MissionBrief, {
+            **summary, 'type': summary['mission_type'], 'command': summary['mission_command'], 'started': summary['start'],
             'ended': summary['end'], 'complete': True, 'unsent': _unsent(folder, sent), 'refused_by_server': sent.refused,
             'last_error': sent.error, 'remedy': '', 'folder': str(folder.path),
-            **{name: summary[name] for name in ('mission_id', 'run_id', 'robot', 'duration_s', 'result', 'errors', 'distance_m',
-                                                'battery_consumed_pct')},
-        }  # fmt: skip
-    except KeyError:
+        })  # fmt: skip
+    except (KeyError, ValueError):
         return None
 
 
@@ -105,7 +146,7 @@ def export(folder: MissionFolder) -> dict[str, Any]:
             events.append({'time': iso(int(record['t'])), 'name': record['name'], 'data': record['data']})
     points.sort(key=lambda point: point['time_ms'])
     params = state.params() | (state.final_params() if state.end else {}) if state.start else {}
-    return {'mission': overview(folder), 'params': params, 'points': points, 'events': events,
+    return {'mission': as_plain(overview(folder)), 'params': params, 'points': points, 'events': events,
             'summary': read_json(folder.summary) or None}  # fmt: skip
 
 

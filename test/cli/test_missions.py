@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, write_json
 from shadowhound_data_logger.missions.journal import Journal
-from shadowhound_data_logger.missions.overview import BRIEF, LOCK, overview, overviews
+from shadowhound_data_logger.missions.overview import LOCK, MissionBrief, overview, overviews
 
 
 def run(home: Path, *arguments: str) -> Result:
@@ -95,7 +96,7 @@ def test_a_list_does_not_read_what_is_sent(tmp_path: Path) -> None:
     (before,) = overviews(tmp_path)
     whole = overview(MissionFolder(tmp_path / MISSIONS / mission_id))
     assert whole is not None
-    assert before == {name: whole[name] for name in BRIEF}
+    assert before == MissionBrief(**{field.name: getattr(whole, field.name) for field in fields(MissionBrief)})
     (tmp_path / MISSIONS / mission_id / 'journal').unlink()
     assert overviews(tmp_path) == [before]
 

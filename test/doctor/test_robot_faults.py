@@ -24,6 +24,7 @@ from shadowhound_data_logger.doctor.checks import CHECKS
 from shadowhound_data_logger.doctor.context import make as make_context
 from shadowhound_data_logger.doctor.model import Result, Role
 from shadowhound_data_logger.doctor.run import fix
+from shadowhound_data_logger.missions.overview import MissionBrief
 from shadowhound_data_logger.ros.fast_dds_profile import PROFILE_FILES, SHIPPED
 
 SECRET = 'AWS_SECRET_ACCESS_KEY = kept-from-others\n'
@@ -193,9 +194,15 @@ def patched(target: str, value: object) -> Inject:
     return inject
 
 
-def stuck_mission(_: Path) -> list[dict[str, object]]:
-    error, remedy = 'http://tower:5001 cannot be asked', 'is MLFLOW_TRACKING_URI right?'
-    return [{'complete': False, 'last_error': error, 'remedy': remedy, 'refused_by_server': [], 'mission_id': 'm'}]
+def stuck_mission(_: Path) -> list[MissionBrief]:
+    return [
+        MissionBrief(
+            mission_id='m', run_id=None, type='patrol', command='', robot='thor', started='', ended=None, duration_s=1.0,
+            result='FINISHED', errors=(), distance_m=None, battery_consumed_pct=None, complete=False, unsent={},
+            refused_by_server=0, last_error='http://tower:5001 cannot be asked', remedy='is MLFLOW_TRACKING_URI right?',
+            folder='',
+        )
+    ]  # fmt: skip
 
 
 def beside(**middleware: object) -> dict[str, object]:

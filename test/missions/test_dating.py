@@ -59,7 +59,7 @@ def test_a_mission_takes_as_long_as_it_does(tmp_path: Path, clocks: Clocks, step
         logger.end_mission(True, 1.0, 0.0)
     found = overview(next(missions(tmp_path)))
     assert found is not None
-    assert found['duration_s'] == 10.0
+    assert found.duration_s == 10.0
 
 
 def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpooler, **offsets: int) -> Replay:
@@ -93,7 +93,7 @@ def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
     assert not replay.owes
     found = overview(folder)
     assert found
-    assert (found['started'], found['last_error']) == ('2025-10-18T11:59:50.000000Z', '')
+    assert (found.started, found.last_error) == ('2025-10-18T11:59:50.000000Z', '')
 
 
 def test_the_clock_is_set_in_the_middle(tmp_path: Path, clocks: Clocks) -> None:
