@@ -9,6 +9,7 @@ and must see each of its rows once every time. Kills are in ``torture.lake``.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import multiprocessing
 import resource
 import shutil
@@ -60,7 +61,8 @@ def rows(robot: str, number: int, count: int, of_day: int) -> Iterator[schema.Ro
         yield {
             **dict.fromkeys(schema.COLUMNS), 'robot': robot, 'sensor': sensor, 'topic': f'/{sensor}', 'bucket': schema.BUCKET,
             'type': 'sensor_msgs/msg/Imu', 'key': f'{robot}/{sensor}/{utc(stamp_ns):%Y%m%d/%H%M%S}_{place:06d}.json',
-            'bytes': 1000 + place % 977, 'sha256': f'{place:064x}', 't_start': micros, 't_end': micros, 't_start_ns': stamp_ns,
+            'bytes': 1000 + place % 977, 'sha256': hashlib.sha256(f'{robot} {place}'.encode()).hexdigest(),
+            't_start': micros, 't_end': micros, 't_start_ns': stamp_ns,
             't_end_ns': stamp_ns, 'count': 1, 'x': place % 100 / 10, 'y': place % 70 / 10, 'yaw': 0.0, 'pose_frame': 'odom',
             'battery_pct': 100 - place * 80 / of_day, 'clock': 'synced', 'content_type': 'application/json',
             'format_version': schema.FORMAT_VERSION, 'received_start_ns': stamp_ns, 'received_end_ns': stamp_ns,

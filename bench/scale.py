@@ -18,8 +18,8 @@ HOURS: Final = 8
 DAY_S: Final = HOURS * 3600
 PART_BYTES, ROW_BYTES = 4000, 81
 """Of a part of the catalog, and of each row in it (measured with the rows of bench/lake.py: 23 take 5.9 KB, 360 take 33 KB)."""
-COMPACT_ROW_BYTES: Final = 88
-"""Of a row in a compacted day (measured on 33,326 rows; their sha256 is random text, which hardly shrinks)."""
+TABLE_ROW_BYTES: Final = 85
+"""Of a row in the table ``objects`` (``bench/fleet.py``, 200,000 rows of 10 robots; a sha256 hardly shrinks)."""
 PART_S: Final = 60
 """``catalog.period_s``."""
 LISTED: Final = 1000
@@ -63,13 +63,17 @@ def flow(profile: Profile) -> Iterator[tuple[str, ...]]:
 
 
 def catalog(profile: Profile) -> Iterator[tuple[str, ...]]:
-    """Rows: the catalog of a day, and the requests of a question for the whole fleet's day, before and after compaction."""
+    """Rows: the rows of a day, and the requests of a query over all robots' day: of row files, and of the tables.
+
+    Row files: a LIST per 1,000 of a robot, and a GET per file. Tables whose row files have expired: two LISTs for each robot
+    (are there newer row files of objects, of deletions?) and one GET for its file of that day.
+    """
     for robots in FLEETS:
         parts = robots * DAY_S // PART_S
         rows = robots * profile.objects_s * DAY_S
         yield (
             f'{robots:,}', f'{rows:,.0f}', f'{parts:,}', size(parts * PART_BYTES + rows * ROW_BYTES),
-            f'{robots * lists(DAY_S // PART_S) + parts:,}', size(rows * COMPACT_ROW_BYTES), f'{robots * 2:,}',
+            f'{robots * lists(DAY_S // PART_S) + parts:,}', size(rows * TABLE_ROW_BYTES), f'{robots * 3:,}',
         )  # fmt: skip
 
 
@@ -100,7 +104,15 @@ HEADS: Final = {
         'bytes a year',
         'cores that take it',
     ),
-    'catalog': ('robots', 'rows a day', 'parts a day', 'in parts', 'requests for a day of all', 'compacted', 'requests then'),
+    'catalog': (
+        'robots',
+        'rows a day',
+        'row files a day',
+        'their size',
+        'requests for a day of all',
+        'in tables',
+        'requests then',
+    ),
     'store': (
         'robots',
         'objects in 30 days',
