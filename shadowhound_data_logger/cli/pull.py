@@ -30,6 +30,7 @@ from shadowhound_data_logger.core.mailbox import (
     LONGEST_NS,
     MAX_KEYS,
     KeptFilter,
+    Offer,
     RequestAnswer,
     offer,
 )
@@ -95,14 +96,14 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
             rows = table.to_pylist()
             if not rows:
                 _check_names(source, robot, flags, bag, left_out)
-            offered = {'robot': robot, 'want': want.to_json(), **offer(want, rows, link.pace_mbps(source, robot, left_out))}
+            offered = offer(want, rows, link.pace_mbps(source, robot, left_out))
             if not as_json:
-                click.echo(_found_sentence(offered))
+                click.echo(_found_sentence(robot, offered))
             answer: RequestAnswer | None = None
-            offered['id'] = None
-            if not dry_run and offered['objects']:
+            request_id = None
+            if not dry_run and offered.objects:
                 request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
-                offered['id'] = request.id
+                request_id = request.id
                 if not as_json:
                     click.echo(f'Requested: request {request.id}.')
                 if is_waiting:
@@ -110,21 +111,22 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
                     if answer.state == 'done':
                         lake.await_rows(source, robot, want, rows, left_out)
     if as_json:
-        print_json({**offered, 'answer': as_plain(answer)})
+        shown = {'robot': robot, 'want': want.to_json(), **offered.to_json(), 'id': request_id}
+        print_json({**shown, 'answer': as_plain(answer)})
     code = report_skipped(left_out)
     return exit_code(finding=code is not ExitCode.FINE or (answer is not None and _is_finding(answer)))
 
 
-def _found_sentence(offered: Mapping[str, Any]) -> str:
+def _found_sentence(robot: str, offered: Offer) -> str:
     """What the robot keeps and what it has lost."""
-    text = f'{offered["robot"]} keeps {number(offered["objects"])} such objects, {volume(offered["bytes"])}'
-    if offered['lost']:
-        reasons = ', '.join(f'{reason} {count:,}' for reason, count in offered['lost'].items())
-        text += f'; {sum(offered["lost"].values()):,} are lost ({visible(reasons)})'
-    if offered['objects'] and offered['seconds'] is None:
+    text = f'{robot} keeps {number(offered.objects)} such objects, {volume(offered.bytes)}'
+    if offered.lost:
+        reasons = ', '.join(f'{reason} {count:,}' for reason, count in offered.lost.items())
+        text += f'; {sum(offered.lost.values()):,} are lost ({visible(reasons)})'
+    if offered.objects and offered.seconds is None:
         text += '. How long that takes is unknown: it has not reported the pace of its uploads yet'
-    elif offered['objects']:
-        text += f'. At its pace, {offered["mbps"]:.1f} Mbit/s, that takes {duration(offered["seconds"])}'
+    elif offered.objects and offered.mbps and offered.seconds is not None:
+        text += f'. At its pace, {offered.mbps:.1f} Mbit/s, that takes {duration(offered.seconds)}'
     return f'{text}.'
 
 

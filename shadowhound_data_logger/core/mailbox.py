@@ -218,12 +218,30 @@ def size_of(want: KeptFilter, row: Mapping[str, Any]) -> int:
     return want.bytes_of(row['key'], row['sensor'] or '', row['bytes'] or 0, begin_ns, row['t_end_ns'] or begin_ns, {})
 
 
-def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | None) -> dict[str, Any]:
-    """What a request for these rows of ``catalog.schema.KEPT`` comes to: all of them are wanted.
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """What a request would get."""
 
-    ``objects`` that the robot keeps and about how many ``bytes`` of them it would send, in how
-    many ``seconds`` at its pace, None where that is not known; and what it has ``lost``, by reason.
-    """
+    objects: int
+    """That the robot keeps."""
+    bytes: int
+    """That it would send, approximately."""
+    lost: Mapping[str, int]
+    """Objects that it has lost, by reason."""
+    mbps: float | None
+    """Its pace; None if unknown."""
+
+    @property
+    def seconds(self) -> float | None:
+        """How long these bytes take at this pace."""
+        return 8e-6 * self.bytes / self.mbps if self.mbps else None
+
+    def to_json(self) -> dict[str, Any]:
+        return {'objects': self.objects, 'bytes': self.bytes, 'lost': dict(self.lost), 'mbps': self.mbps, 'seconds': self.seconds}
+
+
+def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | None) -> Offer:
+    """What a request for these rows of ``formats.rows.schema.KEPT`` would get; the filter selects all of them."""
     objects, size, lost = 0, 0, Counter[str]()
     for row in rows:
         if row['where'] == ON_ROBOT:
@@ -231,7 +249,7 @@ def offer(want: KeptFilter, rows: Iterable[Mapping[str, Any]], mbps: float | Non
             objects += 1
         elif row['where'] == LOST:
             lost[row['reason'] or 'unknown'] += 1
-    return {'objects': objects, 'bytes': size, 'lost': dict(lost), 'mbps': mbps, 'seconds': 8e-6 * size / mbps if mbps else None}
+    return Offer(objects, size, lost, mbps)
 
 
 def inbox_key(robot: str) -> str:

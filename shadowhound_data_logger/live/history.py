@@ -124,7 +124,7 @@ class PastReader:
             return {'id': self._labels.add(robot, asked)}, b''
         if do == 'kept':
             begin_ns, end_ns = _times(asked)
-            return {'kept': offers(self._kept, robot, begin_ns, end_ns)}, b''
+            return {'kept': {sensor: each.to_json() for sensor, each in offers(self._kept, robot, begin_ns, end_ns).items()}}, b''
         if do == 'requests':
             return self.requests(robot), b''
         if do == 'pull':
@@ -140,9 +140,10 @@ class PastReader:
         """
         found = []
         for one in self._kept.requests(robot)[::-1]:
-            want = one.pop('want')
+            want = one.want
             times = {name: want[word] / 1e6 for name, word in (('from', 'since_ns'), ('to', 'until_ns')) if word in want}
-            found.append({**one, 'by': _text(one['by']), 'state': _text(one['state']), 'why': _text(one['why']),
+            found.append({'id': one.id, 'by': _text(one.by), 'state': _text(one.state), 'why': _text(one.why),
+                          'objects': one.objects, 'bytes': one.bytes, 'sent': one.sent, 'sent_bytes': one.sent_bytes,
                           'sensor': _text(want.get('sensor', '')), **times})  # fmt: skip
         return {'requests': found, 'mbps': self._kept.mbps(robot)}
 
@@ -150,13 +151,14 @@ class PastReader:
         """Ask for a sensor's objects of a time, or take a request back. Raises as ``KeptSource.ask``, LakeError."""
         by = re.sub(r'[^A-Za-z0-9_.-]', '_', str(asked['by']))
         if 'cancel' in asked:
-            if all(one['id'] != asked['cancel'] for one in self._kept.requests(robot)):
+            if all(one.id != asked['cancel'] for one in self._kept.requests(robot)):
                 raise PullRefused('there is no such request any more')
             self._kept.cancel(robot, asked['cancel'], by)
             return {'id': asked['cancel']}
         begin_ns, end_ns = _times(asked)
         sensor = str(asked['sensor'])
-        if not offers(self._kept, robot, begin_ns, end_ns).get(sensor, {}).get('objects'):
+        offered = offers(self._kept, robot, begin_ns, end_ns).get(sensor)
+        if offered is None or not offered.objects:
             raise PullRefused(f'{robot} keeps nothing of {visible(sensor)[:MOST_TEXT]} in this time')
         return {'id': self._kept.ask(robot, KeptFilter(sensor=sensor, since_ns=begin_ns, until_ns=end_ns), by)}
 

@@ -12,14 +12,14 @@ import sqlite3
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import LakeError, SpoolError
-from shadowhound_data_logger.core.mailbox import KeptFilter, RequestAnswer, offer
+from shadowhound_data_logger.core.mailbox import KeptFilter, Offer, RequestAnswer, offer
 from shadowhound_data_logger.core.model import ON_ROBOT, State
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.formats.rows.schema import BUCKET
@@ -38,6 +38,23 @@ LONGEST_SLICE_NS: Final = 3600 * SECOND
 """A slice that began before a time may have messages of it."""
 
 
+@dataclass(frozen=True, slots=True)
+class KeptRequest:
+    """A request, as the page shows it."""
+
+    id: str
+    by: str
+    state: str
+    why: str
+    want: Mapping[str, Any]
+    """The ``KeptFilter``."""
+    objects: int
+    bytes: int
+    sent: int
+    """Objects that the store has."""
+    sent_bytes: int
+
+
 class KeptSource(Protocol):
     """What the page knows of what robots keep, and whom it asks for it."""
 
@@ -50,8 +67,8 @@ class KeptSource(Protocol):
     def mbps(self, robot: str) -> float | None:
         """The pace at which the robot uploads; None where it is not known."""
 
-    def requests(self, robot: str) -> list[dict[str, Any]]:
-        """The newest ones, the oldest of them first, each with ``id by state why want objects bytes sent sent_bytes``."""
+    def requests(self, robot: str) -> list[KeptRequest]:
+        """The newest ones, the oldest of them first."""
 
     def ask(self, robot: str, want: KeptFilter, by: str) -> str:
         """The id of the request."""
@@ -59,8 +76,8 @@ class KeptSource(Protocol):
     def cancel(self, robot: str, request: str, by: str) -> None: ...
 
 
-def offers(source: KeptSource, robot: str, begin_ns: int, end_ns: int) -> dict[str, Any]:
-    """Sensor -> what a request for this time comes to, as ``mailbox.offer`` says it."""
+def offers(source: KeptSource, robot: str, begin_ns: int, end_ns: int) -> dict[str, Offer]:
+    """Sensor -> what a request for this time would get."""
     want, mbps = KeptFilter(since_ns=begin_ns, until_ns=end_ns), source.mbps(robot)
     of: dict[str, list[Mapping[str, Any]]] = {}
     for row in source.rows(robot, begin_ns, end_ns):
@@ -90,7 +107,7 @@ class SpoolKept:
     def mbps(self, robot: str) -> float | None:
         return read_status(self._spool, robot, SystemClock.of_this_machine()).node.requests.mbps
 
-    def requests(self, robot: str) -> list[dict[str, Any]]:
+    def requests(self, robot: str) -> list[KeptRequest]:
         """Raises SpoolError."""
         return self._read(_of_index) if robot == self._robot else []
 
@@ -156,16 +173,15 @@ class StoreKept:
             known = self._paces[robot] = now_s, link.pace_mbps(self._source, robot, self._findings)
         return known[1]
 
-    def requests(self, robot: str) -> list[dict[str, Any]]:
+    def requests(self, robot: str) -> list[KeptRequest]:
         """Raises StoreError, LakeError."""
         from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
 
         found = []
         for one in pull.listed(self._source, robot)[-MAX_REQUESTS:]:
             answer = one.answer or RequestAnswer(id=one.id, state=one.state)
-            found.append({'id': one.id, 'by': one.by, 'state': one.state, 'why': answer.why, 'want': one.want,
-                          'objects': answer.objects, 'bytes': answer.bytes, 'sent': answer.delivered.objects,
-                          'sent_bytes': answer.delivered.bytes})  # fmt: skip
+            found.append(KeptRequest(one.id, one.by, one.state, answer.why, one.want, answer.objects, answer.bytes,
+                                     answer.delivered.objects, answer.delivered.bytes))  # fmt: skip
         return found
 
     def ask(self, robot: str, want: KeptFilter, by: str) -> str:
@@ -186,10 +202,10 @@ class StoreKept:
 _Answer = TypeVar('_Answer')
 
 
-def _of_index(index: Index) -> list[dict[str, Any]]:
+def _of_index(index: Index) -> list[KeptRequest]:
     found = []
     for row in index.requests.rows()[-MAX_REQUESTS:]:
         sent, size = index.requests.progress(row.id).outcomes.get('delivered', (0, 0))
-        found.append({'id': row.id, 'by': row.requester, 'state': row.state, 'why': row.why, 'want': json.loads(row.wanted),
-                      'objects': row.objects, 'bytes': row.bytes, 'sent': sent, 'sent_bytes': size})  # fmt: skip
+        want = json.loads(row.wanted)
+        found.append(KeptRequest(row.id, row.requester, row.state, row.why, want, row.objects, row.bytes, sent, size))
     return found
