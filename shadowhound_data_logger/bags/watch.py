@@ -11,12 +11,12 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from stat import S_ISREG
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.naming import METADATA, SLICES, safe_bag
@@ -24,6 +24,7 @@ from shadowhound_data_logger.bags.upload import deliver, is_confirmed, opened_sp
 from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, finished
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import Settings
+from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.durable_files import flock, replacing
 from shadowhound_data_logger.core.errors import BagError, DataLoggerError
 from shadowhound_data_logger.stores import open_store
@@ -38,10 +39,47 @@ DELIVER_S: Final = 5.0
 """For one bag in one round; the spool has it safe, and a later round goes on."""
 RETRY_S: Final = 60.0
 """Before that: to open the spool costs it a row, and the node that runs here delivers by itself."""
-_Listing = list[list[Any]]
-"""Name, size and time of change of every file: what does not change while nobody writes."""
-
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundFile:
+    """A file of a bag, as its recorder left it."""
+
+    name: str
+    size: int
+    changed_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class SentFile:
+    """A file of a bag, as it is sent."""
+
+    name: str
+    key: str
+    size: int
+    sha256: str
+
+
+@dataclass(slots=True)
+class BagMark:
+    """A bag that was shipped."""
+
+    state: str
+    """SPOOLED, STORED or REMOVED; when it became so is in the fields of these names."""
+    look: tuple[FoundFile, ...]
+    files: tuple[SentFile, ...]
+    spooled: str
+    stored: str | None = None
+    removed: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BagMarks:
+    """The content of MARKS."""
+
+    bags: dict[str, BagMark] = field(default_factory=dict)
+    version: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +105,7 @@ class Watch:
         self._settle_s = settle_s
         self._is_removing = is_removing
         self._monotonic = monotonic
-        self._looks: dict[str, tuple[_Listing, float]] = {}
+        self._looks: dict[str, tuple[tuple[FoundFile, ...], float]] = {}
         self._told: dict[str, str] = {}
         self._again_s: dict[str, float] = {}
         self._left: set[str] = set()
@@ -92,9 +130,9 @@ class Watch:
 
     def is_owing(self) -> bool:
         """Whether the store does not have a bag of this folder yet, for whatever reason."""
-        return bool(self._looks or self._left) or any(mark['state'] == SPOOLED for mark in self._marks().values())
+        return bool(self._looks or self._left) or any(mark.state == SPOOLED for mark in self._marks().values())
 
-    def _step(self, path: Path, marks: dict[str, Any]) -> Iterator[WatchStep]:
+    def _step(self, path: Path, marks: dict[str, BagMark]) -> Iterator[WatchStep]:
         mark = marks.get(path.name)
         try:
             if mark is None:
@@ -104,10 +142,10 @@ class Watch:
                 mark = marks[path.name] = self._ship(path)
                 self._write(marks)
                 yield WatchStep(path.name, SPOOLED)
-            if mark['state'] == SPOOLED and self._monotonic() >= self._again_s.get(path.name, 0.0) and self._confirm(path, mark):
+            if mark.state == SPOOLED and self._monotonic() >= self._again_s.get(path.name, 0.0) and self._confirm(path, mark):
                 self._write(marks)
                 yield WatchStep(path.name, STORED)
-            if self._is_removing and mark['state'] == STORED and self._remove(path, mark):
+            if self._is_removing and mark.state == STORED and self._remove(path, mark):
                 self._write(marks)
                 yield WatchStep(path.name, REMOVED)
         except DataLoggerError as error:
@@ -117,7 +155,7 @@ class Watch:
 
     def _unfinished(self, path: Path) -> Iterator[WatchStep]:
         """A bag that nobody seems to write any more, once."""
-        times = [changed_ns for name, _, changed_ns in _look(path) if name.endswith(SLICES)]
+        times = [file.changed_ns for file in _look(path) if file.name.endswith(SLICES)]
         if not times or self._clock.wall_ns() - max(times) < UNFINISHED_S * SECOND:
             self._left.discard(path.name)
         elif path.name not in self._left:
@@ -134,64 +172,64 @@ class Watch:
             return self._settle_s <= 0
         return self._monotonic() - since_s >= self._settle_s
 
-    def _ship(self, path: Path) -> dict[str, Any]:
+    def _ship(self, path: Path) -> BagMark:
         settings = self._settings
         look = _look(path)
         with planned(path, settings.robot, safe_bag(path.name), settings.home, is_archive=False) as sent:
             with opened_spool(settings, self._clock) as spool:
                 spool_upload(sent, spool)
-            files = [[file.name, file.key, file.size, file.sha256] for file in sent.files]
+            files = tuple(SentFile(file.name, file.key, file.size, file.sha256) for file in sent.files)
         self._looks.pop(path.name, None)
-        return {'state': SPOOLED, 'spooled': iso(self._clock.wall_ns()), 'look': look, 'files': files}
+        return BagMark(SPOOLED, look, files, spooled=iso(self._clock.wall_ns()))
 
-    def _confirm(self, path: Path, mark: dict[str, Any]) -> bool:
+    def _confirm(self, path: Path, mark: BagMark) -> bool:
         """Ask the store; where it does not have everything yet, deliver for a moment, unless the node does."""
         self._again_s[path.name] = self._monotonic() + RETRY_S
         if not self._is_stored(mark):
             settings = self._settings
             with opened_spool(settings, self._clock) as spool:
-                files = (Outgoing(name, key, path, size, sha256) for name, key, size, sha256 in mark['files'])
+                files = (Outgoing(file.name, file.key, path, file.size, file.sha256) for file in mark.files)
                 deliver(
                     settings, spool, UploadPlan(settings.robot, safe_bag(path.name), path, tuple(files)), deadline_s=DELIVER_S
                 )
             if not self._is_stored(mark):
                 return False
-        mark['state'], mark['stored'] = STORED, iso(self._clock.wall_ns())
+        mark.state, mark.stored = STORED, iso(self._clock.wall_ns())
         return True
 
-    def _is_stored(self, mark: Mapping[str, Any]) -> bool:
+    def _is_stored(self, mark: BagMark) -> bool:
         store = open_store(self._settings.store, self._settings.upload)
         with closing(store):
-            return is_confirmed(store, [(key, size, sha256) for _, key, size, sha256 in mark['files']])
+            return is_confirmed(store, [(file.key, file.size, file.sha256) for file in mark.files])
 
-    def _remove(self, path: Path, mark: dict[str, Any]) -> bool:
+    def _remove(self, path: Path, mark: BagMark) -> bool:
         """Only what the store holds this very moment, and what is still what was sent."""
-        if _look(path) != [list(each) for each in mark['look']] or not self._is_stored(mark):
+        if _look(path) != mark.look or not self._is_stored(mark):
             return False
         shutil.rmtree(path)
-        mark['state'], mark['removed'] = REMOVED, iso(self._clock.wall_ns())
+        mark.state, mark.removed = REMOVED, iso(self._clock.wall_ns())
         return True
 
-    def _marks(self) -> dict[str, Any]:
+    def _marks(self) -> dict[str, BagMark]:
         try:
-            found = json.loads((self._folder / MARKS).read_bytes())
+            return parse(BagMarks, json.loads((self._folder / MARKS).read_bytes())).bags
         except FileNotFoundError:
             return {}
         except ValueError as error:
             remedy = 'remove it: nothing is sent twice all the same, but everything is read once more'
             raise BagError(f'{self._folder / MARKS} cannot be read: {error}', remedy=remedy) from error
-        return dict(found['bags'])
 
-    def _write(self, marks: Mapping[str, Any]) -> None:
+    def _write(self, marks: dict[str, BagMark]) -> None:
         with replacing(self._folder / MARKS, is_synced=True) as file:
-            file.write(json.dumps({'version': 1, 'bags': marks}, indent=1).encode())
+            file.write(json.dumps(as_plain(BagMarks(marks)), indent=1).encode())
 
 
-def _look(folder: Path) -> _Listing:
-    found: _Listing = []
+def _look(folder: Path) -> tuple[FoundFile, ...]:
+    """Every file of a bag; nothing changes while nobody writes it."""
+    found = []
     for path in sorted(folder.rglob('*')):
         with suppress(FileNotFoundError):  # its recorder is at work
             stat = path.stat()
             if S_ISREG(stat.st_mode):
-                found.append([str(path.relative_to(folder)), stat.st_size, stat.st_mtime_ns])
-    return found
+                found.append(FoundFile(str(path.relative_to(folder)), stat.st_size, stat.st_mtime_ns))
+    return tuple(found)

@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.remote import find_bag, find_bags
 from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_remote
-from shadowhound_data_logger.bags.watch import Watch
+from shadowhound_data_logger.bags.watch import MARKS, Watch
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import BagDamaged, BagError, NameRefused
@@ -295,6 +295,16 @@ def test_one_bad_bag_costs_itself_alone(settings: Settings, store: DirectoryStor
     assert steps(watching) == [('bad', 'refused'), ('good', 'spooled'), ('good', 'stored')]
     assert steps(watching) == []
     assert watching.is_owing()
+
+
+@pytest.mark.parametrize(
+    'content', ['{', '[]', '{"bags": []}', '{"bags": {"a": {"state": "spooled"}}}', '{"bags": {"a": {"files": [[1]]}}}']
+)
+def test_a_damaged_list_of_sent_bags_is_an_error(settings: Settings, tmp_path: Path, content: str) -> None:
+    """It names the file, and nothing is sent."""
+    (tmp_path / MARKS).write_text(content)
+    with pytest.raises(BagError, match=f'{MARKS} cannot be read'):
+        watch(settings, tmp_path, Hand()).round()
 
 
 def test_two_do_not_watch_one_folder(settings: Settings, tmp_path: Path) -> None:
