@@ -99,7 +99,7 @@ class Run:
     """(stamp, when it was sent)."""
     node_reports: dict[str, Any]
     """The ``stamps`` of each topic at the end of the publishers, of the ledger."""
-    findings: list[str]
+    findings: Sequence[str]
     """Of ``status``, at the same time."""
     objects: dict[Name, Stored] = field(default_factory=dict)
     keys: dict[str, list[Name]] = field(default_factory=dict)
@@ -155,9 +155,9 @@ def run(folder: Path, seconds: float, rng: random.Random) -> Run:
                 raise RuntimeError(f'the publishers failed: {publishers.log}')
             time.sleep(1.0)
             reports = {topic: row['stamps'] for topic, row in node.ledger()['topics'].items()}
-            findings = read_status(node.home / 'spool', ROBOT, SystemClock.of_this_machine())['findings']
+            findings = read_status(node.home / 'spool', ROBOT, SystemClock.of_this_machine()).findings
             (folder / 'reports.json').write_text(
-                json.dumps({'stamps': reports, 'findings': findings}, indent=1), encoding='utf-8'
+                json.dumps({'stamps': reports, 'findings': list(findings)}, indent=1), encoding='utf-8'
             )
             node.stop()
         finally:
