@@ -26,9 +26,10 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, volume
 from shadowhound_data_logger.cli.progress import progress
-from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, report_skipped
+from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, by_option, quietly, report_skipped
 from shadowhound_data_logger.core.errors import TrackingError
 from shadowhound_data_logger.core.keys import check_name
+from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.stores import open_reader
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ def _missions(command: _Command) -> _Command:
               help='Videos: a file for each episode, or one for each camera, which can also be streamed.')  # fmt: skip
 @click.option('--resample', multiple=True, metavar='SENSOR=HOW', help='hold (default) or linear: between the last two messages.')
 @click.option('--max-age', multiple=True, metavar='SENSOR=S', help='Older messages are stale  [default: 1.5 periods]')
+@by_option
 @click.option('--max-gap', type=click.FloatRange(0.0), default=5.0, show_default=True, metavar='S',
               help='Refuse missions in which a stream is silent for longer.')  # fmt: skip
 @click.option('--max-stale', type=click.FloatRange(0.0, 1.0), default=0.05, show_default=True, metavar='SHARE',
@@ -145,6 +147,8 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
         if address and cluster is None:
             raise BadUsage(f'--address {address} is refused', 'it is of a Ray cluster: --runner ray')
         place = DatasetPlace.of(to) if to and to.startswith(SCHEME) else None
+        if task and options.by != BY_STAMP:
+            raise BadUsage(f'--task with --by {options.by} is refused', 'the recordings of a task are by stamps')
         if task and place is not None:
             raise BadUsage(f'--task with --to {to} is refused', 'the folder of a task is made on this machine: --to DIR')
     folder = _copy_of(to) if place and to else Path(to or name)
@@ -209,7 +213,7 @@ def _options(how: Mapping[str, Any]) -> ExportOptions:
         max_gap_s=how['max_gap'], max_stale=how['max_stale'],
         allow_gaps=how['allow_gaps'], validation=how['validation'],
         labels=how['labels'], validation_label=how['validation_label'],
-        arm=how['arm'], clock_pairs=pairs,
+        arm=how['arm'], clock_pairs=pairs, by=how['by'],
     )  # fmt: skip
 
 

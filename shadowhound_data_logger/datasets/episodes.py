@@ -96,7 +96,8 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
     try:
         place, work = Place(settings), folder / 'tmp'
         with ExitStack() as stack:
-            of_robot = Recordings(place, store, plan.tracks, plan.topics, plan.span_ns, plan.bags, work, early_ns=BEFORE_NS)
+            of_robot = Recordings(place, store, plan.tracks, plan.topics, plan.span_ns, plan.bags, work, early_ns=BEFORE_NS,
+                                   by=options.by)  # fmt: skip
             recordings = {False: stack.enter_context(of_robot)}
             if plan.arm is not None:
                 span = plan.arm.span_ns(*plan.span_ns)
@@ -197,7 +198,8 @@ def _derived(poses: Series, options: ExportOptions) -> Series:
     later, values = motion(poses.stamps, poses.values, round(options.max_gap_s * SECOND))
     if not len(later):
         raise LakeError(f'{poses.recording.topic} has no two poses from which a velocity could be derived')
-    previous = np.column_stack([poses.stamps[later - 1], poses.received[later - 1], poses.file[later - 1]])
+    own = poses.stamps if poses.own_stamps is None else poses.own_stamps
+    previous = np.column_stack([each[later - 1] for each in (poses.stamps, own, poses.received, poses.file)])
     return replace(poses.only(later), values=values, names=(), previous=previous)
 
 
@@ -435,7 +437,8 @@ def _sources(mission_id: str, stream: _Stream, ticks: NDArray[np.int64]) -> Iter
     if series.previous is not None:
         earlier = series.previous[sampled.message]
         held = (ticks - earlier[:, 0]) / SECOND
-        yield _source_rows(mission_id, stream, frames, earlier[:, 0], earlier[:, 1], earlier[:, 2], held)
+        _, own_stamps, received, files = earlier.T
+        yield _source_rows(mission_id, stream, frames, own_stamps, received, files, held)
 
 
 def _source_rows(mission_id: str, stream: _Stream, frames: NDArray[np.int64], stamps: NDArray[np.int64],

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS
 from shadowhound_data_logger.lake import decode
 
 _POSE: Final = decode.ODOMETRY[:7]
@@ -86,6 +87,8 @@ class ExportOptions:
     """Sensor -> ``hold`` or ``linear``; default: hold."""
     max_age_s: Mapping[str, float] | None = None
     """Sensor -> seconds; default: ``ticks.LATE`` periods of the stream or of the ticks."""
+    by: str = BY_STAMP
+    """Which of the two times of messages places them at the ticks."""
     max_gap_s: float = 5.0
     max_stale: float = 0.05
     allow_gaps: bool = False
@@ -111,6 +114,10 @@ class ExportOptions:
         for sensor, how in (self.resample or {}).items():
             if how not in {HOLD, LINEAR}:
                 raise SettingError(f'--resample {sensor}', how, f'{HOLD} or {LINEAR}')
+        if self.by not in CLOCKS:
+            raise SettingError('--by', self.by, ' or '.join(CLOCKS))
+        if self.by == BY_RECEIVED and self.arm:
+            raise SettingError('--by', self.by, f'{BY_STAMP}: with --arm, times are converted between two clocks')
         if self.fps is not None and self.fps < 1:
             raise SettingError('--fps', self.fps, 'auto, or a whole number of frames a second')
 
@@ -121,6 +128,7 @@ class ExportOptions:
             'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
             'max_gap_s': self.max_gap_s, **({'arm': self.arm} if self.arm else {}),
             'layout': self.layout, **({'labels': True} if self.labels else {}),
+            **({'by': self.by} if self.by != BY_STAMP else {}),
         }  # fmt: skip
 
 

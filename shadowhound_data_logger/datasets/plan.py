@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.errors import LakeError
+from shadowhound_data_logger.core.stamps import BY_RECEIVED
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.datasets.clocks import NEAR_NS, ClockOffset, measured
 from shadowhound_data_logger.datasets.features import (
@@ -191,7 +192,9 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
     """
     for robot in sorted({mission.robot for mission in missions}):
         ours = [mission for mission in missions if mission.robot == robot]
-        stated = newest(source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings)
+        stated = newest(
+            source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings, by=options.by
+        )
         labelled = labels.read(source, robot, findings=findings) if options.labels or options.validation_label else []
         recorded = manifests_of(store, robot)
         for mission in ours:
@@ -242,15 +245,20 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     actions = [COMMAND, DERIVED] if action == 'auto' else [ACTIONS[action]]
     sensors = [*options.cameras, *(part.sensor for part in parts), *(part.sensor for part in actions if part)]
     used = f'{among("sensor", sorted({*sensors, *RECORDED}))} OR {among("type", sorted(DETECTIONS))}'
+    span: dict[str, Any] = {'since': utc(since - LONGEST_BATCH_NS), 'until': utc(until + 1000)}
+    if options.by == BY_RECEIVED:  # stamps can be anywhere then, and so the dates of rows
+        arrival = 'coalesce(received_start_ns, t_start_ns)'
+        used, span = f'({used}) AND {arrival} >= {since - LONGEST_BATCH_NS} AND {arrival} <= {until} AND t_start IS NOT NULL', {}
     found = query.objects(
-        source, findings=findings, columns=(*NEEDED, *RECEIVED, 'topic'), where=used, robot=mission.robot,
-        since=utc(since - LONGEST_BATCH_NS), until=utc(until + 1000),
-    ).to_pylist()  # fmt: skip
+        source, findings=findings, columns=(*NEEDED, *RECEIVED, 'topic'), where=used, robot=mission.robot, **span
+    ).to_pylist()
     seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
     tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS], mission)
+    if options.by == BY_RECEIVED:
+        tracks = {sensor: track.by_arrival() for sensor, track in tracks.items()}
     bags = tuple(bags_of(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
     place = Place(source.settings)
-    with Recordings(place, store, tracks, topics, (since, until), bags, work, early_ns=BEFORE_NS) as recordings:
+    with Recordings(place, store, tracks, topics, (since, until), bags, work, early_ns=BEFORE_NS, by=options.by) as recordings:
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
     streams, missing = [], []
     wanted: list[tuple[str, StatePart | None, str]] = [

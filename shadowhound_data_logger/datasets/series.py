@@ -28,6 +28,7 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.errors import BagDamaged, LakeError, Rejected
 from shadowhound_data_logger.core.model import Batch, ObjectInfo, Sample
 from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, DEFAULT_SENSORS, IMAGE, SensorSettings
+from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.formats.definitions import SEPARATOR
 from shadowhound_data_logger.formats.image import encode_png
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage
@@ -153,11 +154,11 @@ class Series:
     names: tuple[str, ...] = ()
     """Of joints, by the first message."""
     previous: NDArray[np.int64] | None = None
-    """Of values that are derived from two messages, (messages, 3): stamp and arrival of the earlier one, its file."""
+    """Of values that are derived from two messages, (messages, 4): of the earlier one time, stamp, arrival and file."""
     picture: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
     """Content and extension (``jpg``, ``png``) of a message of a camera."""
     own_stamps: NDArray[np.int64] | None = None
-    """By the clock of the machine that they are of, where that is another one."""
+    """The stamps of the messages, where ``stamps`` has other times: the robot's instead of another machine's, or arrivals."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -181,11 +182,12 @@ class Recordings:
     """
 
     def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],  # noqa: PLR0913
-                 span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path, *, early_ns: int = 0) -> None:  # fmt: skip
+                 span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path, *, early_ns: int = 0,
+                 by: str = BY_STAMP) -> None:  # fmt: skip
         """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time that is read, both ends included.
 
         What was recorded in the first ``early_ns`` of it does not count when one recording is chosen over another. ``bags``
-        are in the order of preference (``bags_of``).
+        are in the order of preference (``bags_of``). ``by`` is which of their two times messages have; the tracks have the same.
         """
         self._place = place
         self._store = store
@@ -195,6 +197,7 @@ class Recordings:
         self._counted = Interval(span_ns[0] + early_ns, span_ns[1])
         self._bags = bags
         self._work = work
+        self._by = by
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -293,11 +296,12 @@ class Recordings:
                 times = np.array([each.stamp_ns for each in members(wanted)], np.int64) + int(track.offset_ns[number])
                 where += [(number, member) for member in range(len(times))]
             else:
-                times = track.start_ns[number : number + 1]
+                times = (track.start_ns if track.stamp_ns is None else track.stamp_ns)[number : number + 1]
                 where.append((number, -1))
             stamps += times.tolist()
             arrived += _arrivals(track, number, times).tolist()
-        order = np.argsort(np.array(stamps, np.int64), kind='stable')
+        times_of = self._times(np.array(stamps, np.int64), np.array(arrived, np.int64))
+        order = np.argsort(times_of, kind='stable')
 
         def picture(message: int) -> tuple[bytes, str]:
             coming = {where[int(order[place])][0] for place in range(message, min(message + AHEAD, len(order)))}
@@ -313,13 +317,19 @@ class Recordings:
             recording, np.array(stamps, np.int64), np.empty((len(stamps), 0)), file, [_file(each) for each in objects],
             np.array(arrived, np.int64),
         )  # fmt: skip
-        return _with_pictures(made, picture, order, np.array(stamps, np.int64), self._span)
+        return _with_pictures(made, picture, order, times_of, self._span)
+
+    def _times(self, stamps: NDArray[np.int64], received: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those that place messages: their stamps, or their arrivals as far as these are known."""
+        return np.where(received > 0, received, stamps) if self._by == BY_RECEIVED else stamps
 
     def _ordered(self, recording: RecordedSensor, stamps: NDArray[np.int64], values: NDArray[np.float64], file: NDArray[np.int64],
                  files: Sequence[SourceFile], received: NDArray[np.int64], names: tuple[str, ...] = ()) -> Series:  # fmt: skip
-        order = np.argsort(stamps, kind='stable')
-        inside = order[(stamps[order] >= self._span[0]) & (stamps[order] <= self._span[1])]
-        return Series(recording, stamps[inside], values[inside], file[inside], files, received[inside], names)
+        times = self._times(stamps, received)
+        order = np.argsort(times, kind='stable')
+        inside = order[(times[order] >= self._span[0]) & (times[order] <= self._span[1])]
+        own = stamps[inside] if self._by == BY_RECEIVED else None
+        return Series(recording, times[inside], values[inside], file[inside], files, received[inside], names, own_stamps=own)
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
@@ -401,14 +411,15 @@ class Recordings:
         made = self._ordered(recording, stamped, values, np.array(file, np.int64), files, np.array(arrived, np.int64), names)
         if bodies is None:
             return made
-        order = np.argsort(stamped, kind='stable')
+        times = self._times(stamped, np.array(arrived, np.int64))
+        order = np.argsort(times, kind='stable')
 
         def picture(message: int) -> tuple[bytes, str]:
             start, size, extension = where[int(order[message])]
             bodies.seek(start)
             return bodies.read(size), extension
 
-        return _with_pictures(made, picture, order, stamped, self._span)
+        return _with_pictures(made, picture, order, times, self._span)
 
     def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
         source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
@@ -485,17 +496,17 @@ def _arrivals(track: Track, number: int, times: NDArray[np.int64]) -> NDArray[np
     first, last = (0, 0) if track.received_ns is None else map(int, track.received_ns[number])
     if not first:
         return np.zeros(len(times), np.int64)
-    return decode.arrivals(times + (first - int(track.start_ns[number])), first, last)
+    return decode.arrivals(times + (first - int(times.min())), first, last)
 
 
 def _unpacked(prefetch: Prefetch, wanted: Object) -> list[decode.ArchiveMember]:
     return decode.members(prefetch.get(wanted), decode.extension_of(wanted.key))
 
 
-def _with_pictures(made: Series, picture: Callable[[int], tuple[bytes, str]], order: NDArray[np.intp], stamps: NDArray[np.int64],
+def _with_pictures(made: Series, picture: Callable[[int], tuple[bytes, str]], order: NDArray[np.intp], times: NDArray[np.int64],
                    span: tuple[int, int]) -> Series:  # fmt: skip
     """``picture`` counts all messages in their order; the series may begin later."""
-    before = int((stamps[order] < span[0]).sum())
+    before = int((times[order] < span[0]).sum())
     made.picture = lambda message: picture(before + message)
     return made
 

@@ -63,6 +63,8 @@ class Track:
     """The latest end of this object and those before it."""
     received_ns: NDArray[np.int64] | None = None
     """(n, 2): when the first and the last message of each object arrived, 0 where that is unknown; None without ``RECEIVED``."""
+    stamp_ns: NDArray[np.int64] | None = None
+    """Of a track by arrival, the stamp of each object's first message; None of one by stamps."""
 
     @classmethod
     def of(cls, rows: pa.Table) -> Track:
@@ -113,6 +115,14 @@ class Track:
         kept['end_ns'] = _shared(kept['end_ns'], kept['start_ns'])
         kept['latest_ns'] = _shared(np.maximum.accumulate(kept['end_ns']), kept['end_ns'])
         return replace(self, **kept)
+
+    def by_arrival(self) -> Track:
+        """The same objects in the order of their arrival; one whose arrival is unknown keeps its time. It needs ``RECEIVED``."""
+        assert self.received_ns is not None
+        first, last = self.received_ns.T
+        start, end = (np.where(first > 0, one, other) for one, other in ((first, self.start_ns), (last, self.end_ns)))
+        moved = replace(self, start_ns=start, end_ns=np.maximum(start, end), stamp_ns=self.start_ns)
+        return moved.only(np.argsort(start, kind='stable'))
 
     def object(self, number: int) -> Object:
         return Object(

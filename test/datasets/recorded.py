@@ -139,7 +139,8 @@ class House:
         until = mission.end_ns + round(until_s * SECOND)
         marks = [
             complete('thor', 'j', 10 + self._parts, sink='objects', topic=TOPICS[sensor], session=1 + round(mission.begin_s),
-                     grade='exact', from_ns=mission.begin_ns - 2 * SECOND, to_ns=until, received=1000, skipped=mission.skipped)
+                     grade='exact', from_ns=mission.begin_ns - 2 * SECOND, to_ns=until, received=1000, skipped=mission.skipped,
+                     received_from_ns=mission.begin_ns - 2 * SECOND, received_to_ns=until)
             for sensor in mission.sensors if sensor not in mission.uncounted
         ]  # fmt: skip
         tell(self.settings, self.folder, *mission.gaps, *marks, name=f'part{self._parts}')

@@ -56,7 +56,8 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     dense, key = record_bag(house, tmp_path)
     tell(house.settings, tmp_path, *(
         complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
-                 from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND) for sensor in ('camera', 'odom')
+                 from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND,
+                 received_from_ns=mission.begin_ns - 2 * SECOND, received_to_ns=mission.end_ns + SECOND) for sensor in ('camera', 'odom')
     ), name='bags')  # fmt: skip
     found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
     assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
@@ -71,6 +72,14 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     assert set((sources['received_ns'].to_numpy() - sources['stamp_ns'].to_numpy()).tolist()) == {2_000_000}
     proved = verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None)
     assert (proved.wrong, proved.frames) == ([], len(table))
+    by_received = export(tmp_path / 'received', house.source, {'mission_type': 'patrol'}, ExportOptions(by='received'))
+    assert {each['from'] for each in by_received.added[0]['streams'].values()} == {'bags'}
+    (row,) = Lerobot(tmp_path / 'received').rows
+    ticks = pq.read_table(Lerobot(tmp_path / 'received').path(DATA, row, 'data'))['shadowhound.stamp_ns'].to_numpy()
+    sources = pq.read_table(tmp_path / 'received/meta/shadowhound_sources.parquet')
+    assert set((sources['received_ns'].to_numpy() - sources['stamp_ns'].to_numpy()).tolist()) == {2_000_000}
+    age_ns = ticks[sources['frame'].to_numpy()] - sources['received_ns'].to_numpy()
+    assert sources['held_s'].to_numpy() * SECOND == pytest.approx(age_ns, abs=1000)
 
 
 def test_slices_that_a_robot_keeps_are_not_missed(tmp_path: Path) -> None:

@@ -287,6 +287,43 @@ def test_every_source_has_both_times_and_a_changed_offset_is_flagged(tmp_path: P
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
 
 
+@pytest.mark.parametrize('archives', [True, False])
+def test_by_received_frames_have_what_had_arrived(tmp_path: Path, *, archives: bool) -> None:
+    """The camera's stamps are 146 s behind: by arrival it is aligned with poses of its time, by stamps the mission has none."""
+    house = House(tmp_path)
+    mission = Mission('late', seconds=4, begin_s=200, sensors=('camera', 'odom'))
+    late_by = {'camera': LATE_NS, 'odom': 0}
+    mission.late_ns = lambda sensor, _stamp: late_by[sensor]
+    every = mission.stamps
+    mission.stamps = lambda sensor: [stamp - late_by[sensor] for stamp in every(sensor)]  # type: ignore[method-assign]
+    house.record(mission, archives=archives)
+    refused = export(tmp_path / 'by-stamp', house.source, {'mission_type': 'patrol'}, ExportOptions()).refused
+    assert 'camera' in refused['late']
+    options = ExportOptions(by='received')
+    found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, options)
+    assert (found.refused, found.waiting) == ({}, {})
+    made = Lerobot(tmp_path / 'set')
+    table = pq.read_table(made.path(DATA, made.rows[0], 'data'))
+    ticks = table['shadowhound.stamp_ns'].to_numpy()
+    assert mission.begin_ns <= ticks[0] <= ticks[-1] <= mission.end_ns
+    assert matrix(table['observation.state'])[:, 0] == pytest.approx([x_of(int(tick)) for tick in ticks], abs=0.03)
+    rows = pq.read_table(tmp_path / 'set' / SOURCE_TABLE).to_pylist()
+    for row in rows:
+        late_ns = late_by['camera' if row['stream'].startswith('images') else 'odom']
+        assert row['received_ns'] - row['stamp_ns'] == late_ns
+        assert row['received_ns'] == pytest.approx(ticks[row['frame']] - row['held_s'] * SECOND, abs=1000)
+    assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
+    with pytest.raises(LakeError, match='was started with by received'):
+        export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
+
+
+def test_arrivals_do_not_go_with_another_clock() -> None:
+    """An arm's times are converted to the robot's; and there are two clocks to choose from."""
+    for by, arm in (('arrival', ''), ('received', 'soarm')):
+        with pytest.raises(SettingError, match='--by'):
+            ExportOptions(by=by, arm=arm)
+
+
 def test_arrivals_that_are_unknown_are_null(tmp_path: Path) -> None:
     """Not 0; and no stream is flagged."""
     house = House(tmp_path)
