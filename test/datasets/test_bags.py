@@ -57,7 +57,8 @@ def test_a_bag_is_taken_where_it_has_more(tmp_path: Path) -> None:
     tell(house.settings, tmp_path, *(
         complete('thor', 'j', 99, sink='bags', topic=TOPICS[sensor], session=1, grade='exact', received=1, skipped=0,
                  from_ns=mission.begin_ns - 2 * SECOND, to_ns=mission.end_ns + SECOND,
-                 received_from_ns=mission.begin_ns - 2 * SECOND, received_to_ns=mission.end_ns + SECOND) for sensor in ('camera', 'odom')
+                 received_from_ns=mission.begin_ns - 2 * SECOND, received_to_ns=mission.end_ns + SECOND)
+        for sensor in ('camera', 'odom')
     ), name='bags')  # fmt: skip
     found = export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
     assert (found.refused, found.waiting, found.fps) == ({}, {}, 10)
