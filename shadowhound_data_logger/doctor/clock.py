@@ -31,11 +31,11 @@ def check(context: Context) -> Iterator[Result]:
     yield ok('clock.set', time.strftime('it is %Y-%m-%d %H:%M:%S UTC', time.gmtime()))
     yield _kept()
     if context.role is Role.THOR:
-        steps = clock_record.read(context.settings.spool_path, context.settings.robot)
-        if steps['steps']:
+        known = clock_record.read(context.settings.spool_path, context.settings.robot)
+        if known.steps:
             yield info(
                 'clock.steps',
-                f'the clock stepped {steps["steps"]} times while the node ran, last by {steps["last_step_s"]} s',
+                f'the clock stepped {known.steps} times while the node ran, last by {known.last_step_s} s',
                 'dates before and after do not follow on each other; the boot clock is in every object',
             )
 

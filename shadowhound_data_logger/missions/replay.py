@@ -354,7 +354,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         opened.callback(successor.stop)
         settings, clock = Settings.load({}, {**os.environ, 'SHADOWHOUND_HOME': str(options.home)}), SystemClock.of_this_machine()
         tracking = open_tracking(options.home, options.experiment)
-        dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot)['offsets'])
+        dating = Dating(clock, settings.clock.hold_s, lambda: clock_record.read(settings.spool_path, settings.robot).offsets)
         replay = Replay(
             options.home, tracking, Spooler(settings, clock), Drawing(), settle=lambda folder: give_date(folder, dating)
         )

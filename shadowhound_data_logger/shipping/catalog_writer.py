@@ -185,7 +185,7 @@ class _GapParts:
 
     def parts(self) -> list[DataObject]:
         """Raises SpoolError or sqlite3.Error."""
-        offsets = clock_record.read(self._spool, self._robot)['offsets']
+        offsets = clock_record.read(self._spool, self._robot).offsets
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
             with index.snapshot():

@@ -10,7 +10,7 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypedDict
 
 from shadowhound_data_logger.core.durable_files import replacing
 from shadowhound_data_logger.core.untrusted import from_json
@@ -24,22 +24,36 @@ MAX_SAID: Final = 300
 """Letters of an answer."""
 
 
+class Act(TypedDict):
+    """What an operator requested."""
+
+    at_ns: int
+    """Unix, by the robot's clock."""
+    who: str
+    do: str
+    ok: bool
+    said: str
+    """The answer of the node."""
+
+
 def file(spool: Path, robot: str) -> Path:
     """Where the node of a robot keeps them."""
     return spool / f'acts-{robot}.json'
 
 
-def read(spool: Path, robot: str) -> list[dict[str, Any]]:
-    """Each with ``at_ns`` (Unix, by the robot's clock), ``who``, ``do``, ``ok`` and ``said``, the node's answer; oldest first."""
+def read(spool: Path, robot: str) -> list[Act]:
+    """The oldest first."""
     try:
         with file(spool, robot).open('rb') as stream:
             given = from_json(stream.read(MOST_BYTES + 1), MOST_BYTES)
         return [
-            {
-                'at_ns': int(each['at_ns']),
-                'ok': bool(each['ok']),
-                **{name: str(each[name])[:MAX_SAID] for name in ('who', 'do', 'said')},
-            }
+            Act(
+                at_ns=int(each['at_ns']),
+                ok=bool(each['ok']),
+                who=str(each['who'])[:MAX_SAID],
+                do=str(each['do'])[:MAX_SAID],
+                said=str(each['said'])[:MAX_SAID],
+            )
             for each in given[-MAX_ACTS:]
         ]
     except (OSError, ValueError, TypeError, KeyError, OverflowError):

@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.clock_watch import ClockWatch
+from shadowhound_data_logger.core.dataclass_json import dumps, parse
 from shadowhound_data_logger.core.durable_files import replacing
 
 log = logging.getLogger(__name__)
@@ -22,20 +24,30 @@ SLEWED_NS: Final = 100_000_000
 """An offset is noted again once it has moved so far."""
 
 
+@dataclass(frozen=True, slots=True)
+class KnownClock:
+    """What is known of the wall clock of a robot."""
+
+    is_set: bool | None = None
+    """None if no node has looked yet."""
+    steps: int = 0
+    last_step_s: float | None = None
+    last_step_time: str | None = None
+    offsets: Mapping[str, int] = field(default_factory=dict)
+    """UTC minus the boot clock, ns, by boot id, of boots whose clock was set."""
+
+
 def file(spool: Path, robot: str) -> Path:
     """Where the node of a robot keeps it."""
     return spool / f'clock-{robot}.json'
 
 
-def read(spool: Path, robot: str) -> dict[str, Any]:
-    """``is_set`` (None: no node has looked yet), ``steps``, ``last_step_s``, ``last_step_time``, ``offsets`` by boot id."""
+def read(spool: Path, robot: str) -> KnownClock:
+    """The content of the file; nothing is known if it is missing or damaged."""
     try:
-        given = json.loads(file(spool, robot).read_bytes())
-        offsets = {str(boot): int(offset) for boot, offset in given['offsets'].items()}
-        return {'is_set': bool(given['is_set']), 'steps': int(given['steps']), 'last_step_s': given['last_step_s'],
-                'last_step_time': given['last_step_time'], 'offsets': offsets}  # fmt: skip
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return {'is_set': None, 'steps': 0, 'last_step_s': None, 'last_step_time': None, 'offsets': {}}
+        return parse(KnownClock, json.loads(file(spool, robot).read_bytes()))
+    except (OSError, ValueError, RecursionError):
+        return KnownClock()
 
 
 class ClockRecord:
@@ -46,36 +58,36 @@ class ClockRecord:
 
     def __init__(self, spool: Path, robot: str) -> None:
         self._path = file(spool, robot)
-        self._said = read(spool, robot)
-        self._offsets: dict[str, int] = self._said['offsets']
+        self._known = read(spool, robot)
 
     @property
     def steps(self) -> int:
-        return int(self._said['steps'])
+        return self._known.steps
 
     def offsets(self) -> Mapping[str, int]:
-        """UTC less boot clock by boot id, of the boots whose clock was set; the others are missing."""
-        return dict(self._offsets)
+        """UTC minus the boot clock by boot id, of the boots whose clock was set; the others are missing."""
+        return self._known.offsets
 
     def knows(self, boot_id: str, offset_ns: int | None) -> bool:
         """Whether there is nothing new in this offset."""
         if offset_ns is None:
-            return self._said['is_set'] is False
-        return self._said['is_set'] is True and abs(offset_ns - self._offsets.get(boot_id, 0)) < SLEWED_NS
+            return self._known.is_set is False
+        return self._known.is_set is True and abs(offset_ns - self._known.offsets.get(boot_id, 0)) < SLEWED_NS
 
     def note(self, watch: ClockWatch) -> None:
         """Keep what is known now."""
-        state, offset_ns = watch.state(), watch.offset_ns()
+        state, offset_ns, offsets = watch.state(), watch.offset_ns(), dict(self._known.offsets)
         if offset_ns is not None:
-            self._offsets.pop(watch.boot_id, None)
-            self._offsets[watch.boot_id] = offset_ns
-        while len(self._offsets) > BOOTS:
-            del self._offsets[next(iter(self._offsets))]
-        if state.steps != self._said['steps']:
-            self._said |= {'last_step_s': state.last_step_s, 'last_step_time': iso(watch.wall_ns())}
-        self._said |= {'is_set': state.is_set, 'steps': state.steps, 'offsets': self._offsets}
+            offsets.pop(watch.boot_id, None)
+            offsets[watch.boot_id] = offset_ns
+        while len(offsets) > BOOTS:
+            del offsets[next(iter(offsets))]
+        known = replace(self._known, is_set=state.is_set, steps=state.steps, offsets=offsets)
+        if state.steps != self._known.steps:
+            known = replace(known, last_step_s=state.last_step_s, last_step_time=iso(watch.wall_ns()))
+        self._known = known
         try:
             with replacing(self._path, mode=0o600) as file:
-                file.write(json.dumps(self._said).encode())
+                file.write(dumps(known))
         except OSError as error:
             log.warning('what is known of the clock cannot be kept: %s', error)

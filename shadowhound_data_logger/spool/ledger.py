@@ -15,6 +15,7 @@ from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool import act_record, clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
 from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
+from shadowhound_data_logger.spool.act_record import Act
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 
@@ -90,8 +91,8 @@ class SpoolLedger(Ledger):
     """The ledger of a spool folder."""
 
     clock: ClockFigures
-    acts: list[dict[str, Any]]
-    """What operators requested (``act_record``)."""
+    acts: list[Act]
+    """What operators requested."""
 
 
 def read(spool: Path, robot: str) -> SpoolLedger:
@@ -101,8 +102,8 @@ def read(spool: Path, robot: str) -> SpoolLedger:
     """
     with _reading(spool) as index:
         known = clock_record.read(spool, robot)
-        clock = ClockFigures(is_set=known['is_set'], steps=known['steps'], last_step_s=known['last_step_s'],
-                             last_step_time=known['last_step_time'], held=index.objects.held_count('clock'))  # fmt: skip
+        clock = ClockFigures(is_set=known.is_set, steps=known.steps, last_step_s=known.last_step_s,
+                             last_step_time=known.last_step_time, held=index.objects.held_count('clock'))  # fmt: skip
         return {**of_index(index, robot), 'clock': clock, 'acts': act_record.read(spool, robot)}
 
 
@@ -112,7 +113,7 @@ def journal(spool: Path, robot: str) -> list[Gap]:
     Raises SpoolError as ``read``.
     """
     with _reading(spool) as index:
-        return index.gaps.known(clock_record.read(spool, robot)['offsets'])
+        return index.gaps.known(clock_record.read(spool, robot).offsets)
 
 
 def watermarks(spool: Path) -> list[Watermark]:
