@@ -41,8 +41,8 @@ from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.live.history import PastReader
-from shadowhound_data_logger.live.kept import SpoolKept, StoreKept
-from shadowhound_data_logger.live.past import SpoolPast, StorePast
+from shadowhound_data_logger.live.kept import KeptSource, SpoolKept, StoreKept
+from shadowhound_data_logger.live.past import PastSource, SpoolPast, StorePast
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.estimator import RESTART
 from shadowhound_data_logger.spool.gaps import BAGS, OBJECTS
@@ -90,7 +90,7 @@ class Stored(NamedTuple):
         return self.stamp_ns if by == BY_STAMP else self.received_ns
 
 
-@dataclass(slots=True)
+@dataclass
 class Run:
     """What was published and stored."""
 
@@ -106,6 +106,9 @@ class Run:
     """The messages of each object, by its key."""
     bag: dict[Name, tuple[int, int]] = field(default_factory=dict)
     """(publish time, log time) of each message in the bags."""
+
+    def __post_init__(self) -> None:
+        self.began_ns = min(sent_ns for _, sent_ns in self.published.values())
 
 
 class Bars:
@@ -312,8 +315,9 @@ def _losses(held: Mapping[Name, Stored], stream: Skewed, by: str) -> Iterator[Lo
 
 def _spans(spans: Sequence[tuple[Any, ...]], found: Run) -> list[list[Any]]:
     """In seconds from the first message, to be read."""
-    began_ns = min(sent_ns for _, sent_ns in found.published.values())
-    return [[None if at is None else round((at - began_ns) / SECOND, 2) for at in span[:2]] + list(span[2:]) for span in spans]
+    return [
+        [None if at is None else round((at - found.began_ns) / SECOND, 2) for at in span[:2]] + list(span[2:]) for span in spans
+    ]
 
 
 # -- what is shown -------------------------------------------------------------------------------------------------------------
@@ -397,14 +401,13 @@ def _shown(topic: str, head: Mapping[str, Any], body: bytes) -> Name:
     return topic, int(values[-1][names.index('y')]), int(values[-1][names.index('x')])
 
 
-def check_query(found: Run, by: str, at_ns: int, bars: Bars) -> None:
-    """The objects that begin around a moment."""
+def check_query(found: Run, by: str, begins: Mapping[str, int], at_ns: int, bars: Bars) -> None:
+    """The objects that begin around a moment; ``begins`` is when each began by this clock."""
     since_ns, until_ns = at_ns - AROUND_NS, at_ns + AROUND_NS
     rows = lake.objects(default_source(), robot=ROBOT, columns=('key',), by=by, since=_time(since_ns), until=_time(until_ns))
     said = {key for key in rows['key'].to_pylist() if key in found.keys}
-    for key, names in found.keys.items():
-        begin_ns = min(found.objects[name].on(by) for name in names)
-        slack_ns = slack_of(by, BY_TOPIC[names[0][0]])
+    for key, begin_ns in begins.items():
+        slack_ns = slack_of(by, BY_TOPIC[found.keys[key][0][0]])
         text = f'at {_place(found, at_ns)} by {by}: {key} begins {(begin_ns - at_ns) / SECOND:.3f} s after'
         if min(abs(begin_ns - since_ns), abs(begin_ns - until_ns)) > slack_ns:
             bars.check('query: the objects of a time', text, holds=(key in said) == (since_ns <= begin_ns < until_ns))
@@ -454,8 +457,7 @@ def _time(at_ns: int) -> str:
 
 
 def _place(found: Run, at_ns: int) -> str:
-    began_ns = min(sent_ns for _, sent_ns in found.published.values())
-    return f'{(at_ns - began_ns) / SECOND:.3f} s'
+    return f'{(at_ns - found.began_ns) / SECOND:.3f} s'
 
 
 # -- what is reported ----------------------------------------------------------------------------------------------------------
@@ -489,7 +491,7 @@ def audit(found: Run, folder: Path, rng: random.Random, bars: Bars) -> None:
         bars.check('messages of every topic are stored', stream.topic, holds=stored[stream.topic] > 0)
     check_losses(found, bars)
     check_reports(found, bars)
-    sources = {
+    sources: dict[str, tuple[PastSource, KeptSource]] = {
         'the store': (StorePast(), StoreKept()),
         'the spool': (SpoolPast(found.node.home / 'spool', ROBOT), SpoolKept(found.node.home / 'spool', ROBOT)),
     }
@@ -501,8 +503,9 @@ def audit(found: Run, folder: Path, rng: random.Random, bars: Bars) -> None:
             with closing(PastReader(source, kept)) as reader:
                 for at_ns in at if where == 'the store' else at[:SPOOL_MOMENTS]:
                     check_page(found, where, reader, by, lines, at_ns, bars)
+        begins = {key: min(found.objects[name].on(by) for name in names) for key, names in found.keys.items()}
         for at_ns in at:
-            check_query(found, by, at_ns, bars)
+            check_query(found, by, begins, at_ns, bars)
         check_dataset(found, by, rng, bars)
         progress(f'looked at {len(at)} moments by {by}')
 
