@@ -24,7 +24,7 @@ def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> 
     with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
         earlier, known = deliveries.noted(), deliveries.known()
-        with progress('read back' if deep else 'asked for', known, of='objects') as bar:
+        with progress('read back' if deep else 'checked', known, of='objects') as bar:
             bar.have(earlier)
             found = audit(deliveries, store, deep=deep, tell=bar.have)
         said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)

@@ -335,7 +335,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
     object was selected.
     """
     if catalog and 'success' in flags:
-        raise BadUsage('a catalog does not say which missions failed', 'leave out --failed and --succeeded, or --catalog')
+        raise BadUsage('a catalog does not say which missions failed', 'omit --failed and --succeeded, or --catalog')
     with asking():
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake import verify as library  # noqa: PLC0415
@@ -357,7 +357,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
         asked = json.dumps([where, deep, catalog and str(catalog.resolve()), flags], sort_keys=True)
         with library.Unfinished(rows, the_home() / 'verify', asked, again=again) as left:
             earlier = left.earlier()
-            with progress('read back' if deep else 'asked for', len(rows), of='objects') as bar:
+            with progress('read back' if deep else 'checked', len(rows), of='objects') as bar:
                 bar.have(earlier)
                 found = audit(left, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
             if found.away is None:

@@ -52,7 +52,7 @@ RTSP_PORT = 8554
     '--name', 'names', multiple=True, metavar='HOST', help='Another name of this machine in addresses; may be repeated.'
 )
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
-              help='Limit of uploads in Mbit/s while somebody watches over the network; 0: no limit.')  # fmt: skip
+              help='Limit of uploads in Mbit/s while a viewer watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--rtsp', type=click.IntRange(0, 65535), is_flag=False, flag_value=RTSP_PORT, metavar='[PORT]',
               help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
@@ -89,7 +89,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
         raise BadUsage('this is the page of a store, which has no cameras', 'give --rtsp to the page of the robot')
     if robot_url is not None:
         if not is_of_store:
-            raise BadUsage(f'{folder} is a spool: this is the robot itself', 'leave out --robot-url')
+            raise BadUsage(f'{folder} is a spool: this is the robot itself', 'omit --robot-url')
         parts = urlsplit(robot_url)
         if parts.scheme not in ('http', 'https') or not parts.hostname or '@' in parts.netloc:
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')

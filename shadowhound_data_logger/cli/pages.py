@@ -118,8 +118,8 @@ SECTIONS: Final = (
         ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority', 'spool.remember_days'),
     ),
     Section(
-        'Keep on the robot, and upload what is asked for',
-        'What is `on_request` stays on the disk of the robot until somebody asks for it ([keep](keep.md)).',
+        'Keep on the robot, and upload what is requested',
+        'What is `on_request` stays on the disk of the robot until it is requested ([keep](keep.md)).',
         (
             'SENSOR.ship',
             'bag.ship',

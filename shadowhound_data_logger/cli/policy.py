@@ -140,7 +140,7 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
     """Replace keys that may have been stolen.
 
     By default those are targets.key and online.key.
-    Robots learn of it from the store. What somebody else signed with the old keys is no longer listed.
+    Robots learn of it from the store. What others signed with the old keys is no longer listed.
     """
     if (publics or threshold) and 'root' not in roles:
         raise BadUsage('--root-key and --threshold are of a new root', 'policy rotate root --root-key alice.pub')

@@ -116,7 +116,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         if like or like_text or model:
             if sql or order or bool(like) is bool(like_text):
                 raise BadUsage('--like FILE or --like-text TEXT asks for pictures, the most similar first',
-                               'leave out the other one, SQL and --order')  # fmt: skip
+                               'omit the other one, SQL and --order')  # fmt: skip
             found = most_similar(source, like, like_text, model, limit or SHOWN, left_out, flags)
             limit = limit or SHOWN
         else:

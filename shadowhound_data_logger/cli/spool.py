@@ -195,7 +195,7 @@ def _advice(what: set[tuple[str, str | None]], running: Sequence[str]) -> Iterat
         yield plain('No node runs here. Start one, or: shadowhound-data spool drain')
     for reason in reasons:
         if reason == MISSING:
-            yield plain('missing: somebody took these files out of the spool; they are tried again where they come back.')
+            yield plain('missing: these files were removed from the spool; they are tried again if they are restored.')
         else:
             yield plain(f'{reason}: once the cause is gone, shadowhound-data spool retry --reason {reason}')
     if any(state == State.HELD.value and reason == 'clock' for state, reason in what):

@@ -67,7 +67,7 @@ class SensorSettings:
         0.0, 'Rate at which it is published, to estimate losses where messages have no numbers; 0 learns it.', low=0.0, high=1e5
     )
     ship: str = _setting(
-        ALWAYS, 'Upload its objects always, or keep them on the robot and upload those that are asked for.', choices=SHIPS
+        ALWAYS, 'Upload its objects always, or keep them on the robot and upload those that are requested.', choices=SHIPS
     )
     counter: str = _setting(
         '', 'Field that counts messages or milliseconds, such as tick, to estimate losses from it instead of from stamps.'
@@ -128,7 +128,7 @@ class SpoolSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeepSettings:
-    """What stays on the robot until somebody asks for it (``ship: on_request``)."""
+    """What stays on the robot until it is requested (``ship: on_request``)."""
 
     max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
@@ -140,8 +140,8 @@ class KeepSettings:
     preview_s: float = _setting(
         1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0
     )
-    poll_s: float = _setting(10.0, 'Seconds between two looks at what is asked for.', low=0.5, high=3600.0)
-    when: str = _setting('', 'Upload what is asked for only while this rule holds; empty: always.')
+    poll_s: float = _setting(10.0, 'Seconds between two looks at requests.', low=0.5, high=3600.0)
+    when: str = _setting('', 'Upload requested objects only while this rule is true; empty: always.')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,7 +221,7 @@ class BagSettings:
     )
     topics: tuple[str, ...] = _setting(('',), 'Topics to record; with neither topics nor a regex, those of the sensors.')
     regex: str = _setting('', 'Record also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
-    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    exclude: str = _setting('', 'Skip topics that match this, unless they are in topics.')
     slice_s: float = _setting(
         60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
     )
@@ -229,7 +229,7 @@ class BagSettings:
     compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
     priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
     ship: str = _setting(
-        ALWAYS, 'Upload bags always, or keep them on the robot and upload the slices that are asked for.', choices=SHIPS
+        ALWAYS, 'Upload bags always, or keep them on the robot and upload the slices that are requested.', choices=SHIPS
     )
 
 
@@ -239,7 +239,7 @@ class EventSettings:
 
     topics: tuple[str, ...] = _setting(('',), 'Topics to keep; with neither topics nor a regex, there are no events.')
     regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
-    exclude: str = _setting('', 'Leave out topics that match this, unless they are in topics.')
+    exclude: str = _setting('', 'Skip topics that match this, unless they are in topics.')
     pre_s: float = _setting(30.0, 'Seconds to keep from before a trigger.', low=0.0, high=3600.0, live=True)
     post_s: float = _setting(
         10.0, 'Seconds to keep after it; another trigger in that time prolongs the event.', low=0.0, high=3600.0, live=True
