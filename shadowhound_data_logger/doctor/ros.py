@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -52,6 +53,8 @@ NAME: Final = 'ros'
 WINDOW_S: Final = 2.5
 PEEK_S: Final = 1.2
 MAX_PEEKS: Final = 3
+MAX_SHOWN: Final = 8
+"""Topics that a result names."""
 MAX_NODES: Final = 3
 TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 """Below half of the expected rate; above a tenth that did not arrive."""
@@ -84,8 +87,9 @@ def check(context: Context) -> Iterator[Result]:
         pairs = [pair for sensor in sensors for pair in zip(sensor.topics, sensor.types, strict=False)]
         types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
+        others = [] if heard else list(ros_watch.published(node))
     if not heard:
-        yield from _nobody(context, names, listener)
+        yield from _nobody(context, names, listener, others)
         return
     for sensor in sensors:
         yield from _sensor(sensor, [heard[resolved[topic]] for topic in sensor.topics], context.rates_hz)
@@ -127,9 +131,15 @@ def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
         yield ok('ros.types', 'all message types can be received')
 
 
-def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None) -> Iterator[Result]:
-    """None of the topics is there: another domain, or no driver."""
+def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None, published: Sequence[str]) -> Iterator[Result]:
+    """None of the topics has a publisher: another namespace, another robot, another domain, or no driver.
+
+    ``published`` are the topics that have publishers in this domain.
+    """
     ours = domain_of(context.environ)
+    if published:
+        yield _other_topics(context, topics, published)
+        return
     theirs = [domain_of(driver.environ) for driver in processes(context.root, *DRIVERS) if driver.environ]
     others = [int(domain) for domain in dict.fromkeys([*theirs, *map(str, domains(context.root))]) if domain != ours]
     for domain in others[:MAX_PEEKS]:
@@ -147,6 +157,21 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
         "the robot's driver does not run, has lost the robot, or is in another domain or network",
         'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py ; echo $ROS_DOMAIN_ID  # the same everywhere?',
     )
+
+
+def _other_topics(context: Context, topics: Sequence[str], others: Sequence[str]) -> Result:
+    """What to do if other topics are published than the configured ones."""
+    last = {topic.removeprefix(context.namespace.rstrip('/')) for topic in topics}
+    spaces = Counter(other.removesuffix(name) for other in others for name in last if other.endswith(name))
+    shown = ', '.join(others[:MAX_SHOWN]) + (f' and {len(others) - MAX_SHOWN} more' if len(others) > MAX_SHOWN else '')
+    what = f'none of {", ".join(topics[:4])}, ... has a publisher, but these topics have: {shown}'
+    if spaces:
+        names = sorted(filter(None, spaces), key=lambda name: (-spaces[name], name)) or ['/']
+        several = f'  # one node for each of {", ".join(names)}' if len(names) > 1 else ''
+        remedy = f'ros2 run shadowhound_data_logger sensor_logger_node --ros-args -r __ns:={names[0]}{several}'
+        return error('ros.topics', what, f'the robot publishes in the namespace {names[0]}', remedy)
+    return error('ros.topics', what, 'this is another robot than the settings are for',
+                 'shadowhound-data init --output robot.yaml  # settings for the topics that are published')  # fmt: skip
 
 
 def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> list[str]:

@@ -12,6 +12,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from doctor.scene import Scene, expect
@@ -24,6 +25,7 @@ pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
 SENSORS = {'sensors': ['odom', 'imu', 'lidar']}
+ARM = {'sensors': ['wrist'], 'wrist.topics': ['wrist/joint_states'], 'wrist.types': ['sensor_msgs/msg/JointState']}
 ROBOTS = ('well', 'mute', 'soft', 'deaf', 'two', 'squatted', 'slow', 'unheard')
 RATES = {'odom': 20.0, 'imu': 20.0, 'point_cloud2': 20.0}
 
@@ -36,13 +38,17 @@ class Examined:
     robots: dict[str, list[Result]]
     elsewhere: list[Result]
     nowhere: list[Result]
+    unnamed: list[Result]
+    """Of a logger without a namespace."""
+    foreign: list[Result]
+    """Of a logger for another robot."""
 
 
-def examine(scene: Scene, namespace: str = '/') -> list[Result]:
+def examine(scene: Scene, namespace: str = '/', sensors: dict[str, Any] = SENSORS) -> list[Result]:
     """In this process, whose ROS is loaded once; the check itself is what a child of the doctor runs."""
     from shadowhound_data_logger.doctor import ros
 
-    context = make(scene.environ, role=scene.role, parameters=SENSORS, namespace=namespace, rates_hz=RATES, root=scene.root)
+    context = make(scene.environ, role=scene.role, parameters=sensors, namespace=namespace, rates_hz=RATES, root=scene.root)
     return list(ros.check(context))
 
 
@@ -62,12 +68,13 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examined]:
         scene.environ['ROS_DOMAIN_ID'] = str(domain)
         with ThreadPoolExecutor(len(ROBOTS)) as pool:
             found = dict(zip(ROBOTS, pool.map(lambda name: examine(scene, f'/{name}'), ROBOTS), strict=True))
+        unnamed, foreign = examine(scene), examine(scene, sensors=ARM)
         patch.setenv('ROS_DOMAIN_ID', str(other))
         scene.environ['ROS_DOMAIN_ID'] = str(other)
         nowhere = examine(scene, '/well')
         lines = ['head', f'   1: 00000000:{7400 + 250 * domain:04X} 00000000:0000 07']
         (scene.root / 'proc/net/udp').write_text('\n'.join(lines) + '\n')
-        yield Examined(domain, found, examine(scene, '/well'), nowhere)
+        yield Examined(domain, found, examine(scene, '/well'), nowhere, unnamed, foreign)
 
 
 def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,6 +132,18 @@ def test_a_wrong_domain(examined: Examined) -> None:
 def test_no_driver(examined: Examined) -> None:
     """Where nobody is anywhere, the guide's three questions are asked."""
     expect(findings(examined.nowhere), 'ros.topics', 'go2_driver', 'robot.launch.py', 'ROS_DOMAIN_ID')
+
+
+def test_the_robot_is_in_a_namespace(examined: Examined) -> None:
+    """As a driver of several robots publishes: the topics that are there are named, and how to log one robot's."""
+    expect(findings(examined.unnamed), 'ros.topics', '-r __ns:=/', 'one node for each of', '/well')
+    assert '/deaf/imu' in findings(examined.unnamed)[0].seen
+
+
+def test_it_is_another_robot(examined: Examined) -> None:
+    """With none of the configured topics in any namespace."""
+    expect(findings(examined.foreign), 'ros.topics', 'shadowhound-data init')
+    assert '/deaf/imu' in findings(examined.foreign)[0].seen
 
 
 @pytest.mark.long('a robot of its own')
