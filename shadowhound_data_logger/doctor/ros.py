@@ -137,8 +137,12 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
     ``published`` are the topics that have publishers in this domain.
     """
     ours = domain_of(context.environ)
-    if published:
-        yield _other_topics(context, topics, published)
+    shown = ', '.join(published[:MAX_SHOWN]) + f' and {len(published) - MAX_SHOWN} more' * (len(published) > MAX_SHOWN)
+    what = f'none of {", ".join(topics[:4])}, ... has a publisher, but these topics have: {shown}'
+    if names := _namespaces(context, topics, published):
+        several = f'  # one node for each of {", ".join(names)}' if len(names) > 1 else ''
+        remedy = f'ros2 run shadowhound_data_logger sensor_logger_node --ros-args -r __ns:={names[0]}{several}'
+        yield error('ros.topics', what, f'the robot publishes in the namespace {names[0]}', remedy)
         return
     theirs = [domain_of(driver.environ) for driver in processes(context.root, *DRIVERS) if driver.environ]
     others = [int(domain) for domain in dict.fromkeys([*theirs, *map(str, domains(context.root))]) if domain != ours]
@@ -151,6 +155,10 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
                 f'export ROS_DOMAIN_ID={domain}  # here and for the node',
             )
             return
+    if published:
+        remedy = 'shadowhound-data init --output robot.yaml  # settings for the topics that are published'
+        yield error('ros.topics', what, 'this is another robot than the settings are for', remedy)
+        return
     yield error(
         'ros.topics',
         f'nobody publishes any of {", ".join(topics[:4])}, ... in domain {ours}',
@@ -159,19 +167,11 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
     )
 
 
-def _other_topics(context: Context, topics: Sequence[str], others: Sequence[str]) -> Result:
-    """What to do if other topics are published than the configured ones."""
-    last = {topic.removeprefix(context.namespace.rstrip('/')) for topic in topics}
-    spaces = Counter(other.removesuffix(name) for other in others for name in last if other.endswith(name))
-    shown = ', '.join(others[:MAX_SHOWN]) + (f' and {len(others) - MAX_SHOWN} more' if len(others) > MAX_SHOWN else '')
-    what = f'none of {", ".join(topics[:4])}, ... has a publisher, but these topics have: {shown}'
-    if spaces:
-        names = sorted(filter(None, spaces), key=lambda name: (-spaces[name], name)) or ['/']
-        several = f'  # one node for each of {", ".join(names)}' if len(names) > 1 else ''
-        remedy = f'ros2 run shadowhound_data_logger sensor_logger_node --ros-args -r __ns:={names[0]}{several}'
-        return error('ros.topics', what, f'the robot publishes in the namespace {names[0]}', remedy)
-    return error('ros.topics', what, 'this is another robot than the settings are for',
-                 'shadowhound-data init --output robot.yaml  # settings for the topics that are published')  # fmt: skip
+def _namespaces(context: Context, topics: Sequence[str], published: Sequence[str]) -> list[str]:
+    """Where topics of these names are published, first the namespace with the most of them."""
+    names = {topic.removeprefix(context.namespace.rstrip('/')) for topic in topics}
+    found = Counter(other.removesuffix(name) or '/' for other in published for name in names if other.endswith(name))
+    return sorted(found, key=lambda name: (-found[name], name))
 
 
 def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> list[str]:
