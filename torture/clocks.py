@@ -19,7 +19,7 @@ import sys
 import time
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise, product
@@ -70,6 +70,8 @@ OPEN_NS: Final = round((BATCH_S + 1.5) * SECOND)
 """A kill takes at most the messages of so long; its rows may begin or end so far from the loss."""
 SHOWN_NS: Final = 8 * SECOND
 """A message this new must be shown at a moment; the page omits what is older than ten seconds."""
+IN_BAG_NS: Final = SECOND
+"""The page reads bags for 1.5 s before a moment."""
 AROUND_NS: Final = 3 * SECOND
 NEAR_S: Final = 0.5
 REPORTED_S: Final = 0.5
@@ -332,10 +334,12 @@ class Timeline:
         self.names = [name for _, name in pairs]
         self.of = dict(zip(self.names, self.times, strict=True))
 
-    def newest(self, at_ns: int) -> int | None:
-        """The time of the newest message at or before a moment."""
-        place = bisect_right(self.times, at_ns)
-        return self.times[place - 1] if place else None
+    def newest(self, at_ns: int, objects: Container[Name]) -> int | None:
+        """The time of the newest message at or before a moment; the page reads bags only shortly before it."""
+        for place in range(bisect_right(self.times, at_ns) - 1, -1, -1):
+            if self.names[place] in objects or at_ns - self.times[place] <= IN_BAG_NS:
+                return self.times[place]
+        return None
 
     def nearest_ns(self, at_ns: int) -> int:
         """How far the nearest message is."""
@@ -365,7 +369,7 @@ def check_page(found: Run, where: str, reader: PastReader, by: str, lines: Mappi
     shown = {topic: round(age_ms * 1e6) for topic, _, age_ms, _ in head['shown']}
     for topic, line in lines.items():
         slack_ns = slack_of(by, BY_TOPIC[topic])
-        due_ns = line.newest(at_ns - slack_ns)
+        due_ns = line.newest(at_ns - slack_ns, found.objects)
         if topic not in shown:
             text = f'{where} at {_place(found, at_ns)} by {by}: {topic} has one {((at_ns - (due_ns or 0)) / SECOND):.3f} s before'
             bars.check('page: the newest message of each topic is shown', text, holds=due_ns is None or at_ns - due_ns > SHOWN_NS)
