@@ -153,10 +153,11 @@ def test_no_go2_interfaces(scene: Scene, domain: int, tmp_path: Path) -> None:
     (tmp_path / 'go2_interfaces/__init__.py').write_text("raise ImportError('not sourced')")
     path = os.pathsep.join(filter(None, [str(tmp_path), scene.environ.get('PYTHONPATH')]))
     scene.environ |= {'PYTHONPATH': path, 'ROS_DOMAIN_ID': str(domain)}
-    scene.parameters |= SENSORS
+    scene.parameters |= {'sensors': ['odom', 'imu', 'states']}  # an IMU can also publish a standard message
     found = {result.check: result for result in scene.ask('ros')}
     assert found['ros.types'].severity is Severity.ERROR
-    assert 'go2_interfaces/msg/IMU' in found['ros.types'].seen
+    assert 'go2_interfaces/msg/Go2State' in found['ros.types'].seen
+    assert 'IMU' not in found['ros.types'].seen
     assert 'colcon build --packages-select go2_interfaces' in found['ros.types'].remedy
     assert 'ros.topics' in found  # and all else was asked as well
 
