@@ -62,8 +62,10 @@ BATCH_S: Final = 1.0
 KILLED: Final = (0.45, 0.55)
 """When the node is killed, as shares of the run."""
 KILLED_S: Final = 1.5
+LATEST_NS: Final = SECOND
+"""A message arrives so soon after it was sent, also where the machine stands still for a moment; the figures have the latest."""
 ARRIVED_NS: Final = SECOND // 4
-"""A message arrives so soon after it was sent; the tolerance of everything that is on the clock of arrival."""
+"""The tolerance of everything else that is on the clock of arrival: compared with the arrivals in the bags."""
 EXACT_NS: Final = SECOND // 1000
 """The tolerance of stamps where they are shown; in objects and bags they are exact."""
 OPEN_NS: Final = round((BATCH_S + 1.5) * SECOND)
@@ -196,8 +198,8 @@ def read_bags(found: Run, folder: Path, bars: Bars) -> None:
                 stamp_ns, sent_ns = found.published[name]
                 late_ns = message.log_ns - sent_ns
                 text = f'{name}: {message.publish_ns - stamp_ns} ns from its stamp, {late_ns} ns after it was sent'
-                is_sent = stream.by_arrival and 0 <= message.publish_ns - sent_ns <= ARRIVED_NS
-                bars.check(bar, text, holds=(message.publish_ns == stamp_ns or is_sent) and 0 <= late_ns <= ARRIVED_NS)
+                is_sent = stream.by_arrival and 0 <= message.publish_ns - sent_ns <= LATEST_NS
+                bars.check(bar, text, holds=(message.publish_ns == stamp_ns or is_sent) and 0 <= late_ns <= LATEST_NS)
                 bars.check('bags: no message twice', str(name), holds=name not in found.bag)
                 found.bag[name] = message.publish_ns, message.log_ns
 
@@ -238,7 +240,7 @@ def _check_object(found: Run, bars: Bars, stream: Skewed, key: str, metadata: Ma
         by_arrival += is_by_arrival
         text = f'{name} in {key}: dated {dated_ns - stamp_ns} ns from its stamp, {dated_ns - sent_ns} ns from when it was sent'
         bars.check('objects: each message is dated by its stamp, or by its arrival where stamps are not trusted', text,
-                   holds=not is_by_arrival or (stream.by_arrival and 0 <= dated_ns - sent_ns <= ARRIVED_NS))  # fmt: skip
+                   holds=not is_by_arrival or (stream.by_arrival and 0 <= dated_ns - sent_ns <= LATEST_NS))  # fmt: skip
         bars.check('objects: no message twice', str(name), holds=name not in found.objects)
         found.objects[name] = Stored(dated_ns, log_ns)
     found.keys[key] = [name for name, _ in messages]
