@@ -16,8 +16,8 @@ from shadowhound_data_logger.core.model import Taken
 
 log = logging.getLogger(__name__)
 
-MESSAGE_BYTES: Final = 256
-"""What CPython needs for a message beside its content: a tuple of five, the header of its bytes, integers, a place in a list."""
+MESSAGE_BYTES: Final = 304
+"""What CPython needs for a message beside its content: a tuple of eight, the header of its bytes, integers, a place in a list."""
 MAX_LATCHED_BYTES: Final = 64 << 20
 """Of all latched messages that a bag repeats."""
 MAX_PER_TOPIC: Final = 100

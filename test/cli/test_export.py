@@ -127,7 +127,7 @@ def test_a_drop_whose_upload_was_cut_off(machines: tuple[Machine, Machine], cutt
         a.ask('drop', 'one')
     cutting(1000)
     if files:
-        with pytest.raises(LakeError, match='another machine began to upload'):
+        with pytest.raises(LakeError, match='another machine started to upload'):
             b.add('three')
     assert {*a.ask('drop', 'one')} == {URL}
     assert b.add('three') == ['three']
@@ -143,7 +143,7 @@ def test_an_export_whose_upload_was_cut_off(machines: tuple[Machine, Machine], c
     with pytest.raises(CutOffError):
         a.add('two')
     cutting(1000)
-    with pytest.raises(LakeError, match='another machine began to upload'):
+    with pytest.raises(LakeError, match='another machine started to upload'):
         b.add('three')
     assert {*a.ask('drop', 'two')} == {URL}
     assert b.add('three') == ['three']

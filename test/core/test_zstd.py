@@ -17,7 +17,7 @@ sys.modules.update({'compression': compression, 'compression.zstd': zstd})
 for name in [name for name in sys.modules if name.startswith('backports')]:
     sys.modules[name] = None
 sys.version_info = (3, 14, 0, 'final', 0)
-for folder in ('mcap', 'bags'):
+for folder in ('formats.mcap', 'bags'):
     package = importlib.import_module(f'shadowhound_data_logger.{folder}')
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f'{package.__name__}.{module.name}')

@@ -31,7 +31,8 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.stores import open_store
 
-LIMIT_BYTES = 2 << 30
+LIMIT_BYTES = 3 << 30
+"""Of addresses: the threads of delta-rs reserve most of them. The commands use 0.2 GB of memory."""
 ROWS = [row('camera', NOON_NS + number * 10**9) for number in range(1, 4)]
 THEIRS = [row('camera', NOON_NS + number * 10**9, robot='tachi') for number in range(1, 4)]
 TEXTS = [each['topic'] for each in ROWS]
@@ -112,6 +113,7 @@ def test_every_command_goes_on_without_it(home: Path, tmp_path: Path, kind: str)
     """``lake verify``, ``fetch``, ``lake reindex`` and ``lake ingest``: the others are verified, fetched, known and ingested."""
     before = good(home)
     key = bad_parts.put(folder_store(home), BAD[kind]())
+    assert run(lake_command, home, 'ingest').return_value == 1, 'it names what it ingests now'
     verified = run(lake_command, home, 'verify', '--json')
     told = json.loads(verified.stdout)
     assert (verified.return_value, told['sound'], told['findings'], [one['key'] for one in told['left_out']]) == (
@@ -123,7 +125,7 @@ def test_every_command_goes_on_without_it(home: Path, tmp_path: Path, kind: str)
     known = json.loads(run(lake_command, home, 'reindex', '--robot', 'thor', '--json').stdout)
     assert known['added'] == 2, 'the two summaries have no rows'
     before = good(home)
-    assert run(lake_command, home, 'ingest').return_value == 1
+    assert run(lake_command, home, 'ingest').return_value == 0
     assert good(home) == before
 
 
@@ -172,17 +174,17 @@ def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None
 
 
 @pytest.mark.long('commands in little memory')
-def test_a_bomb_is_left_out_in_2_gb(home: Path) -> None:
-    """With no more memory than that, ``query`` and ``lake ingest`` end by themselves and name it."""
+def test_a_bomb_is_left_out_in_little_memory(home: Path) -> None:
+    """``query`` and ``lake ingest`` end normally and name it."""
     key = bad_parts.put(folder_store(home), bad_parts.bomb())
     for arguments in (('query', '--format', 'keys'), ('lake', 'ingest')):
-        ran = in_2_gb(home, *arguments)
+        ran = in_little_memory(home, *arguments)
         assert (ran.returncode, 'Traceback' in ran.stderr) == (1, False), ran.stderr
         assert f'{key} is left out: ' in ran.stderr
         shutil.rmtree(home / 'lake')
 
 
-def in_2_gb(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def in_little_memory(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environ = {**os.environ, 'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': ''}
     command = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *arguments]
     return subprocess.run(

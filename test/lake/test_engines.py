@@ -87,6 +87,7 @@ def test_the_page_has_all_engines() -> None:
 
 
 @pytest.mark.seaweedfs
+@pytest.mark.slow
 @pytest.mark.long('processes of engines')
 @pytest.mark.parametrize('name', ['duckdb', 'polars', 'pandas', 'daft', 'ray'])
 def test_an_engine_reads_the_tables(name: str, lake: tuple[str, dict[str, str]]) -> None:

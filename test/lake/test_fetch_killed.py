@@ -40,7 +40,7 @@ def body(number: int) -> bytes:
     return hashlib.sha256(str(number).encode()).digest() * (SIZE // 32)
 
 
-KEPT = re.compile(rf'\.fetch/(lock|files\.db)|{ROBOT}/_catalog/date=[\d-]+/{ROBOT}_\d+_mended_[0-9a-f]+\.jsonl\.zst')
+KEPT = re.compile(rf'\.fetch/(lock|files\.db)|{ROBOT}/_catalog/date=[\d-]+/{ROBOT}_\d+_backfilled_[0-9a-f]+\.jsonl\.zst')
 SUMS = {key: hashlib.sha256(body(number)).hexdigest() for number, key in enumerate(KEYS)}
 
 

@@ -16,6 +16,7 @@ from shadowhound_tower.embedded import Tower
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.policies import active, registry
+from shadowhound_data_logger.policies.smoke import ISOLATIONS
 
 pytestmark = [pytest.mark.seaweedfs, pytest.mark.long('an MLflow server, and a process for each smoke run')]
 
@@ -71,7 +72,9 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     assert [(row['policy'], row['active'], bool(row['why_not'])) for row in run(thor, 'list', '--json')['policies']] == [
         (first, True, False), (second, False, True)]  # fmt: skip
     run(thor, 'use', f'{name}@2')
-    assert run(thor, 'sync', '--json') == {'wanted': second, 'active': second, 'done': 'pinned', 'p99_ms': None,
+    pinned = run(thor, 'sync', '--json')
+    assert pinned.pop('isolation') in ISOLATIONS
+    assert pinned == {'wanted': second, 'active': second, 'done': 'pinned', 'p99_ms': None,
                                            'fetched_bytes': 0, 'begun_anew': 0, 'stale': ''}  # fmt: skip
     assert run(thor, 'unpin') == 'follows the registry again\n'
     run(thor, 'pin')
