@@ -902,6 +902,7 @@ def minute(store: ObjectStore, folder: Path) -> None:
     add_part(store, rows, 'minute', folder)
 
 
+@pytest.mark.slow
 def test_what_is_played_is_asked_for_ahead(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a recorded minute some six moments a second are shown at its own pace, though each takes 0.08 s more to be read."""
     monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
