@@ -225,7 +225,7 @@ class Watch:
 
 
 def _look(folder: Path) -> tuple[FoundFile, ...]:
-    """Every file of a bag; nothing changes while nobody writes it."""
+    """Every file of a bag; nothing changes unless a program writes it."""
     found = []
     for path in sorted(folder.rglob('*')):
         with suppress(FileNotFoundError):  # its recorder is at work

@@ -71,7 +71,10 @@ class Proposal:
 @click.option(
     '--namespace', default='/', show_default=True, help='Propose only topics below it, for the node of one of several robots.'
 )
-@click.option('--robot', help='Name of the robot, which begins every key  [default: the namespace, else the host name]')
+@click.option(
+    '--robot',
+    help='Name of the robot, which begins every key  [default: SHADOWHOUND_ROBOT, else the namespace, else the host name]',
+)
 @click.option('--force', is_flag=True, help='Overwrite the file.')
 @as_json
 def init(output: Path | None, seconds: float, namespace: str, robot: str | None, *, force: bool, as_json: bool) -> ExitCode:
@@ -82,13 +85,15 @@ def init(output: Path | None, seconds: float, namespace: str, robot: str | None,
     """
     if output is not None and output.exists() and not force:
         raise BadUsage(f'{output} exists', 'name another file, or overwrite it with --force')
-    name = robot or re.sub(r'[^A-Za-z0-9_-]', '_', namespace.strip('/') or socket.gethostname()).strip('_-') or 'robot'
+    namespace = '/' + namespace.strip('/')
+    of_machine = re.sub(r'[^A-Za-z0-9_-]', '_', namespace.strip('/') or socket.gethostname()).strip('_-') or 'robot'
+    name = robot or os.environ.get('SHADOWHOUND_ROBOT') or of_machine
     if not is_name(name):
         raise BadUsage(f'{name!r} is not a name of a robot', '--robot NAME, of letters, digits, - and _')
     if find_spec('rclpy') is None:
         raise DataLoggerError('rclpy cannot be imported', remedy='source ROS in this shell: . /opt/ros/humble/setup.bash')
     click.echo(f'listening for {seconds:g} s ...', err=True)
-    found = _proposals(seconds, '/' + namespace.strip('/'), name)
+    found = _proposals(seconds, namespace, name)
     text = '\n'.join(_yaml(found, name, namespace)) + '\n'
     if output is not None:
         output.write_text(text, encoding='utf-8')
@@ -182,7 +187,9 @@ def _yaml(found: Sequence[Proposal], robot: str, namespace: str) -> Iterator[str
     yield '#'
     yield f'#   ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file FILE{below}'
     yield '#'
-    yield f'# About {sum(known):,.0f} MB an hour as proposed, from one message and the rate of each topic as measured just now.'
+    missing = len(logged) - len(known)
+    unknown = f'; unknown for {missing} topics without a message that could be encoded' * (missing > 0)
+    yield f'# About {sum(known):,.0f} MB per hour as proposed, from one message and the rate of each topic{unknown}.'
     yield '/**:'
     yield '  ros__parameters:'
     yield f'    robot: {json.dumps(robot)}'
@@ -204,7 +211,7 @@ def _measured(each: Proposal) -> str:
     text = f'{printable(each.topic)} ({printable(each.type)}), '
     text += f'{each.rate_hz:.1f} Hz, {each.bytes / 1000:,.1f} KB a message' if each.bytes else 'no message came while listening'
     if each.mb_per_hour is not None and each.sensor is not None:
-        text += f'; stored {"once an hour" if each.sensor.on_change else "at this rate"}: {each.mb_per_hour:,.1f} MB an hour'
+        text += f'; stored {"once an hour" if each.sensor.on_change else "at this rate"}: {each.mb_per_hour:,.1f} MB per hour'
     return text
 
 

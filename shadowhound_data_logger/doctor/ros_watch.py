@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 from shadowhound_data_logger.core.type_rules import NOT_LOGGED
+from shadowhound_data_logger.node.intake.consumers import is_plain_name
 from shadowhound_data_logger.ros.endpoints import Endpoint, HistoryDepth, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
 from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
@@ -95,13 +96,16 @@ def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) ->
 
 
 def published(of: Node, within: str = '/') -> dict[str, list[Endpoint]]:
-    """Each topic with publishers whose name begins with a namespace, once the graph has been quiet for a moment."""
+    """Each topic with publishers whose name starts with a namespace, once the graph has been quiet for a moment.
+
+    Names that are invalid in ROS are skipped: any participant chooses them, and they would end up in commands and files.
+    """
     end = time.monotonic() + DISCOVER_S
     found: dict[str, list[Endpoint]] = {}
     quiet_since = time.monotonic()
-    while (now := time.monotonic()) < end or now - quiet_since < SETTLE_S:
-        names = [name for name, _ in of.get_topic_names_and_types() if name.startswith(f'{within.rstrip("/")}/')]
-        seen = {name: endpoints(of, name) for name in names if name not in NOT_LOGGED}
+    while (now := time.monotonic()) < end or (now - quiet_since < SETTLE_S and now < end + DISCOVER_S):
+        named = [name for name, _ in of.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
+        seen = {name: endpoints(of, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
         if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
             found, quiet_since = seen, now
         time.sleep(POLL_S)

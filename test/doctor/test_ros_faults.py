@@ -140,6 +140,17 @@ def test_the_robot_is_in_a_namespace(examined: Examined) -> None:
     assert '/deaf/imu' in findings(examined.unnamed)[0].seen
 
 
+def test_no_command_has_a_name_that_is_invalid_in_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another participant of DDS chooses the names of its topics."""
+    from shadowhound_data_logger.doctor import ros_watch
+
+    names = ['/robot0/odom', '/$(reboot)/odom', '/a;b/odom', '/a b/odom', '/a\nb/odom', '/rosout', '/_hidden/odom']
+    here = SimpleNamespace(get_topic_names_and_types=lambda: [(name, ['a/msg/B']) for name in names])
+    monkeypatch.setattr(ros_watch, 'endpoints', lambda *_: [SimpleNamespace(type='a/msg/B')])
+    monkeypatch.setattr(ros_watch, 'DISCOVER_S', 0.1)
+    assert list(ros_watch.published(here)) == ['/robot0/odom']
+
+
 def test_it_is_another_robot(examined: Examined) -> None:
     """With none of the configured topics in any namespace."""
     expect(findings(examined.foreign), 'ros.topics', 'shadowhound-data init')

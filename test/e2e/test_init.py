@@ -53,7 +53,7 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
     topics = {given[name]['topics'][0] for name in given['sensors']}
     assert topics == {f'{NS}/{name}' for name in SENT if name != 'led'}
     assert {'imu', 'odom', 'joints'} <= set(given['sensors']), 'the names of the default sensors'
-    assert 'MB an hour' in next(line for line in text.splitlines() if f'{NS}/scan' in line)
+    assert 'MB per hour' in next(line for line in text.splitlines() if f'{NS}/scan' in line)
     assert init(shared, '--output', str(path)).returncode == 2, 'it does not overwrite'
 
     node = shared.node(seaweed.environment(), None, '--params-file', str(path), '-r', f'__ns:={NS}', robot='')
