@@ -32,7 +32,6 @@ from shadowhound_data_logger.formats.rows.labels import LABELS
 from shadowhound_data_logger.formats.rows.schema import DOUBLE, FORGOTTEN, INT32, INT64, KEPT, OBJECTS, STRING, TIME, TableSchema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.stores.credentials import with_keys
 from shadowhound_data_logger.stores.s3_obstore import proxy_options
 
 BUCKET: Final = 'lake'
@@ -279,7 +278,10 @@ def storage_options(settings: StoreSettings) -> dict[str, str]:
         'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
         'connect_timeout': '5s', 'timeout': '60s', 'retry_timeout': '60s', **proxy_options(settings.endpoint_url or ''),
     }  # fmt: skip
-    settings = with_keys(settings)
+    if not settings.access_key_id:
+        from shadowhound_data_logger.stores.credentials import with_keys  # noqa: PLC0415 - botocore takes a while
+
+        settings = with_keys(settings)
     if settings.access_key_id and settings.secret_access_key:
         options |= {'AWS_ACCESS_KEY_ID': settings.access_key_id, 'AWS_SECRET_ACCESS_KEY': settings.secret_access_key}
     if settings.session_token:

@@ -326,6 +326,13 @@ def test_the_help_imports_no_verb() -> None:
     assert not {'rich', 'numpy', 'pyarrow', 'sqlite3.dbapi2', 'mcap'} & {name.partition('.')[0] for name in names}
 
 
+def test_a_query_of_a_folder_imports_no_s3_client() -> None:
+    """The S3 client botocore takes a quarter of the time of a query."""
+    code = 'import sys; from shadowhound_data_logger.lake import labels, names, query, values; print(*sys.modules)'
+    names = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {'botocore', 'boto3', 'matplotlib', 'pandas'} & {name.partition('.')[0] for name in names}
+
+
 # -- the robot ---------------------------------------------------------------------------------------------------------
 
 
