@@ -50,10 +50,10 @@ def commits(root: Path, group: int, size: int) -> dict[str, float]:
 def pending(root: Path, rows: int) -> dict[str, float]:
     """Milliseconds of asking for 16 objects, of a commit of one, and of a start, with that many objects waiting."""
     spool = opened(root)
-    with spool._index.transaction():  # without the syncing of commits, which is not what is measured here
+    with spool._connections.transaction() as index:  # without the syncing of commits, which is not what is measured here
         for number in range(rows):
             item = make(number)
-            spool._index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
+            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
             path = root / 'ready' / item.bucket / item.key
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(item.body)

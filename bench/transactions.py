@@ -96,7 +96,7 @@ def measured(root: Path, objects: int, size: int, period_s: float, seconds: floa
     descriptor = os.open(root / 'raw', os.O_WRONLY | os.O_CREAT, 0o600)
     os.pwrite(descriptor, bytes(1 << 20), 0)
     os.fsync(descriptor)
-    with timed(spool._index) as found:
+    with timed(spool._connections.writing) as found:
         end = perf_counter() + seconds
         while perf_counter() < end:
             begun, before = perf_counter(), log.stat().st_size
@@ -116,22 +116,22 @@ def measured(root: Path, objects: int, size: int, period_s: float, seconds: floa
 def asked(root: Path) -> dict[str, object]:
     """How long the transactions are in which a request for very many objects is accepted, ended and forgotten."""
     spool: Spool = opened(root)
-    with spool._index.transaction():
-        spool._index._db.executemany(
+    with spool._connections.writing.transaction():
+        spool._connections.writing._db.executemany(
             'INSERT INTO objects (bucket, key, state, priority, protected, waits_for, on_request, event, mission, sensor, topic,'
             " type, samples, bytes, sha256, content_type, metadata, t_start_ns, t_end_ns, created_ns)"
             " VALUES ('sensor-data', ?, 'kept', 5, 0, 'upload.when', 1, 0, '', 'camera',"
             " '/camera', 't', 1, 50000, '0', 'image/jpeg', '{}', 1, 1, 1)",
             ((f'thor/camera/{number:08d}.jpg',) for number in range(ASKED)),
         )  # fmt: skip
-    chosen = [(item.id, item.bytes) for item in spool.kept()]
+    chosen = [(item.id, item.bytes) for item in spool.requests.selectable()]
     row = RequestRow(id='0' * 32, requester='bench', priority=5, made_ns=1, expires_ns=1 << 62, received_ns=1, wanted='{}')
-    with timed(spool._index) as found:
+    with timed(spool._connections.writing) as found:
         begun = perf_counter()
-        row = spool.accept(row, chosen)
+        row = spool.requests.accept(row, chosen)
         accepted_s = perf_counter() - begun
-        spool.close_request(row.id, CANCELLED)
-        spool.accept(row, [])
+        spool.requests.close(row.id, CANCELLED)
+        spool.requests.accept(row, [])
     spool.close()
     return {'objects': row.objects, 'accepted_s': accepted_s, 'transactions': len(found.held), 'held_ms': spread(found.held),
             'over_bar': sum(held > BAR_MS for held in found.held)}  # fmt: skip

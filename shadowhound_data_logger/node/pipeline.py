@@ -306,7 +306,7 @@ class Pipeline:
         self._link: LinkTrack | None = None
         settings = self._settings
         ships = {settings.bag.ship, *(sensor.ship for sensor in settings.sensors)}
-        if ON_REQUEST not in ships and not self.spool.has_kept():
+        if ON_REQUEST not in ships and not (self.spool.kept.bytes() or self.spool.requests.is_any_open()):
             return
         sweep(settings.home, settings.robot)
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)

@@ -181,7 +181,7 @@ class RequestServer:
         """One look at everything; whether there is more to do. Raises OSError or sqlite3.Error where the spool is of no use."""
         now_s = self._monotonic()
         if not self._is_clear:
-            self._spool.clear_requests()
+            self._spool.requests.clear_unfinished()
             self._is_clear = True
         with suppress(StoreError):  # which says how many answers there were; it is asked again
             while self._asked_here:
@@ -191,23 +191,23 @@ class RequestServer:
             self._poll_at_s = now_s + self._settings.poll_s
             self._poll()
             self._look()
-        rows = self._spool.requests()
+        rows = self._spool.requests.rows()
         now_ns = self._clock.wall_ns()
         for row in rows:
             if row.is_open and row.expires_ns <= now_ns:
-                self._spool.close_request(row.id, EXPIRED)
+                self._spool.requests.close(row.id, EXPIRED)
         rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
         is_busy = self._may_send() and self._release(rows) | self._cut({row.id for row in rows})
-        for row in self._spool.requests():
+        for row in self._spool.requests.rows():
             if row.told != row.state or row.is_open:
                 self._answer(row)
         if now_s >= self._tidy_at_s:
             self._tidy_at_s = now_s + TIDY_S
-            self._spool.forget_requests(now_ns - REMEMBER_NS)
-            asking, known = {row.requester for row in rows}, {row.id for row in self._spool.requests()}
+            self._spool.requests.forget(now_ns - REMEMBER_NS)
+            asking, known = {row.requester for row in rows}, {row.id for row in self._spool.requests.rows()}
             self._served = {name: served for name, served in self._served.items() if name in asking}
             self._answering = {name: number for name, number in self._answering.items() if name in known}
-            while self._spool.evict_old():
+            while self._spool.kept.evict_old():
                 pass
         return self._thin() | is_busy
 
@@ -234,7 +234,7 @@ class RequestServer:
 
     def _look(self) -> None:
         """At how much is asked for."""
-        count, size = self._spool.awaited()
+        count, size = self._spool.requests.awaited()
         mbps = self._mbps()
         self.status = RequestStatus(count, size, mbps, round(8e-6 * size / mbps) if mbps else None)
 
@@ -269,7 +269,7 @@ class RequestServer:
 
     def _handle_requests(self, reads: Sequence[PullRequest | PullCancel]) -> bool:
         """Whether all of it is done. Raises StoreError."""
-        known = {row.id: row for row in self._spool.requests()}
+        known = {row.id: row for row in self._spool.requests.rows()}
         new, cancels = dict[str, PullRequest](), []
         for read in reads:
             row = known.get(read.id)
@@ -278,8 +278,8 @@ class RequestServer:
             elif row is None or (not row.is_open and row.told == row.state and read.made_ns != row.made_ns):
                 new.setdefault(read.id, read)
         if (beyond := len(known) + len(new) - MAX_REQUESTS) > 0:
-            self._spool.forget_requests(self._clock.wall_ns(), beyond)
-            known = {row.id: row for row in self._spool.requests()}
+            self._spool.requests.forget(self._clock.wall_ns(), beyond)
+            known = {row.id: row for row in self._spool.requests.rows()}
         room = max(0, MAX_REQUESTS - len(known))
         if len(new) > room:
             self._refuse('too_many', 'too many requests are open')
@@ -287,7 +287,7 @@ class RequestServer:
         for cancel in cancels:
             row = known.get(cancel.id)
             if row is not None and row.is_open and cancel.made_ns > row.made_ns:
-                self._spool.close_request(cancel.id, CANCELLED)
+                self._spool.requests.close(cancel.id, CANCELLED)
         return len(new) <= min(AT_A_TIME, room)
 
     def _accept(self, new: Sequence[PullRequest], known: Mapping[str, RequestRow]) -> Iterator[RequestRow]:
@@ -298,7 +298,7 @@ class RequestServer:
                    for request in new}  # fmt: skip
         chosen: dict[str, list[tuple[int, int]]] = {request.id: [] for request in new}
         gone: dict[str, list[KeptObject]] = {request.id: [] for request in new}
-        for item in self._spool.kept():
+        for item in self._spool.requests.selectable():
             for request in new:
                 if request.want.takes(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
                     if item.is_here:
@@ -310,7 +310,7 @@ class RequestServer:
         now_ns = self._clock.wall_ns()
         for request in new:
             is_late = request.expires_ns <= now_ns
-            row = self._spool.accept(RequestRow(
+            row = self._spool.requests.accept(RequestRow(
                 id=request.id, requester=request.by, priority=request.priority, made_ns=request.made_ns,
                 expires_ns=request.expires_ns, received_ns=now_ns, wanted=json.dumps(request.want.to_json()),
                 state=REFUSED if is_late else ACTIVE, why='it has expired already' if is_late else '',
@@ -337,11 +337,11 @@ class RequestServer:
         """Let the next objects wait for delivery; whether there are any."""
         mbps = self._mbps()
         window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), MIN_WINDOW), MOST_WINDOW)
-        count, size = self._spool.released()
+        count, size = self._spool.requests.released()
         if not rows or count > WINDOW // 2 or size > window // 2:
             return False
         room, room_bytes = WINDOW - count, window - size
-        queues = {row.id: deque(self._spool.next_requested(row.id, room)) for row in rows}
+        queues = {row.id: deque(self._spool.requests.waiting(row.id, room)) for row in rows}
         chosen: dict[int, int] = {}
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
             number, size, is_cut = queues[row.id].popleft()
@@ -355,12 +355,12 @@ class RequestServer:
                 room_bytes -= size
                 self._served[row.requester] += size / (10 - row.priority)
         if chosen:
-            self._released(self._spool.release(list(chosen.items())))
+            self._released(self._spool.kept.release(list(chosen.items())))
         return bool(chosen)
 
     def _begin_cut(self, row: RequestRow) -> None:
         """Unless one is being made: of the oldest bag of which a request wants parts of slices."""
-        if self._cutting is not None or not (slices := self._spool.to_cut(row.id)):
+        if self._cutting is not None or not (slices := self._spool.requests.to_cut(row.id)):
             return
         folder = slices[0].key.rpartition('/')[0]
         wanted = json.loads(row.wanted)
@@ -405,12 +405,12 @@ class RequestServer:
         self._released(placed)
 
     def _set_cut(self, row: RequestRow, cut: SliceCut, places: Sequence[tuple[str, str]]) -> None:
-        size = self._spool.set_cut(row.id, [each.id for each in cut.slices], places)
+        size = self._spool.requests.set_cut(row.id, [each.id for each in cut.slices], places)
         self._served[row.requester] += size / (10 - row.priority)
 
     def _send_whole(self, row: RequestRow, cut: SliceCut, error: Exception) -> None:
         log.warning('%d slices are sent whole, since they cannot be cut: %s', len(cut.slices), error)
-        self._spool.set_complete(row.id, [each.id for each in cut.slices])
+        self._spool.requests.set_complete(row.id, [each.id for each in cut.slices])
 
     def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
         """Of the requester who was served least, the most important request, of these the oldest."""
@@ -429,16 +429,16 @@ class RequestServer:
         """Spool the next answer of a request, if one is due."""
         if self._answering.get(row.id, 0) > row.answers:
             return
-        if row.is_open and self._spool.is_over(row.id):
-            self._spool.close_request(row.id, DONE)
+        if row.is_open and self._spool.requests.is_over(row.id):
+            self._spool.requests.close(row.id, DONE)
             self._finished()
             row = replace(row, state=DONE)
         now_ns = self._clock.wall_ns()
         if row.told == row.state and (not row.is_open or now_ns - row.told_ns < TELL_S * SECOND):
             return
         if not row.is_open:
-            self._spool.let_go(row.id)
-        progress = self._spool.progress(row.id)
+            self._spool.requests.let_go(row.id)
+        progress = self._spool.requests.progress(row.id)
         if not row.is_open and progress.outcomes.get('pending'):
             return  # what was released goes on its way, and the last answer tells of it
         number = row.answers + 1

@@ -54,7 +54,7 @@ class Thinner:
 
         Raises OSError or sqlite3.Error.
         """
-        return bool(self._least_hz) and self._spool.is_short_to_keep() and next(self._work)
+        return bool(self._least_hz) and self._spool.kept.is_short() and next(self._work)
 
     def _all(self) -> Iterator[bool]:
         after = told_ns = 0
@@ -83,7 +83,7 @@ class Thinner:
                 window = sorted(left, key=lambda item: item.id)
 
     def _window(self, after: int) -> list[ThinnableObject]:
-        found = self._spool.thinnable(after, WINDOW)
+        found = self._spool.kept.thinnable(after, WINDOW)
         return [item for item in found if item.t_start_ns < found[0].t_start_ns + HOUR_NS or item is found[0]]
 
     def _halved(self, item: ThinnableObject) -> ThinnableObject | None:
@@ -93,7 +93,7 @@ class Thinner:
             if item.path.exists():  # not evicted meanwhile
                 log.warning('%s cannot be thinned: %s', item.path, error)
             return None
-        return None if thinned is None else self._spool.thin(item, thinned)
+        return None if thinned is None else self._spool.kept.thin(item, thinned)
 
     def _halve_frames(self, frames: Sequence[ThinnableObject]) -> list[ThinnableObject]:
         """Every second one goes; what may lose half once more."""
@@ -101,5 +101,5 @@ class Thinner:
         span_ns = span_of(len(ordered), ordered[0].t_start_ns, ordered[-1].t_start_ns)
         if not may_halve(len(ordered), span_ns, self._least_hz):
             return []
-        self._spool.thin_out(ordered[1::2])
+        self._spool.kept.evict(ordered[1::2])
         return ordered[::2]

@@ -1,9 +1,9 @@
-"""The durable spool: what ``commit`` returned survives the death of the process and a power cut (docs/decisions/0001).
+"""The durable spool: what ``commit`` returned survives a kill of the process and a power cut (docs/decisions/0001).
 
 A group commit writes and syncs the payloads as ``incoming/<session>-<any>.body``, then commits one index transaction that holds
-the new objects, the outcomes of deliveries and the accounts, and makes ``incoming/<id>.part`` of the files, then renames the
-parts to their final names. The transaction is the only commit point, so objects and ledger cannot disagree; a rename that did
-not happen is completed by recovery. It waits for the disk once, when it is committed: no file is written or synced in it.
+the new objects, the outcomes of deliveries and the accounts, and renames the files to ``incoming/<id>.part``; then the parts
+get their final names. The transaction is the only commit point, so objects and ledger cannot disagree; recovery completes a
+rename that did not happen. No file is written or synced inside the transaction: it waits for the disk once, at COMMIT.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ import errno
 import logging
 import os
 import sqlite3
-import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -32,51 +31,40 @@ from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast, is_disk_full
+from shadowhound_data_logger.spool.connections import Connections
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
-from shadowhound_data_logger.spool.index import Index, lost
+from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.keeping import KEEP, KeptObjects
 from shadowhound_data_logger.spool.object_table import spooled
 from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
-from shadowhound_data_logger.spool.request_table import (
-    PIECE,
-    KeptObject,
-    KeptSlice,
-    Progress,
-    RequestRow,
-    RequestTable,
-    WaitingObject,
-)
-from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, evict_old, fits, is_short, make_room, thin_out
+from shadowhound_data_logger.spool.requests import Requests
+from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, is_short, make_room
 from shadowhound_data_logger.spool.session import Session, carry
-from shadowhound_data_logger.spool.thinning import ThinnableObject, Thinned, thin
 from shadowhound_data_logger.spool.usage import usage_of
 
 log = logging.getLogger(__name__)
 
 CLOSE_S: Final = 10.0
-"""For a commit that is under way when the spool is closed."""
+"""How long ``close`` waits for a running commit."""
 PUT_BACK_S: Final = 2.5
-"""For a process that lives to put back an index that was deleted under it: it commits each second."""
+"""How long a starting process waits for a running one to put back a deleted index: the running one commits once per second."""
 DAY_NS: Final = 24 * 3600 * SECOND
 FULL_ROWS_NS: Final = 3600 * SECOND
-"""For so long the index keeps all that it knows of an object that left the spool; then its key, size, checksum and state."""
-SHORT_PART, SHORT_BYTES = 32, 64 << 20
-"""Where less is left than such a part of the room for what is kept, or so many bytes, it runs short."""
+"""How long the index keeps the full row of an object that left the spool; afterwards only key, size, checksum and state."""
 MOST_OBJECTS: Final = 32
-"""To be committed at a time: their rows take some 5 ms, for which other processes wait."""
-KEEP: Final = KeepSettings()
-LAST: Final = '\x7f'
-"""After everything that a key has."""
+"""Per commit: their rows take about 5 ms, during which other processes wait."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
 
 class Spool:
     """The durable queue on disk: objects, their states and the accounts, in one transaction.
 
-    Life: New; open once; commit, pending, ... from any thread; close once.
+    Lifecycle: new; open once; commit, pending, ... from any thread; close once. ``requests`` and ``kept`` are the parts of its
+    state that concern objects kept on the robot.
 
-    ``_lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
+    ``_connections.lock`` guards the writing connection and makes a commit and its renames one step for ``pending``.
     """
 
     def __init__(self, root: Path, settings: SpoolSettings, clock: Clock, robot: str, keep: KeepSettings = KEEP) -> None:
@@ -88,15 +76,13 @@ class Spool:
         self._clock = clock
         self._robot = robot
         self._tree = Tree(root)
-        self._lock = threading.Lock()
-        self._index = Index(root / 'index.db')
-        self._view = Index(root / 'index.db', read_only=True)
-        self._lost: list[Index] = []
-        """Views of indexes that were deleted."""
+        self._connections = Connections(root)
         self._session: Session | None = None
         self._compacted_ns = self._forgot_ns = 0
         self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
+        self.requests = Requests(self._connections, self._tree, robot)
+        self.kept = KeptObjects(self._connections, self._tree, self._ballast, settings, keep, clock)
         self._repeats = Repeats()
 
     def open(self) -> None:
@@ -111,43 +97,42 @@ class Spool:
             log.warning('spool %s: %s', self.root, self.recovery.describe())
 
     def close(self) -> None:
-        """Commit the last accounts and end the session; idempotent. Raises SpoolError when the disk does not take them.
+        """Commit the last accounts and end the session; idempotent. Raises SpoolError if they cannot be written.
 
-        Where the index is lost or damaged the accounts cannot be kept: it is closed, and raises SpoolError.
+        If the index is lost or damaged, the accounts cannot be saved: the spool is closed and SpoolError is raised.
         """
         session = self._session
         if session is None:
             return
         with suppress(OSError, sqlite3.Error):
-            self._keep_index()
-        with self._lock_within(CLOSE_S):
-            lost = self.accounts.drop_open('shutdown')
-            if lost:
+            self._connections.keep_in_place()
+        with self._connections.lock_within(CLOSE_S):
+            if lost := self.accounts.drop_open('shutdown'):
                 log.error('%d messages were still in memory when the spool %s was closed', lost, self.root)
             snapshot = self.accounts.snapshot({})
             try:
-                self._ballast.work(lambda: session.end(self._index, snapshot, self._clock.wall_ns()))
+                self._ballast.work(lambda: session.end(self._connections.writing, snapshot, self._clock.wall_ns()))
             except (OSError, sqlite3.OperationalError) as error:
                 self.accounts.mark_dirty()
                 raise self.unwritable(error) from error
             except sqlite3.DatabaseError as error:
                 self._leave(session)
                 raise SpoolError(f'the index of the spool {self.root} is damaged: {error}',
-                                 remedy='start again: it is rebuilt from the files then') from error  # fmt: skip
+                                 remedy='restart: the index is then rebuilt from the files') from error  # fmt: skip
             self._leave(session)
 
     def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (),
                rows: Sequence[RecordingRows] = (), *, leave_files: bool = False) -> list[SpooledObject]:  # fmt: skip
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
-        It does not cut what it is given: all is one transaction, for which other processes wait (``MOST_OBJECTS``).
-        ``leave_files``: files of what is delivered or evicted wait for ``remove_files``, which may take longer than the commit.
-        Raises OSError or sqlite3.OperationalError when nothing of it became durable; the caller tries again. Objects
-        for which there is no room at all are recorded as evicted, those whose file is gone as quarantined.
+        Everything is one transaction, for which other processes wait: pass at most ``MOST_OBJECTS`` objects. With ``leave_files``
+        the files of delivered and evicted objects remain until ``remove_files``, which may take longer than the commit.
+        Raises OSError or sqlite3.OperationalError if none of it became durable; the caller tries again. Objects for which there
+        is no room are recorded as evicted, those whose file is missing as quarantined.
         """
-        self._keep_index()
-        with staged(self._tree, self._session.number if self._session else 0, objects) as ready:
-            with self._lock:
+        self._connections.keep_in_place()
+        with staged(self._tree, self._connections.session, objects) as ready:
+            with self._connections.lock:
                 placed = self._ballast.work(lambda: self._commit(ready, outcomes, rows))
                 self._ballast.keep(self._tree.free_bytes, self._settings.min_free_bytes)
             remove_sources(self._tree, objects, ready)
@@ -156,7 +141,7 @@ class Spool:
         return placed
 
     def remove_files(self, outcomes: Iterable[Outcome]) -> None:
-        """Let the files of committed outcomes follow their rows; after a kill the next start does it."""
+        """Move or delete the files of committed outcomes; after a kill, the next startup does it."""
         for outcome in outcomes:
             item = outcome.item
             if outcome.state is State.QUARANTINED:
@@ -165,36 +150,38 @@ class Spool:
                 self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
 
     def fits(self, objects: Sequence[DataObject]) -> bool:
-        """Whether there is room for all of them before anything leaves the disk. Raises OSError."""
+        """Whether there is room for all of them without deleting anything first. Raises OSError."""
         return fits(self._tree, objects)
 
     def is_short(self, objects: Sequence[DataObject]) -> bool:
-        """Whether something would have to leave the disk for them. Raises OSError."""
+        """Whether something must be evicted to make room for them. Raises OSError."""
         return is_short(self._tree, self._settings, objects)
 
     def knows(self, bucket: str, key: str, sha256: str) -> bool:
-        """Whether this content was spooled under this (wanted) key, whatever became of it: a source of it is not needed any more.
+        """Whether this content was spooled under this (wanted) key, whatever became of it: its source is no longer needed.
 
-        Waits for no commit; what left the spool ``remember_days`` ago is forgotten. Raises sqlite3.Error.
+        Waits for no commit; objects that left the spool ``spool.remember_days`` ago are forgotten. Raises sqlite3.Error.
         """
-        return binding.knows(self._view, bucket, key, sha256)
+        return binding.knows(self._connections.reading, bucket, key, sha256)
 
     def unwritable(self, error: OSError | sqlite3.Error) -> SpoolError:
-        """What a failed commit means to an operator."""
-        full = os.strerror(errno.ENOSPC)  # in one word, whoever found it: it is told once
+        """The error to show an operator after a failed commit."""
+        full = os.strerror(errno.ENOSPC)  # one text for SQLite's and the kernel's error, so that it is logged once
         reason = full if is_disk_full(error, self.root) else getattr(error, 'strerror', None) or error
         return SpoolError(f'the spool {self.root} cannot be written: {reason}', remedy='is its disk full, read-only or broken?')
 
     def pending(self, limit: int, *, exclude: Collection[int] = (), oldest: bool = False,
                 without: Sequence[str] = (), waiting_for: Collection[str] = ()) -> list[SpooledObject]:  # fmt: skip
-        """Up to ``limit`` objects to ship: the most important first, or the oldest first.
+        """Up to ``limit`` objects to ship, by priority or oldest first.
 
-        ``exclude`` are ids already in somebody's hands, ``without`` buckets that cannot take anything now, ``waiting_for``
-        settings that do not hold (``model.waits_for``).
+        Skips the ids ``exclude`` (in progress), the buckets ``without`` (unreachable now), and objects that wait for one of the
+        settings ``waiting_for`` (``model.waits_for``).
         """
-        with self._lock:
-            rows = self._index.objects.pending(limit + len(exclude), oldest=oldest, without=without, waiting_for=waiting_for)
-        parts = frozenset(self._tree.incoming.iterdir())  # one question for all, because nearly none is there
+        with self._connections.lock:
+            rows = self._connections.writing.objects.pending(
+                limit + len(exclude), oldest=oldest, without=without, waiting_for=waiting_for
+            )
+        parts = frozenset(self._tree.incoming.iterdir())  # one listing for all objects: it is nearly always empty
         found: list[SpooledObject] = []
         for row in rows:
             if row['id'] not in exclude and len(found) < limit:
@@ -205,8 +192,8 @@ class Spool:
         return found
 
     def has(self, bucket: str, key: str) -> bool:
-        """Whether the name is taken. Waits for no commit; raises sqlite3.Error."""
-        return self._view.objects.has(bucket, key)
+        """Whether the key is taken. Waits for no commit; raises sqlite3.Error."""
+        return self._connections.reading.objects.has(bucket, key)
 
     @property
     def evicted(self) -> int:
@@ -214,268 +201,90 @@ class Spool:
         return self._shortage.evicted
 
     def states(self, bucket: str, prefix: str) -> dict[str, State]:
-        """What became of every object whose key begins so, by key. Waits for no commit; raises sqlite3.Error."""
-        return {row['key']: State(row['state']) for row in self._view.objects.with_prefix(bucket, prefix)}
+        """The states of all objects whose keys start with ``prefix``, by key. Waits for no commit; raises sqlite3.Error."""
+        return {row['key']: State(row['state']) for row in self._connections.reading.objects.with_prefix(bucket, prefix)}
 
     def gaps_after(self, version: int, limit: int, offsets: Mapping[str, int]) -> tuple[list[Gap], list[Watermark]]:
-        """What changed in the gap journal since this version, and up to when that is complete, both of one instant.
+        """The changes of the gap journal since this version, and up to when it is complete, both at one instant.
 
-        About ``limit`` rows: the watermarks hold once no further row is left. ``offsets`` as of ``ClockRecord.offsets``. Waits
-        for no commit; raises SpoolError or sqlite3.Error.
+        Returns about ``limit`` rows: the watermarks are valid when no further row is left. ``offsets`` are those of
+        ``ClockRecord.offsets``. Waits for no commit; raises SpoolError or sqlite3.Error.
         """
-        with closing(Index(self.root / 'index.db', read_only=True)) as index:
-            index.open()
-            with index.snapshot():
-                return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
-
-    @property
-    def owner(self) -> str:
-        """Whose sessions and recordings are its own."""
-        return self._robot
-
-    def recordings(self) -> list[RecordingRows]:
-        """Bags of this owner that are not whole yet. Waits for no commit; raises sqlite3.Error."""
-        return self._view.recordings.rows(self._robot)
-
-    def free_bytes(self) -> int:
-        """What this user may still write to the spool's file system. Raises OSError."""
-        return self._tree.free_bytes()
-
-    def has_room(self) -> bool:
-        """Whether a bag may go on: it leaves so much free that what it has written still gets into the spool."""
-        return self.free_bytes() >= self._settings.min_free_bytes // 2
-
-    def carry(self, sink: str) -> None:
-        """Carry over what this robot's ended sessions left open in a sink. Call it once, before anything is counted there."""
-        with self._lock:
-            if self._session is not None:
-                with self._index.transaction():
-                    rows = carry(self._index, self._session.number, self._robot, sink)
-                self.accounts.carry(rows)
-
-    def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
-        """What has no final name yet for this reason, the oldest first; waits for no commit. Raises sqlite3.Error."""
-        return self._view.objects.held(reason, limit)
-
-    def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
-        """Give held objects their final (made unique) keys, all or none; returns those that may be shipped now.
-
-        What is not held any more is left out. Raises NameRefused, OSError or sqlite3.OperationalError when nothing was bound.
-        Waits for a recovery, another process's start: that would take the files of what is not committed for its own.
-        """
-        with flock(self.root / 'recovery.lock'), self._lock:
-            return self._ballast.work(lambda: binding.bind(self._index, self._tree, bindings, self._clock.wall_ns()))
-
-    # -- what is kept until somebody asks for it -------------------------------------------------------------------
+        with self._connections.snapshot() as index:
+            return index.gaps.changed(version, limit, offsets), index.gaps.watermarks()
 
     @property
     def unkept(self) -> int:
-        """Objects that this process could not keep, because nothing that is kept may be evicted."""
+        """Objects that this process could not keep, because no kept object may be evicted."""
         return self._shortage.unkept
 
-    def has_kept(self) -> bool:
-        """Whether anything is kept, or anybody waits for an answer; waits for no commit. Raises sqlite3.Error."""
-        return self._view.kept.bytes() > 0 or bool(self._view.requests.open_ids())
+    @property
+    def owner(self) -> str:
+        """The robot whose sessions and recordings this spool continues."""
+        return self._robot
 
-    def requests(self) -> list[RequestRow]:
-        """All that is known of what was asked for; waits for no commit. Raises sqlite3.Error."""
-        return self._view.requests.rows()
+    def recordings(self) -> list[RecordingRows]:
+        """Bags of this robot that are not complete yet. Waits for no commit; raises sqlite3.Error."""
+        return self._connections.reading.recordings.rows(self._robot)
 
-    def progress(self, request: str) -> Progress:
-        """What became of what a request found; waits for no commit. Raises sqlite3.Error."""
-        return self._view.requests.progress(request)
+    def free_bytes(self) -> int:
+        """Bytes that this user may still write to the spool's file system. Raises OSError."""
+        return self._tree.free_bytes()
 
-    def is_over(self, request: str) -> bool:
-        """Whether a request waits for nothing; waits for no commit. Raises sqlite3.Error."""
-        return self._view.requests.is_over(request)
+    def has_room(self) -> bool:
+        """Whether a bag may continue: enough space must be left to spool what it has already written."""
+        return self.free_bytes() >= self._settings.min_free_bytes // 2
 
-    def next_requested(self, request: str, limit: int) -> list[WaitingObject]:
-        """What a request still waits for and nobody has released, the oldest first. Raises sqlite3.Error."""
-        return self._view.requests.waiting(request, limit)
+    def carry(self, sink: str) -> None:
+        """Take over the messages of a sink that this robot's earlier sessions left open. Call it once, before the sink counts."""
+        with self._connections.lock:
+            if self._session is not None:
+                index = self._connections.writing
+                with index.transaction():
+                    rows = carry(index, self._session.number, self._robot, sink)
+                self.accounts.carry(rows)
 
-    def to_cut(self, request: str) -> list[KeptSlice]:
-        """Kept slices of which a request wants a part, the oldest first. Raises sqlite3.Error."""
-        return [KeptSlice(number, key, self._tree.path(State.KEPT, None, bucket, key), sha256, metadata)
-                for number, bucket, key, sha256, metadata in self._view.requests.to_cut(request)]  # fmt: skip
+    def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
+        """Objects without a final name for this reason, oldest first; waits for no commit. Raises sqlite3.Error."""
+        return self._connections.reading.objects.held(reason, limit)
 
-    def released(self) -> tuple[int, int]:
-        """Requested objects that wait for delivery, and their bytes. Raises sqlite3.Error."""
-        return self._view.requests.released()
+    def bind(self, bindings: Sequence[Binding]) -> list[SpooledObject]:
+        """Give held objects their final, unique keys, all or none; returns those that may be shipped now.
 
-    def awaited(self) -> tuple[int, int]:
-        """Open requests, and the bytes that they wait for and nobody has released. Raises sqlite3.Error."""
-        return self._view.requests.awaited()
-
-    def kept(self) -> Iterator[KeptObject]:
-        """What is kept of this robot, was released and is on its way, or is lost since an hour. Waits for no commit.
-
-        Raises sqlite3.Error.
+        Skips objects that are no longer held. Raises NameRefused, OSError or sqlite3.OperationalError if none was bound.
         """
-        with closing(Index(self.root / 'index.db', read_only=True)) as index:
-            index.open()
-            yield from index.requests.known(self._robot)
-
-    def accept(self, row: RequestRow, chosen: Sequence[tuple[int, int]]) -> RequestRow:
-        """Make a request a row, with the (id, bytes) that it chose of what is kept; returns the row as it is then.
-
-        Fewer bytes than an object has are of a slice that is cut. Raises as ``commit``; before the row nothing of it counts.
-        """
-        self._in_pieces(lambda table: table.clear(row.id))
-        for begin in range(0, len(chosen), PIECE):
-            with self._lock, self._index.transaction():
-                self._index.requests.add(row.id, chosen[begin : begin + PIECE])
-        with self._lock, self._index.transaction():
-            return self._index.requests.accept(row)
-
-    def close_request(self, request: str, state: str, why: str = '') -> None:
-        """End a request; what it has not released is free to go. Raises as ``commit``."""
-        with self._lock, self._index.transaction():
-            self._index.requests.close(request, state, why)
-        self.let_go(request)
-
-    def let_go(self, request: str) -> None:
-        """Of a request that is over: what it has not released is free to go. Raises as ``commit``."""
-        self._in_pieces(lambda table: table.let_go(request))
-
-    def set_complete(self, request: str, ids: Collection[int]) -> None:
-        """These slices cannot be cut: the request wants all of them. Raises as ``commit``."""
-        with self._lock, self._index.transaction():
-            self._index.requests.set_complete(request, ids)
-
-    def set_cut(self, request: str, ids: Collection[int], places: Iterable[tuple[str, str]]) -> int:
-        """A request waits for these (bucket, key) in place of the slices that they were cut out of; returns their bytes.
-
-        Raises as ``commit``.
-        """
-        with self._lock, self._index.transaction():
-            rows = [row for bucket, key in places if (row := self._index.objects.row(bucket, key)) is not None]
-            self._index.requests.set_cut(request, ids, [(row['id'], row['bytes'], row['state']) for row in rows])
-        return sum(row['bytes'] for row in rows)
-
-    def forget_requests(self, before_ns: int, most: int | None = None) -> None:
-        """Drop those that were answered before then, the first ones first, ``most`` at most. Raises as ``commit``."""
-        for request in self._view.requests.answered(before_ns, most):
-            self._in_pieces(lambda table: table.clear(request))  # noqa: B023 - called at once
-            with self._lock, self._index.transaction():
-                self._index.requests.forget(request)
-
-    def clear_requests(self) -> None:
-        """Drop what a process left that died while it accepted a request. Raises as ``commit``."""
-        self._in_pieces(RequestTable.clear_unfinished)
-
-    def _in_pieces(self, step: Callable[[RequestTable], bool]) -> None:
-        """Until it says that there is no more to do; others have their turn between two."""
-        more = True
-        while more:
-            with self._lock, self._index.transaction():
-                more = step(self._index.requests)
-
-    def release(self, wanted: Sequence[tuple[int, int]]) -> list[SpooledObject]:
-        """Let kept objects (id, priority) wait for delivery, all or none. As ``bind``, what is not kept any more is left out."""
-        with flock(self.root / 'recovery.lock'), self._lock:
-            return self._ballast.work(lambda: binding.release(self._index, self._tree, wanted))
-
-    def evict_old(self) -> int:
-        """Evict what was kept for long enough, some of it at a time; returns how many objects. Raises OSError, sqlite3.Error."""
-        with self._lock:
-            return evict_old(self._index, self._tree, self._keep, self._clock.wall_ns())
-
-    def is_short_to_keep(self) -> bool:
-        """Whether little room is left for what is kept, by its limit or by the disk: so much as to thin what is there in time."""
-        kept = self._view.kept.bytes()
-        most = min(self._keep.max_bytes, kept + self._tree.free_bytes() - self._settings.min_free_bytes)
-        return kept > 0 and kept > most - min(max(most // SHORT_PART, SHORT_BYTES), most // 4)
-
-    def thinnable(self, after: int, limit: int) -> list[ThinnableObject]:
-        """What is kept and nobody asked for, with a larger number than ``after``, in their order; waits for no commit."""
-        return [ThinnableObject.of(row, self._tree) for row in self._view.kept.thinnable(after, limit)]
-
-    def thin(self, item: ThinnableObject, thinned: Thinned) -> ThinnableObject | None:
-        """Give a kept object less content; it, or None where it went or was asked for meanwhile. Raises as ``commit``."""
-        with flock(self.root / 'recovery.lock'), self._lock:
-            session = self._session.number if self._session else 0
-            return self._ballast.work(lambda: thin(self._index, self._tree, session, item, thinned, self._clock.wall_ns()))
-
-    def thin_out(self, items: Sequence[ThinnableObject]) -> int:
-        """Evict some of what is kept since others of its time stay; returns how many went. Raises OSError, sqlite3.Error."""
-        with self._lock:
-            return thin_out(self._index, self._tree, {item.id: item.sha256 for item in items}, self._clock.wall_ns())
+        with self._connections.moving_files() as index:
+            return self._ballast.work(lambda: binding.bind(index, self._tree, bindings, self._clock.wall_ns()))
 
     def pending_count(self) -> int:
-        """Waits for no commit."""
-        return sum(row[2] for row in self._view.overview.tally() if row[1] == State.PENDING.value)
+        """How many objects wait for delivery; waits for no commit. Raises sqlite3.Error."""
+        return sum(row[2] for row in self._connections.reading.overview.tally() if row[1] == State.PENDING.value)
 
     def has_uncataloged(self) -> bool:
-        """Whether a delivered object is in no part of the catalog yet. Waits for no commit."""
-        return bool(self._view.catalog.uncataloged(1))
+        """Whether a delivered object is not in the catalog yet; waits for no commit. Raises sqlite3.Error."""
+        return bool(self._connections.reading.catalog.uncataloged(1))
 
     def usage(self) -> SpoolStatus:
-        """What lies here now; waits for no commit. Raises OSError or sqlite3.Error."""
-        return usage_of(self._view, self.root, self._clock.wall_ns())
+        """What the spool contains now; waits for no commit. Raises OSError or sqlite3.Error."""
+        return usage_of(self._connections.reading, self.root, self._clock.wall_ns())
 
     @contextmanager
     def drain_lock(self) -> Iterator[bool]:
-        """Held by the one process that ships; yields False when another one has it."""
+        """The lock of the one process that ships; yields False if another process has it."""
         with flock(self.root / 'drain.lock', wait=False) as mine:
             yield mine
 
     @contextmanager
     def node_lock(self) -> Iterator[bool]:
-        """Held by the one node that takes this robot's messages: a second one would count and store them again."""
+        """The lock of the one node that takes this robot's messages; a second one would count and store them again."""
         with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
 
-    def _keep_index(self) -> None:
-        """Put the index back where somebody deleted it, or go over to the copy that another process has put there.
-
-        Raises sqlite3.DatabaseError where another index is in its place, OSError.
-        """
-        session = self._session
-        if session is None or self._index.is_in_place():
-            return
-        with flock(self.root / 'recovery.lock'), self._lock:
-            if self._index.is_in_place():
-                return
-            path = self.root / 'index.db'
-            copy, view = Index(path), Index(path, read_only=True)
-            try:
-                first = self._index.accounts.first_session()
-                if not path.exists():
-                    self._index.put_back()
-                    log.error('the spool index %s was deleted: it is put back', path)
-                copy.open()
-                is_copy = copy.accounts.first_session() == first and session.number in copy.accounts.sessions(ended=False)
-                view.open()
-            except sqlite3.Error as error:
-                copy.close()
-                raise lost(path) from error
-            if not is_copy:
-                copy.close()
-                view.close()
-                raise lost(path)
-            self._index.close()
-            self._index = copy
-            self._lost.append(self._view)  # other threads may be in the middle of a question
-            self._view = view
-
     def _leave(self, session: Session) -> None:
-        for view in self._lost:
-            view.close()
-        self._lost.clear()
-        self._view.close()
-        self._index.close()
+        self._connections.close()
         session.leave()
         self._session = None
-
-    @contextmanager
-    def _lock_within(self, seconds: float) -> Iterator[None]:
-        """The lock, unless a commit hangs in the disk: the next start then ends the session."""
-        if not self._lock.acquire(timeout=seconds):
-            raise SpoolError(f'the spool {self.root} cannot be closed: its disk does not answer', remedy='is it broken?')
-        try:
-            yield
-        finally:
-            self._lock.release()
+        self._connections.session = 0
 
     # -- under the lock --------------------------------------------------------------------------------------------
 
@@ -484,13 +293,14 @@ class Spool:
             self._tree.create()
             self._wait_for_index()
             with flock(self.root / 'recovery.lock'):
-                self._index = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
-                self._view.open()
-                self._session = Session.begin(self._index, self._tree, self._robot, self._clock)
-                self.accounts = _continued(self._index, self._robot, self._clock)
+                self._connections.writing = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
+                self._connections.reading.open()
+                self._session = Session.begin(self._connections.writing, self._tree, self._robot, self._clock)
+                self._connections.session = self._session.number
+                self.accounts = _continued(self._connections.writing, self._robot, self._clock)
         except (OSError, sqlite3.Error):
-            self._index.close()
-            self._view.close()
+            self._connections.writing.close()
+            self._connections.reading.close()
             raise
 
     def _wait_for_index(self) -> None:
@@ -503,24 +313,24 @@ class Spool:
                 rows: Sequence[RecordingRows]) -> list[SpooledObject]:  # fmt: skip
         now_ns = self._clock.wall_ns()
         leaving = sum(outcome.item.size + OVERHEAD_BYTES for outcome in outcomes if outcome.state is not State.QUARANTINED)
-        room = make_room(self._index, self._tree, self._settings, self._keep, objects, leaving, now_ns)
+        room = make_room(self._connections.writing, self._tree, self._settings, self._keep, objects, leaving, now_ns)
         self._shortage.note(room, now_ns)
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
-        session = self._session.number if self._session else 0
-        with closing(Adding(self._index, self._tree, self._repeats, session, now_ns)) as adding:
+        session = self._connections.session
+        with closing(Adding(self._connections.writing, self._tree, self._repeats, session, now_ns)) as adding:
             try:
                 staged_objects = adding.stage(objects, room.given_up)
-                with self._index.transaction(undo=adding.discard):
+                with self._connections.writing.transaction(undo=adding.discard):
                     for place, item in enumerate(staged_objects):
                         if self._takes(item):
                             adding.add(item, fits=place not in room.given_up)
                     for outcome in outcomes:
-                        self._index.objects.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                        self._connections.writing.objects.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
-                        self._index.recordings.write(self._robot, each)
+                        self._connections.writing.recordings.write(self._robot, each)
                     if snapshot is not None and self._session is not None:
-                        self._index.accounts.write(self._session.number, snapshot)
+                        self._connections.writing.accounts.write(self._session.number, snapshot)
                     self._tidy(now_ns)
                     adding.take()
             except BaseException:
@@ -531,7 +341,7 @@ class Spool:
 
     def _takes(self, item: DataObject) -> bool:
         """Whether nothing else says what an object of bookkeeping says; in the transaction with its row."""
-        index = self._index
+        index = self._connections.writing
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
         return index.catalog.take_uncataloged(item.catalogs) and index.catalog.take_unreported(item.tells)
@@ -542,8 +352,8 @@ class Spool:
         The writing connection is asked: the reading one tells of no later commit while another thread is half through its answer.
         """
         try:
-            with flock(self.root / 'recovery.lock', wait=False) as mine, self._lock:
-                if mine and self._index.objects.state(item.id) is State.QUARANTINED:
+            with flock(self.root / 'recovery.lock', wait=False) as mine, self._connections.lock:
+                if mine and self._connections.writing.objects.state(item.id) is State.QUARANTINED:
                     source = self._tree.waiting(item.id, item.bucket, item.key)
                     self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:
@@ -555,9 +365,9 @@ class Spool:
         While there is more to do, each commit does a step of it.
         """
         if not 0 <= now_ns - self._compacted_ns < 60 * SECOND:
-            self._compacted_ns = now_ns if self._index.history.compact(now_ns - FULL_ROWS_NS) else 0
+            self._compacted_ns = now_ns if self._connections.writing.history.compact(now_ns - FULL_ROWS_NS) else 0
         if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND:
-            done = self._index.history.forget(now_ns - round(self._settings.remember_days * DAY_NS))
+            done = self._connections.writing.history.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0
 
 

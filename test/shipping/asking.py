@@ -110,7 +110,7 @@ class Desk:
         for _ in range(60):
             self.step()
             self.deliver()
-            if not self.spool.released()[0] and not any(row.is_open for row in self.spool.requests()):
+            if not self.spool.requests.released()[0] and not any(row.is_open for row in self.spool.requests.rows()):
                 break
         self.step()
 

@@ -174,7 +174,7 @@ def test_a_slice_that_cannot_be_cut_is_sent_whole(desk: Desk, damage: str) -> No
     desk.step()
     desk.step()
     assert [item.key.rpartition('/')[2] for item in desk.released] == [f'{BAG}_1.mcap']
-    assert {row.id: row.objects for row in desk.spool.requests()} == {request: 1}
+    assert {row.id: row.objects for row in desk.spool.requests.rows()} == {request: 1}
 
 
 def test_a_request_that_is_taken_back_ends_its_cut(desk: Desk) -> None:
@@ -185,7 +185,7 @@ def test_a_request_that_is_taken_back_ends_its_cut(desk: Desk) -> None:
     desk.step()
     desk.step()
     assert list((desk.root.parent / CUTTING).rglob('*.mcap.open'))
-    desk.spool.close_request(request, 'cancelled')
+    desk.spool.requests.close(request, 'cancelled')
     desk.finish()
     assert desk.answers(request)[-1]['outcomes']['unsent']['objects'] == 1
     assert {row['state'] for row in rows(desk.root) if row['sensor'] == 'bag'} == {'kept'}

@@ -222,17 +222,17 @@ def test_what_is_forgotten_is_in_no_watermark_that_is_told_again(spool: Spool, r
     hear(spool, 26, 27, 28)
     store(spool, 'b', samples=3)
     spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in spool.commit(writer(root).parts())])
-    with spool._index.transaction():
-        assert spool._index.gaps.forget(NOON_NS + SECOND * 27 // 10, 100)
+    with spool._connections.writing.transaction():
+        assert spool._connections.writing.gaps.forget(NOON_NS + SECOND * 27 // 10, 100)
         if is_of_older_version:
-            spool._index._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
+            spool._connections.writing._db.execute('UPDATE gaps SET to_ns = NULL WHERE begin_ns = ?', (FORGOTTEN,))
     (mark,) = told(writer(root).parts())
     assert (mark['from_ns'], mark['to_ns']) == (NOON_NS + SECOND * 2, NOON_NS + SECOND * 28 // 10), 'it was told'
     resend_gaps(root)
     (mark,) = told(writer(root).parts())
     begin_ns = NOON_NS + (SECOND * 2 if is_of_older_version else SECOND * 26 // 10)
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == ('complete', begin_ns, NOON_NS + SECOND * 28 // 10)
-    (total,) = [gap for gap in spool._index.gaps.known({}) if gap.begin_ns == FORGOTTEN]
+    (total,) = [gap for gap in spool._connections.writing.gaps.known({}) if gap.begin_ns == FORGOTTEN]
     assert (total.count, total.from_ns, total.to_ns) == (5, None, None), 'a sum has no time'
 
 
@@ -245,15 +245,15 @@ def test_no_watermark_covers_what_was_forgotten_before_it_was_told(
     hear(spool, 26, 27, 28)
     store(spool, 'b', samples=3)
     monkeypatch.setattr(gap_table, 'MOST_ROWS', 0)
-    with spool._index.transaction():
-        assert spool._index.gaps.forget(0, 100)
+    with spool._connections.writing.transaction():
+        assert spool._connections.writing.gaps.forget(0, 100)
     (mark,) = told(writer(root).parts())
     assert (mark['what'], mark['from_ns'], mark['to_ns']) == (
         'complete',
         NOON_NS + SECOND * 26 // 10,
         NOON_NS + SECOND * 28 // 10,
     )
-    (total,) = spool._index.gaps.known({})
+    (total,) = spool._connections.writing.gaps.known({})
     assert (total.count, total.from_ns, total.to_ns) == (5, None, None)
 
 

@@ -61,7 +61,7 @@ def test_asking_twice_is_asking_once(desk: Desk) -> None:
     desk.step()
     desk.step()
     assert len(desk.answers(first)) == before
-    assert len(desk.spool.requests()) == 1
+    assert len(desk.spool.requests.rows()) == 1
 
 
 @pytest.mark.parametrize(('want', 'numbers'), [
@@ -241,14 +241,14 @@ def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path
         request = desk.ask(sensor='camera')
         with pytest.raises(OSError, match='it died'):
             desk.step()
-        assert desk.spool.requests() == []
-        assert len(desk.spool.next_requested(request, 100)) == 8
+        assert desk.spool.requests.rows() == []
+        assert len(desk.spool.requests.waiting(request, 100)) == 8
     desk.entries.clear()
     desk.write(encode_inbox([]))  # the requester took it out again
     desk.open()
     with closing(desk.spool):
         desk.step()
-        assert desk.spool.next_requested(request, 100) == []
+        assert desk.spool.requests.waiting(request, 100) == []
         request = desk.ask(sensor='camera')
         desk.finish()
         assert desk.answers(request)[-1]['outcomes'] == {'delivered': {'objects': 10, 'bytes': 60}}
@@ -325,7 +325,7 @@ def test_many_requests_are_remembered_and_the_first_ones_forgotten(desk: Desk, m
         desk.deliver()
         desk.step()
         desk.deliver()
-    assert len(desk.spool.requests()) <= 4
+    assert len(desk.spool.requests.rows()) <= 4
     desk.ask(by='other', sensor='camera')
     desk.finish()
     assert desk.state(1) == 'delivered'

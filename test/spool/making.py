@@ -164,6 +164,6 @@ def reopened(opened: Callable[[], Spool], root: Path) -> dict[str, int]:
 
 def abandon(spool: Spool) -> None:
     """Leave a spool as a process that dies does."""
-    spool._index.close()
+    spool._connections.writing.close()
     assert spool._session is not None
     os.close(spool._session._lock)

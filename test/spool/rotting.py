@@ -32,7 +32,7 @@ def new_base(root: Path) -> dict[str, bytes]:
     put(spool, make('thor/book.json', bodies['thor/book.json'], topic=None, protected=True))
     settle(spool, items[0], State.DELIVERED)
     settle(spool, items[1], State.QUARANTINED, 'refused')
-    spool._index._db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    spool._connections.writing._db.execute('PRAGMA wal_checkpoint(TRUNCATE)')
     (part,) = put(spool, make('thor/part.jpg', bodies['thor/part.jpg']))
     os.replace(part.path, root / 'incoming' / f'{part.id}.part')  # its rename had not happened yet
     (root / 'incoming/99.part').write_bytes(b'never committed')

@@ -257,7 +257,7 @@ def test_a_binding_that_a_dead_process_began_is_gone_on_with(opened: Open, root:
 def test_what_is_held_is_found_without_looking_at_the_rest(spool: Spool) -> None:
     """A hundred thousand delivered objects cost it nothing."""
     asked: list[str] = []
-    spool._view._db.set_trace_callback(asked.append)
+    spool._connections.reading._db.set_trace_callback(asked.append)
     spool.held('clock')
-    plan = spool._index._db.execute(f'EXPLAIN QUERY PLAN {asked[0]}').fetchall()
+    plan = spool._connections.writing._db.execute(f'EXPLAIN QUERY PLAN {asked[0]}').fetchall()
     assert [row[3] for row in plan] == ['SEARCH objects USING INDEX held (reason=?)']

@@ -66,7 +66,7 @@ def test_a_file_that_cannot_be_linked_is_copied(
     """One of another file system, or of one without links, is copied before the spool's lock is taken."""
 
     def refuse(*_: object) -> None:
-        assert not spool._lock.locked()
+        assert not spool._connections.lock.locked()
         raise OSError(code, 'no link')
 
     monkeypatch.setattr(os, 'link', refuse)

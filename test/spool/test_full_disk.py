@@ -231,7 +231,7 @@ def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.Mo
 
 def test_an_index_that_may_not_grow(spool: Spool, root: Path) -> None:
     """When SQLite itself finds the disk full, the spool goes on once there is space."""
-    index = spool._index
+    index = spool._connections.writing
     pages = index._db.execute('PRAGMA page_count').fetchone()[0]
     index._db.execute(f'PRAGMA max_page_count = {pages}')
     objects = [make(f'{number}', metadata={'padding': 'x' * 1500}) for number in range(40)]
@@ -261,8 +261,8 @@ def test_a_commit_that_fails_at_its_end(spool: Spool, root: Path) -> None:
         def __getattr__(self, name: str) -> Any:
             return getattr(self.connection, name)
 
-    connection = spool._index._connection
-    spool._index._connection = Refusing(connection)  # type: ignore[assignment, arg-type]
+    connection = spool._connections.writing._connection
+    spool._connections.writing._connection = Refusing(connection)  # type: ignore[assignment, arg-type]
     with pytest.raises(sqlite3.OperationalError, match='locked'):
         put(spool, make())
     assert files(root) == {}

@@ -196,7 +196,7 @@ def test_a_pattern_that_somebody_changed(started: Callable[..., Run], pattern: s
     run.take({}, {'key_pattern': 'x'})
     one = run.spool.held('clock')[0]
     broken = {**one.metadata, 'key_pattern': pattern}
-    run.spool._index._db.execute('UPDATE objects SET metadata = ? WHERE id = ?', (json.dumps(broken), one.id))
+    run.spool._connections.writing._db.execute('UPDATE objects SET metadata = ? WHERE id = ?', (json.dumps(broken), one.id))
     clocks.set()
     keys = [item.key for item in run.redating.step()]
     assert len(keys) == 2
@@ -271,7 +271,7 @@ def test_a_held_object_that_has_a_date(started: Callable[..., Run], root: Path, 
     """Whatever made it, it does not wait for ever: it goes as it is once the clock is set."""
     run = started()
     run.take()
-    run.spool._index._db.execute('UPDATE objects SET t_start_ns = ?', (NOON_NS,))
+    run.spool._connections.writing._db.execute('UPDATE objects SET t_start_ns = ?', (NOON_NS,))
     assert run.redating.step() == []
     clocks.set()
     assert [item.key for item in run.redating.step()] == ['thor/_unsynced/this-boot/camera/00000060_000_camera.jpg']

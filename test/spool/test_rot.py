@@ -84,8 +84,8 @@ def test_a_row_whose_text_is_damaged(opened: Open, root: Path) -> None:
     """Damage inside a row, which SQLite cannot see, does not stop the delivery of all others: the index is rebuilt."""
     spool = opened()
     put(spool, make('a'), make('b'))
-    with spool._index.transaction():
-        spool._index._db.execute("UPDATE objects SET metadata = '{\"sha' WHERE key = 'a'")
+    with spool._connections.writing.transaction():
+        spool._connections.writing._db.execute("UPDATE objects SET metadata = '{\"sha' WHERE key = 'a'")
     spool.close()
     spool = opened()
     assert spool.recovery.counts['damaged index rebuilt'] == 1
@@ -96,8 +96,8 @@ def test_a_ledger_that_does_not_close_is_told(opened: Open, root: Path, caplog: 
     """A total that was damaged in the index is said at every start, and costs nothing else."""
     spool = opened()
     put(spool, make('a'))
-    with spool._index.transaction():
-        spool._index._db.execute("UPDATE tally SET samples = samples + 1 WHERE state = 'pending'")
+    with spool._connections.writing.transaction():
+        spool._connections.writing._db.execute("UPDATE tally SET samples = samples + 1 WHERE state = 'pending'")
     spool.close()
     spool = opened()
     assert dict(spool.recovery.counts) == {'sums of the ledger that do not close': 1}

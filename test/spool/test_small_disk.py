@@ -138,7 +138,7 @@ def test_a_disk_that_takes_nothing(
     monkeypatch.setattr(worker, 'LONGEST_PAUSE_S', 0.01)
     monkeypatch.setattr(ballast, 'BALLAST_BYTES', DISK_BYTES)  # none
     spool, writer = writing()
-    connection = spool._index._db
+    connection = spool._connections.writing._db
     receive(spool, 3)
     writer.put(make('0', bytes(MEBI)))
     assert writer.flush(60)

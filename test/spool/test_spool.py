@@ -128,7 +128,7 @@ def test_quarantine_moves_the_file(spool: Spool, root: Path, reason: str | None,
 def test_quarantine_moves_the_file_while_somebody_reads(spool: Spool, root: Path) -> None:
     """A question to the index that is half answered meanwhile, as a status is on a busy machine, does not hide the outcome."""
     (item,) = put(spool, make())
-    half = spool._view._db.execute('SELECT * FROM tally')
+    half = spool._connections.reading._db.execute('SELECT * FROM tally')
     assert half.fetchone()
     settle(spool, item, State.QUARANTINED, 'foreign')
     assert half.fetchone(), 'it was not at its end'

@@ -68,8 +68,8 @@ class Robot:
 
     def told(self) -> None:
         """The store knows of all."""
-        with self.spool._index.transaction():  # what a part of the catalog does when it is spooled
-            self.spool._index._db.execute('DELETE FROM unreported')
+        with self.spool._connections.writing.transaction():  # what a part of the catalog does when it is spooled
+            self.spool._connections.writing._db.execute('DELETE FROM unreported')
 
     def thin(self) -> int:
         """Until there is room, or nothing to thin; how many steps that took."""
@@ -254,10 +254,10 @@ def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[...,
     """Thinning takes what nobody waits for, and leaves the rest whole."""
     robot = make_robot(1 << 20)
     robot.keep(archive(robot, 0), archive(robot, 1), archive(robot, 2))
-    with robot.spool._index.transaction():
-        robot.spool._index.objects.protect('sensor-data', 'thor/camera/20251018/000000.tar')
+    with robot.spool._connections.writing.transaction():
+        robot.spool._connections.writing.objects.protect('sensor-data', 'thor/camera/20251018/000000.tar')
         number = robot.kept()[1]['id']
-        robot.spool._index._db.execute("INSERT INTO requested VALUES ('r', ?, 1, 'kept')", (number,))
+        robot.spool._connections.writing._db.execute("INSERT INTO requested VALUES ('r', ?, 1, 'kept')", (number,))
     robot.max_bytes = 70 * KIB
     robot.spool.close()
     robot.open()
