@@ -40,8 +40,8 @@ demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, a minu
 bench: setup ## benchmarks against the baseline, as ratios, into docs/performance.md; BENCH_ARGS=--quick is shorter
 	scripts/with-env python bench/run.py $(BENCH_ARGS)
 
-docs: setup ## write docs/parameters.md and docs/commands.md anew from the code
-	scripts/with-env python -m shadowhound_data_logger.cli.pages --write
+docs: setup ## write docs/parameters.md and docs/commands.md from the code, and build the documentation site into build/site
+	scripts/docs
 
 lock: setup ## write requirements/*.txt anew from requirements/*.in; LOCK_ARGS=--upgrade renews the pins
 	scripts/lock $(LOCK_ARGS)

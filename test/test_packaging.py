@@ -128,6 +128,7 @@ def test_what_is_imported_is_asked_for_or_comes_with_what_is() -> None:
     [
         ('uv.txt', ['uv.in']),
         ('audit.txt', ['audit.in']),
+        ('docs.txt', ['docs.in']),
         ('runtime.txt', ['runtime.in']),
         ('robot.txt', ['runtime.in']),
         ('wheels.txt', ['runtime.in', 'ros.in', 'dev.in']),
