@@ -150,7 +150,7 @@ def test_a_death_while_it_is_cut_leaves_one_cut(desk: Desk, tmp_path: Path) -> N
     def die(*_: object) -> int:
         raise SpoolError('it died', remedy='')
 
-    desk.spool.set_cut = die  # type: ignore[method-assign]
+    desk.spool.requests.set_cut = die  # type: ignore[method-assign]
     with pytest.raises(SpoolError):
         desk.step()
     desk.spool.close()

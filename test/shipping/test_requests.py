@@ -225,7 +225,7 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
 
 def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A request is accepted in pieces, so that nobody waits for long; before its row nothing of it counts, nor bars eviction."""
-    monkeypatch.setattr('shadowhound_data_logger.spool.spool.PIECE', 4)
+    monkeypatch.setattr('shadowhound_data_logger.spool.requests.PIECE', 4)
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     desk.keeps(*(frame(number) for number in range(10)))
     with closing(desk.spool):
@@ -295,13 +295,13 @@ def test_a_mailbox_that_changes_at_each_look_asks_once(desk: Desk) -> None:
     asked = PullRequest(robot='thor', by='flood', made_ns=desk.clock.now_ns, expires_ns=desk.clock.now_ns + 3600 * SECOND,
                         want=KeptFilter(sensor='camera', until_ns=NOON_NS + 2 * SECOND))  # fmt: skip
     accepted = Counter[str]()
-    real = desk.spool.accept
+    real = desk.spool.requests.accept
 
     def accept(row: RequestRow, chosen: Sequence[tuple[int, int]]) -> RequestRow:
         accepted[row.id] += 1
         return real(row, chosen)
 
-    desk.spool.accept = accept  # type: ignore[method-assign]
+    desk.spool.requests.accept = accept  # type: ignore[method-assign]
     desk.server._release = lambda _: False  # type: ignore[method-assign] # the link is away, so nothing ends
     for number in range(5):
         entries = [replace(asked, by=f'flood{turn}', priority=(number + turn) % 10).to_json() for turn in range(200)]
