@@ -18,7 +18,6 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from shadowhound_data_logger.core import heap
-from shadowhound_data_logger.live.kinds import KINDS
 from shadowhound_data_logger.live.topics import POLL_S, _Watched
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
 
@@ -33,7 +32,7 @@ def main() -> None:
         node = Node('live_floor', start_parameter_services=False, enable_rosout=False)
     time.sleep(DISCOVERY_S)
     known = {topic: types[0] for topic, types in node.get_topic_names_and_types() if topic in topics and do != 'join'}
-    watched = [_Watched(node, topic, name, KINDS[name], is_raw=False) for topic, name in known.items()]
+    watched = [_Watched(node, topic, name, [topic]) for topic, name in known.items()]
     print('ready', len(watched), flush=True)
     next_s = time.monotonic()
     while True:
@@ -42,7 +41,7 @@ def main() -> None:
         now_s = time.monotonic()
         for one in watched if do == 'take' else ():
             if one.is_due(now_s):
-                one.shown(one.reader.drain(one.most), now_s)
+                one.views[one.reader.plan.topic].shown(one.reader.drain(one.most), now_s)
 
 
 if __name__ == '__main__':

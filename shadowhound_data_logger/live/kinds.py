@@ -38,7 +38,20 @@ _EVERY: Final = {FULL: 1, HALF: 4, SMALLEST: 16}
 """Which points of a smaller cloud are kept."""
 MOST_POINTS: Final = 200_000
 """Of a cloud that is sent; of a larger one each second, third, ... is."""
-_COLORSPACES: Final = {'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY'}
+_COLORSPACES: Final = {
+    'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY', '8UC1': 'GRAY', '8UC3': 'BGR',
+    '8UC4': 'BGRA',
+}  # fmt: skip
+_MEASURED: Final = {'16UC1': ('u2', 'm'), '32FC1': ('f4', 'm'), 'mono16': ('u2', '')}
+"""Images of distances (REP 118: millimeters as uint16, meters as float32) and of other values, shown in colors: numpy's name of a
+value, and the unit."""
+_RAMP: Final = ((250, 235, 110), (245, 150, 60), (220, 70, 90), (130, 40, 130), (50, 30, 110), (20, 25, 70))
+"""Red, green and blue from near to far; ``page/style.css`` has the same for the legend."""
+_NO_VALUE: Final = (118, 118, 118)
+_ENDS: Final = tuple(
+    step * ten for ten in (0.1, 1.0, 10.0, 100.0, 1000.0, 10_000.0) for step in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
+)
+"""Where the colors of such an image may end, so that they rarely change."""
 _AXES: Final = ('x', 'y', 'z')
 MOST_NAMES, MAX_NAME = 64, 64
 """Figures in a row, and letters in the name of one."""
@@ -233,6 +246,18 @@ def _go2_state(message: Any) -> dict[str, float]:
             **{f'foot.{place}': float(force) for place, force in enumerate(message.foot_force)}}  # fmt: skip
 
 
+def _fix(message: Any) -> dict[str, float]:
+    """Degrees as a float32 and what it lacks: one alone is wrong by up to a meter. NaN without a fix."""
+    has_fix = message.status.status >= 0
+    latitude, longitude = (value if has_fix else math.nan for value in (message.latitude, message.longitude))
+    lat, lon = float(np.float32(latitude)), float(np.float32(longitude))
+    error_m = math.sqrt(max(0.0, float(message.position_covariance[0]))) if message.position_covariance_type else math.nan
+    return {
+        'lat': lat, 'lat_rest': latitude - lat, 'lon': lon, 'lon_rest': longitude - lon, 'altitude': float(message.altitude),
+        'status': float(message.status.status), 'error': error_m,
+    }  # fmt: skip
+
+
 KINDS: Final[Mapping[str, Kind]] = {
     COMPRESSED_IMAGE: Kind('camera', 30.0, is_bulk=True),
     IMAGE: Kind('camera', 15.0, is_bulk=True),
@@ -244,8 +269,9 @@ KINDS: Final[Mapping[str, Kind]] = {
     'go2_interfaces/msg/LowState': Kind('battery', 2.0, is_bulk=False, values=_low_state),
     'sensor_msgs/msg/BatteryState': Kind('battery', 2.0, is_bulk=False, values=_battery),
     'go2_interfaces/msg/Go2State': Kind('state', 10.0, is_bulk=False, values=_go2_state),
+    'sensor_msgs/msg/NavSatFix': Kind('fix', 5.0, is_bulk=False, values=_fix),
 }
-"""By type of message; topics of other types are counted on the page and not drawn."""
+"""By type of message, what is shown live and of the past; ``panels.py`` has more that is shown live."""
 
 
 def series(topic: str, kind: Kind, type_name: str, types: MessageTypes, messages: Sequence[tuple[float, bytes]]) -> LiveItem:
@@ -286,13 +312,19 @@ def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: b
         for size in sizes:
             yield LiveItem(topic, 'camera', size, {'at': round(at_ms, 1)}, body if size == FULL else _smaller(body, size))
         return
-    pixels, colorspace = _pixels(types.deserialize(type_name, memoryview(cdr)))
+    message = types.deserialize(type_name, memoryview(cdr))
+    head: dict[str, Any] = {'at': round(at_ms, 1)}
+    if message.encoding in _MEASURED:
+        pixels, head['scale'] = _measured(message, _SIDE.get(min(sizes), 1))
+        colorspace = 'RGB'
+    else:
+        pixels, colorspace = _pixels(message)
     for size in sizes:
-        side = _SIDE.get(size, 1)
+        side = _SIDE.get(size, 1) // (_SIDE.get(min(sizes), 1) if 'scale' in head else 1)
         chosen = np.ascontiguousarray(pixels[::side, ::side])
         sampling = 'Gray' if chosen.shape[2] == 1 else '420'
         jpeg = simplejpeg.encode_jpeg(chosen, _QUALITY[size], colorspace, sampling, fastdct=True)
-        yield LiveItem(topic, 'camera', size, {'at': round(at_ms, 1)}, bytes(jpeg))
+        yield LiveItem(topic, 'camera', size, head, bytes(jpeg))
 
 
 def _compressed(types: MessageTypes, cdr: bytes) -> bytes:
@@ -338,6 +370,32 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str]:
     if not 0 < width * channels <= step or not height or message.data.size != step * height or max(width, height) > 65_500:
         raise Rejected('size_mismatch', f'{width} x {height} {message.encoding}, step {step}, {message.data.size} bytes')
     return message.data.reshape(height, step)[:, : width * channels].reshape(height, width, channels), colorspace
+
+
+def _measured(message: Any, side: int) -> tuple[NDArray[Any], dict[str, Any]]:
+    """Pixels of an image of values in colors, each of ``side`` rows and columns one, and the scale of the colors."""
+    name, unit = _MEASURED[message.encoding]
+    dtype = np.dtype(name).newbyteorder('>' if message.is_bigendian else '<')
+    height, width, step = message.height, message.width, message.step
+    if not 0 < width * dtype.itemsize <= step or not height or message.data.size != step * height or max(width, height) > 65_500:
+        raise Rejected('size_mismatch', f'{width} x {height} {message.encoding}, step {step}, {message.data.size} bytes')
+    values = message.data.reshape(height, step)[:, : width * dtype.itemsize].copy().view(dtype)[::side, ::side]
+    if name == 'f4':  # in millimeters too: colors are looked up
+        values = np.clip(np.nan_to_num(values * np.float32(1000), nan=0, posinf=0, neginf=0), 0, 65_535).astype('<u2')
+    some = values[::4, ::4]
+    some = some[some > 0]
+    most = float(np.percentile(some, 98)) / (1000 if unit else 1) if some.size else 1.0
+    end = next((each for each in _ENDS if each >= most), _ENDS[-1])
+    return _color_table(end * 1000 if unit else end)[values], {'low': 0, 'high': round(end, 1), 'unit': unit}
+
+
+@lru_cache(maxsize=8)
+def _color_table(end: float) -> NDArray[Any]:
+    """The color of each uint16, up to ``end``; 0 means that there is no value."""
+    place = np.minimum(np.arange(65_536) / end, 1.0) * (len(_RAMP) - 1)
+    table = np.stack([np.interp(place, range(len(_RAMP)), channel) for channel in zip(*_RAMP, strict=True)], axis=1)
+    table[0] = _NO_VALUE
+    return table.astype(np.uint8)
 
 
 def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:

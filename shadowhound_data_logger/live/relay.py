@@ -26,6 +26,7 @@ import orjson
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.access import TokenRefused, token_of
 from shadowhound_data_logger.live.kinds import FULL, KINDS, MOST_NAMES, LiveItem, check_jpeg
+from shadowhound_data_logger.live.panels import BULK
 from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE
 
 log = logging.getLogger(__name__)
@@ -48,7 +49,9 @@ MAX_SMALL: Final = 1 << 20
 """Bytes of an item that is no picture and no cloud."""
 MAX_HEAD: Final = 1 << 20
 MAX_LANES: Final = 64
-_SHOWN: Final = {'topics', 'figures', 'pong', *(kind.name for kind in KINDS.values())}
+MAX_TOPICS: Final = 2000
+_SERIES: Final = {'field', *(kind.name for kind in KINDS.values() if not kind.is_bulk)}
+_SHOWN: Final = {'topics', 'figures', 'pong', 'message', 'problem', *_SERIES, *BULK, *(kind.name for kind in KINDS.values())}
 _BROKEN: Final = (asyncio.TimeoutError, OSError, ValueError, LookupError, DataLoggerError, TypeError, AttributeError,
                   RecursionError)  # fmt: skip
 _NOT_SIGNED_IN: Final = {
@@ -56,7 +59,7 @@ _NOT_SIGNED_IN: Final = {
 }  # fmt: skip
 _NOT_WATCHING: Final = {401: 'it asks for a token: see --robot-token', 429: 'it takes no more viewers'}
 """Why it does not let us in, by status."""
-_BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk}
+_BULK: Final = {kind.name for kind in KINDS.values() if kind.is_bulk} | BULK
 
 
 class _NotLetIn(ValueError):
@@ -240,8 +243,8 @@ class _Connection:
             self._pings.append((here - float(head['ping']), float(head['now']) - (here + float(head['ping'])) / 2))
             return
         if kind == 'topics':
-            told = [[str(text)[:256] for text in row[:3]] for row in head['topics'][:500] if len(row) == 3]
-            self._came(_catalog(told, str(head.get('problem', ''))[:300]))
+            told = [[*(str(text)[:256] for text in row[:3]), int(row[3])] for row in head['topics'][:MAX_TOPICS] if len(row) == 4]
+            self._came(_catalog(told, str(head.get('problem', ''))[:300], int(head.get('total', 0))))
             return
         if not self._pings:
             return  # nobody could say how old it is
@@ -253,7 +256,7 @@ class _Connection:
         if kind == 'figures' and not _is_figures(head['figures']):
             raise ValueError('its figures are none')
         _check(kind, head, body)
-        if kind != 'figures' and kind not in _BULK:
+        if kind in _SERIES:
             rows = int(head['rows'])
             body = (np.frombuffer(body, '<f8', rows) - ahead).astype('<f8').tobytes() + body[8 * rows :]
         self._came(LiveItem(topic, kind, FULL, head, body))
@@ -272,7 +275,7 @@ def _check(kind: str, head: Mapping[str, Any], body: bytes) -> None:
             or not isinstance(head['frame'], str)
         ):
             raise ValueError('its cloud is none')
-    elif kind != 'figures':
+    elif kind in _SERIES:
         names = head['names']
         if not (isinstance(names, list) and len(names) <= MOST_NAMES and all(isinstance(name, str) for name in names)):
             raise ValueError('its figures have no names')
@@ -286,5 +289,5 @@ def _is_figures(told: Any) -> bool:
     return isinstance(rows, list) and all(isinstance(row['topic'], str) and isinstance(row['type'], str) for row in rows)
 
 
-def _catalog(topics: list[list[str]], problem: str) -> LiveItem:
-    return LiveItem('', 'topics', head={'topics': topics, 'problem': problem})
+def _catalog(topics: list[list[Any]], problem: str, total: int = 0) -> LiveItem:
+    return LiveItem('', 'topics', head={'topics': topics, 'total': max(total, len(topics)), 'problem': problem})

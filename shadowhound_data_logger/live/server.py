@@ -13,7 +13,6 @@ import mimetypes
 import socket
 import ssl
 import time
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +35,7 @@ from shadowhound_data_logger.live.history_process import HistoryProcess
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.past_routes import PastRoutes
 from shadowhound_data_logger.live.relay import Relay
-from shadowhound_data_logger.live.viewers import Viewers
+from shadowhound_data_logger.live.viewers import Graph, Viewers
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.live.topics import Topics
@@ -197,8 +196,8 @@ class LiveServer:
             return
         from shadowhound_data_logger.live.topics import Topics  # noqa: PLC0415 - rclpy
 
-        def tell(graph: Mapping[str, str]) -> None:
-            self._loop.call_soon_threadsafe(self.viewers.on_graph, graph)
+        def tell(graph: Graph, total: int) -> None:
+            self._loop.call_soon_threadsafe(self.viewers.on_graph, graph, total)
 
         def show(items: list[LiveItem]) -> None:
             self._loop.call_soon_threadsafe(self.viewers.on_items, items)

@@ -1,7 +1,9 @@
 """The topics that somebody watches, read raw and polled. Importing this loads rclpy.
 
-A subscription exists as long as somebody watches its topic. All are BEST_EFFORT and shallow, whatever the publisher offers:
-nobody waits for the live page, and nothing is sent again for it.
+A subscription exists as long as somebody watches its topic: as it is drawn (``/imu``), as a tree (``/imu#``), or a number of it
+(``/imu#orientation.w``). All are BEST_EFFORT and shallow, whatever the publisher offers: nobody waits for the live page, and
+nothing is sent again for it. Only what publishers keep for all who come later (maps, static transforms) is requested as they
+offer it.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
 from typing import Final
 
 import rclpy
@@ -21,12 +24,16 @@ from rclpy.utilities import get_default_context
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.model import Taken
+from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
-from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series
+from shadowhound_data_logger.live.kinds import KINDS, Kind, LiveItem, clouds, frames, series, table_item
+from shadowhound_data_logger.live.panels import Maker, kind_of, panel_of
+from shadowhound_data_logger.live.trees import numbers, parsed, tree
+from shadowhound_data_logger.live.viewers import Graph
 from shadowhound_data_logger.ros.endpoints import Plan
 from shadowhound_data_logger.ros.fast_dds_profile import without_our_profile
-from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable
+from shadowhound_data_logger.ros.reader import MAX_TAKES, PolledGroup, Reader, SubscriptionRefused, TypeUnavailable, endpoints
 from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided
 
 log = logging.getLogger(__name__)
@@ -36,56 +43,121 @@ POLL_S: Final = 1 / 30
 GRAPH_S: Final = 1.0
 BULK_DEPTH, ROWS_DEPTH = 2, 128
 """Of bulk, and of a topic of which all messages are shown; of others only the newest is kept."""
-MAX_TOPICS: Final = 500
-"""Of the graph that are told; whoever publishes more is not shown all of it."""
+MAX_GATHERED: Final = 500
+MAX_TOPICS: Final = 2000
+"""Of the graph that are told, those with a publisher first."""
+MAX_PUBLISHERS: Final = 100
+COUNTS: Final = 60
+"""Topics whose publishers are counted per look; those that are new in any case."""
+RATE_S: Final = 4.0
+TREE, FIELD = Kind('message', 2.0, is_bulk=True), Kind('field', 20.0, is_bulk=False)
 _Wanted = Mapping[str, frozenset[int]]
-"""Topic -> the sizes in which it is watched."""
+"""What is watched (a topic, with ``#`` as a tree, with ``#path`` a number of it) -> the sizes in which it is."""
 
 
-class _Watched:
-    """One topic that is watched."""
+class _View:
+    """One way in which a topic is watched."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, kind: Kind) -> None:
-        """Raises TypeUnavailable or SubscriptionRefused."""
-        self.type, self.kind = type_name, kind
-        self._is_each_shown = not kind.is_bulk and 1 / kind.most_hz < POLL_S
-        self.most = MAX_TAKES if kind.is_bulk or self._is_each_shown else 1
-        depth = BULK_DEPTH if kind.is_bulk else 1 if self.most == 1 else ROWS_DEPTH
-        self.reader = Reader(node, Plan(topic, type_name, reliable=False, transient_local=False, depth=depth), PolledGroup())
+    def __init__(self, topic: str, type_name: str, key: str) -> None:
+        """Raises Rejected for a key that is none."""
+        self.path: str | None = None
+        self.maker: Maker | None = None
+        self.is_latched = self._is_gathered = False
+        if '#' in key:
+            self.path = key.partition('#')[2]
+            if self.path:
+                parsed(self.path)
+            self.kind, self.is_latched = FIELD if self.path else TREE, True
+        elif (panel := panel_of(topic, type_name)) is not None:
+            self.kind, self.maker = panel.kind, panel.maker()
+            self.is_latched, self._is_gathered = panel.is_latched, panel.is_gathered
+        else:
+            self.kind = KINDS[type_name]
+        self._is_each_shown = not self.kind.is_bulk and 1 / self.kind.most_hz < POLL_S
+        self.depth = ROWS_DEPTH if self._is_gathered or self._is_each_shown else BULK_DEPTH if self.kind.is_bulk else 1
         self._next_s = 0.0
+        self._waiting: list[Taken] = []
 
     def is_due(self, now_s: float) -> bool:
         """Whether to look: what would not be shown is left to the middleware, which keeps the newest."""
-        return self._is_each_shown or now_s >= self._next_s
+        return self._is_each_shown or self._is_gathered or now_s >= self._next_s
 
     def shown(self, taken: list[Taken], now_s: float) -> list[Taken]:
-        """Those of them that are shown."""
+        """Those messages that are shown now, of these and of those before."""
         if self._is_each_shown:
             return taken[-round(2 * POLL_S * self.kind.most_hz) :]
-        if not taken or now_s < self._next_s:
+        if taken:
+            self._waiting = [*self._waiting, *taken][-MAX_GATHERED:] if self._is_gathered else taken[-1:]
+        if not self._waiting or now_s < self._next_s:
             return []
         self._next_s = max(self._next_s + 1 / self.kind.most_hz, now_s - POLL_S)
-        return taken[-1:]
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+
+class _Watched:
+    """One topic that is watched, in one or several views."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, keys: Collection[str]) -> None:
+        """Raises TypeUnavailable, SubscriptionRefused or Rejected."""
+        self.type = type_name
+        self.views = {key: _View(topic, type_name, key) for key in sorted(keys)}
+        depth = max(view.depth for view in self.views.values())
+        self.most = MAX_TAKES if depth > 1 else 1
+        is_latched = any(view.is_latched for view in self.views.values())
+        publishers = endpoints(node, topic) if is_latched else []
+        self.awaits_publisher = is_latched and not publishers
+        latched = any(each.reliable and each.transient_local for each in publishers)
+        self.reader = Reader(node, Plan(topic, type_name, reliable=latched, transient_local=latched, depth=depth), PolledGroup())
+        self._counts: deque[tuple[float, int]] = deque()  # when, and messages until then
+        self._numbers: dict[str | None, int] = {}
+        self._count = 0
+
+    def is_due(self, now_s: float) -> bool:
+        return any(view.is_due(now_s) for view in self.views.values())
+
+    def count(self, taken: list[Taken], now_s: float) -> None:
+        """Messages by their numbers, where there are any: those that were left to the middleware count too."""
+        for one in taken:
+            last = self._numbers.get(one.publisher)
+            self._count += 1 if last is None or one.number is None else max(1, min(one.number - last, 10_000))
+            if one.number is not None and len(self._numbers) < MAX_PUBLISHERS:
+                self._numbers[one.publisher] = one.number
+        if taken:
+            self._counts.append((now_s, self._count))
+        while len(self._counts) > 2 and self._counts[0][0] < now_s - RATE_S:
+            self._counts.popleft()
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages per second of the last seconds; None before the second one."""
+        if len(self._counts) < 2:
+            return None
+        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
+        return round((last - first) / max(last_s - first_s, 1e-3), 2)
 
 
 class Topics:
     """Reads what is watched, on the thread ``topics``, which alone makes and ends subscriptions.
 
     New; open once; close once. ``wanted`` says what is watched, None while there is no viewer; ``found`` is told topics and
-    types of the graph, ``came`` what there is to show. All three are called by the thread.
+    types of the graph with their number, ``came`` what there is to show. All three are called by the thread.
     """
 
-    def __init__(self, wanted: Callable[[], _Wanted | None], found: Callable[[Mapping[str, str]], None],
+    def __init__(self, wanted: Callable[[], _Wanted | None], found: Callable[[Graph, int], None],
                  came: Callable[[list[LiveItem]], None]) -> None:  # fmt: skip
         self._wanted, self._found, self._came = wanted, found, came
         self._types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
         self._node: Node | None = None
         self._guard: PortGuard | None = None
-        self._graph: dict[str, str] = {}
+        self._graph: Graph = {}
+        self._total = self._counted = 0
+        self._publishers: dict[str, int] = {}
         self._graph_s = self._next_s = 0.0
         self._watched: dict[str, _Watched] = {}
         self._followed: _Wanted | None = None  # the server replaces it when somebody chooses
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, tuple[str, set[str]]] = {}
+        self._problems: dict[str, str] = {}
         self._wake = threading.Event()
         self.worker = Worker('topics', self._step)
         self.rejected: dict[str, int] = {}
@@ -142,32 +214,51 @@ class Topics:
 
     def _look(self) -> None:
         assert self._node is not None
-        seen = sorted(self._node.get_topic_names_and_types())[:MAX_TOPICS]
-        graph = {
-            printable(topic): next((name for name in types if name in KINDS), printable(types[0]))
-            for topic, types in seen
-            if types
-        }
-        if graph != self._graph:
-            self._graph = graph
-            self._found(graph)
+        seen = {topic: types for topic, types in self._node.get_topic_names_and_types() if types}
+        counted = [topic for topic in seen if topic not in self._publishers]
+        known = [topic for topic in self._publishers if topic in seen]
+        first = self._counted % max(1, len(known))
+        self._counted = first + COUNTS
+        counted += [*known[first:], *known[:first]][:COUNTS]
+        own = {'/parameter_events': 1}  # each node of rclpy publishes it
+        counts = {topic: self._node.count_publishers(topic) - own.get(topic, 0) for topic in counted}
+        self._publishers = {topic: counts.get(topic, self._publishers.get(topic, 0)) for topic in seen}
+        rows = [
+            (
+                printable(topic),
+                next((name for name in types if kind_of(topic, name)), printable(types[0])),
+                self._publishers[topic],
+            )
+            for topic, types in seen.items()
+        ]
+        rows.sort(key=lambda row: (row[2] < 1, kind_of(row[0], row[1]) is None, row[0]))
+        graph = {topic: (type_name, count) for topic, type_name, count in rows[:MAX_TOPICS]}
+        if graph != self._graph or len(rows) != self._total:
+            self._graph, self._total = graph, len(rows)
+            self._found(graph, len(rows))
 
     def _follow(self, wanted: _Wanted) -> None:
         assert self._node is not None
-        for topic in [
-            topic for topic, one in self._watched.items() if not wanted.get(topic) or self._graph.get(topic) != one.type
-        ]:
-            self._watched.pop(topic).reader.close()
-        for topic in wanted.keys() - self._watched.keys():
-            type_name = self._graph.get(topic, '')
-            kind = KINDS.get(type_name)
-            if kind is None or not wanted[topic] or self._refused.get(topic) == type_name:
-                continue
-            try:
-                self._watched[topic] = _Watched(self._node, topic, type_name, kind)
-            except (TypeUnavailable, SubscriptionRefused) as error:
-                self._refused[topic] = type_name
-                log.warning('%s is not shown: %s', topic, error)
+        topics: dict[str, set[str]] = {}
+        for key, sizes in wanted.items():
+            topic = key.partition('#')[0]
+            type_name, _ = self._graph.get(topic, ('', 0))
+            if sizes and type_name and ('#' in key or kind_of(topic, type_name)):
+                topics.setdefault(topic, set()).add(key)
+        for topic, one in list(self._watched.items()):
+            type_name, publishers = self._graph.get(topic, ('', 0))
+            if type_name != one.type or topics.get(topic) != one.views.keys() or (one.awaits_publisher and publishers > 0):
+                self._watched.pop(topic).reader.close()
+        self._problems = {key: why for key, why in self._problems.items() if key in wanted}
+        for topic, keys in topics.items():
+            type_name, _ = self._graph[topic]
+            if topic not in self._watched and self._refused.get(topic) != (type_name, keys):
+                try:
+                    self._watched[topic] = _Watched(self._node, topic, type_name, keys)
+                except (TypeUnavailable, SubscriptionRefused, Rejected) as error:
+                    self._refused[topic] = type_name, keys
+                    log.warning('%s is not shown: %s', topic, error)
+                    self._came([item for key in sorted(keys) for item in self._problem(key, str(error))])
 
     def _drain(self, wanted: _Wanted, now_s: float) -> None:
         items: list[LiveItem] = []
@@ -175,26 +266,48 @@ class Topics:
             if not one.is_due(now_s):
                 continue
             came = one.reader.drain(one.most)
-            sizes = wanted.get(topic, frozenset())
-            taken = one.shown(came, now_s)
-            if not taken or not sizes:
-                continue
-            try:
-                items += self._items(topic, one, taken, sorted(sizes))
-            except Rejected as error:
-                self.rejected[topic] = self.rejected.get(topic, 0) + 1
-                if self.rejected[topic] == 1:
-                    log.warning('%s: a message cannot be shown: %s', topic, error)
+            for key, view in one.views.items():
+                if view.kind is TREE:
+                    one.count(came, now_s)
+                taken = view.shown(came, now_s)
+                sizes = wanted.get(key, frozenset())
+                if not taken or not sizes:
+                    continue
+                try:
+                    items += self._items(key, one, view, taken, sorted(sizes))
+                    if key in self._problems:
+                        items += self._problem(key, '')
+                except Rejected as error:
+                    self.rejected[topic] = self.rejected.get(topic, 0) + 1
+                    if self.rejected[topic] == 1:
+                        log.warning('%s: a message cannot be shown: %s', topic, error)
+                    items += self._problem(key, str(error))
         if items:
             self._came(items)
 
-    def _items(self, topic: str, one: _Watched, taken: list[Taken], sizes: list[int]) -> list[LiveItem]:
+    def _problem(self, key: str, why: str) -> list[LiveItem]:
+        """Why something that is watched is not shown, when that changes; empty: it is shown again."""
+        if self._problems.get(key, '') == why:
+            return []
+        self._problems[key] = why
+        return [LiveItem(key, 'problem', head={'at': round(time.monotonic() * 1e3, 1), 'text': visible(why)[:300]})]
+
+    def _items(self, key: str, one: _Watched, view: _View, taken: list[Taken], sizes: list[int]) -> list[LiveItem]:
         # By this machine's own clocks: when it came here, as what ``time.monotonic`` will be compared with.
         offset_ns = time.monotonic_ns() - time.time_ns()
         messages = [((message.received_ns + offset_ns) / 1e6, message.cdr) for message in taken]
-        if not one.kind.is_bulk:
-            return [series(topic, one.kind, one.type, self._types, messages)]
         at_ms, cdr = messages[-1]
-        if one.kind.name == 'cloud':
-            return list(clouds(topic, self._types, at_ms, cdr, sizes))
-        return list(frames(topic, one.type, self._types, at_ms, cdr, sizes))
+        if view.kind is TREE:
+            built = tree(self._types, one.type, self._types.deserialize(one.type, memoryview(cdr)))
+            head = {'at': round(at_ms, 1), 'bytes': len(cdr), 'hz': one.rate_hz, 'tree': built}
+            return [LiveItem(key, 'message', head=head)]
+        if view.path:
+            rows = [(at_ms, self._types.deserialize(one.type, memoryview(cdr))) for at_ms, cdr in messages]
+            return [table_item(key, view.kind, numbers(rows, view.path))]
+        if view.maker is not None:
+            return [view.maker(key, self._types, one.type, messages)]
+        if not view.kind.is_bulk:
+            return [series(key, view.kind, one.type, self._types, messages)]
+        if view.kind.name == 'cloud':
+            return list(clouds(key, self._types, at_ms, cdr, sizes))
+        return list(frames(key, one.type, self._types, at_ms, cdr, sizes))

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 from shadowhound_data_logger.live.kinds import FULL, HALF, SIZES, SMALLEST, LiveItem
+from shadowhound_data_logger.live.panels import BULK
 
 MIN_QUEUE, MAX_QUEUE = 12 << 10, 160 << 10
 """Bytes that may be queued on the link, besides those in flight."""
@@ -29,10 +30,14 @@ SMALL_ROOM: Final = 8 << 10
 MAX_ROWS_WAITING: Final = 12
 """Items of a series, each of some 33 ms; older ones are left out."""
 SMALL_LANE: Final = 0
+OWN: Final = frozenset({'', 'figures', 'topics'})
+"""Slots of what every viewer gets, whatever it watches."""
 ACKNOWLEDGED: Final = 2 << 10
 """Bytes, at least, before a browser says so again."""
 BEGIN, END = 1, 2
-WEIGHTS: Final[Mapping[str, float]] = {'figures': 4.0, 'camera': 4.0, 'cloud': 1.0}
+WEIGHTS: Final[Mapping[str, float]] = {
+    'figures': 4.0, 'camera': 4.0, 'cloud': 1.0, 'topics': 1.0, 'message': 1.0, **dict.fromkeys(BULK, 1.0)
+}  # fmt: skip
 """How bulk topics share a link."""
 MIN_MEASURED: Final = 4 << 10
 """Bytes of an item by which the link is measured."""
@@ -83,7 +88,7 @@ class Viewer:
         self._lanes: dict[str, _Lane] = {}
         self._used: dict[str, float] = {}
         self._virtual = 0.0  # start-time fair queueing: Goyal, Vin, Cheng, SIGCOMM 1996
-        self._kinds: dict[str, str] = {'': 'figures'}
+        self._kinds: dict[str, str] = {}
         self._sizes: dict[str, int] = {}
         self._bytes: dict[str, int] = {}
         self._sent = self._acked = 0
@@ -94,7 +99,7 @@ class Viewer:
         """From now on these and no others."""
         self.watched = frozenset(topics)
         for waiting in (self._rows, self._slots):
-            for topic in [topic for topic in waiting if topic and topic not in self.watched]:
+            for topic in [topic for topic in waiting if topic not in OWN and topic not in self.watched]:
                 del waiting[topic]
 
     def size(self, topic: str) -> int:
@@ -104,10 +109,11 @@ class Viewer:
     def offer(self, item: LiveItem) -> None:
         """Send it when there is room; a newer one of a bulk topic takes its place."""
         if item.kind in WEIGHTS:
-            self._kinds[item.topic] = item.kind
-            self._bytes[item.topic] = round(len(item.packed) / SMALLER[item.size])
-            self.replaced += item.topic in self._slots
-            self._slots[item.topic] = item
+            slot = item.topic or item.kind
+            self._kinds[slot] = item.kind
+            self._bytes[slot] = round(len(item.packed) / SMALLER[item.size])
+            self.replaced += slot in self._slots
+            self._slots[slot] = item
         else:
             self._rows.setdefault(item.topic, deque(maxlen=MAX_ROWS_WAITING)).append(item)
 
@@ -150,7 +156,7 @@ class Viewer:
     def choose_sizes(self) -> None:
         """For the link as it is now; called once a second."""
         for topic, kind in self._kinds.items():
-            if kind == 'figures' or topic not in self._bytes:
+            if kind not in ('camera', 'cloud'):
                 continue
             share, hz = (CAMERA_SHARE, CAMERA_HZ) if kind == 'camera' else (CLOUD_SHARE, CLOUD_HZ)
             room, now = self.rate * share / hz, self.size(topic)

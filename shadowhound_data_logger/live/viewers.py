@@ -19,7 +19,8 @@ from shadowhound_data_logger.live.access import COOKIE, SignIn, is_loopback
 from shadowhound_data_logger.live.answers import parsed, problem
 from shadowhound_data_logger.live.auth import Auth
 from shadowhound_data_logger.live.cameras import Cameras
-from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem
+from shadowhound_data_logger.live.kinds import FULL, LiveItem
+from shadowhound_data_logger.live.panels import BULK, kind_of
 from shadowhound_data_logger.live.viewer import Viewer
 
 log = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ log = logging.getLogger(__name__)
 MAX_VIEWERS: Final = 16
 MAX_MESSAGE: Final = 16 << 10
 """Bytes of a message of a viewer."""
-MAX_WATCHED: Final = 16
+MAX_WATCHED: Final = 32
 """Topics that one viewer watches."""
 REWATCH_S: Final = 0.1
 """Between two changes of what is read, when viewers choose."""
@@ -37,6 +38,10 @@ SILENT_S: Final = 8.0
 """A viewer that sends nothing for this long is disconnected: the page sends something every second."""
 AF41: Final = 34 << 2
 """DSCP of interactive video (RFC 4594), in the byte where IP has it."""
+KEPT: Final = frozenset({*BULK, 'message', 'problem'})
+"""Kinds whose newest item is sent to a viewer that begins to watch: it may have been published once."""
+Graph = Mapping[str, tuple[str, int]]
+"""Topic -> its type and number of publishers, as ROS has them."""
 _MIN_RTT: Final = struct.Struct('=148xI')
 """tcp_info.tcpi_min_rtt of linux/tcp.h, in microseconds."""
 
@@ -78,8 +83,10 @@ class Viewers:
         """``wake`` is called when other topics are to be read than before."""
         self._auth, self._cameras, self._wake, self._is_of_store = auth, cameras, wake, is_of_store
         self.connected: set[Connected] = set()
-        self.graph: Mapping[str, str] = {}
-        """Topic -> type, as ROS has them."""
+        self.graph: Graph = {}
+        """Those with a publisher first."""
+        self._total = 0
+        self._kept: dict[tuple[str, bool], LiveItem] = {}
         self.wanted: dict[str, frozenset[int]] | None = None
         """Topic -> the sizes in which it is shown; None while nobody watches."""
         self.ros_problem = ''
@@ -148,9 +155,9 @@ class Viewers:
         for one in self.connected:
             one.tell(item)
 
-    def on_graph(self, graph: Mapping[str, str]) -> None:
-        """The topics have changed."""
-        self.graph = graph
+    def on_graph(self, graph: Graph, total: int = 0) -> None:
+        """The topics have changed; ``total`` counts those too that are more than can be told."""
+        self.graph, self._total = graph, max(total, len(graph))
         self._cameras.serve(self.camera_topics)
         for one in self.connected:
             self._offer_topics(one)
@@ -159,6 +166,7 @@ class Viewers:
     def on_items(self, items: Iterable[LiveItem]) -> None:
         """Messages of topics that are wanted."""
         for item in items:
+            self._keep(item)
             for one in self.connected:
                 if item.topic in one.viewer.watched and one.viewer.size(item.topic) == item.size:
                     one.tell(item)
@@ -168,6 +176,7 @@ class Viewers:
         """An item of the robot's own page."""
         if item.kind == 'topics':
             self._relayed_topics = item
+        self._keep(item)
         for one in self.connected:
             if not item.topic or item.topic in one.viewer.watched:
                 one.tell(item)
@@ -204,12 +213,17 @@ class Viewers:
         if self._relayed_topics is not None:
             one.tell(self._relayed_topics)
             return
-        topics = [[topic, KINDS[name].name, name] for topic, name in self.graph.items() if name in KINDS]
-        one.tell(LiveItem('', 'topics', head={'topics': topics, 'problem': self.ros_problem}))
+        topics = [[topic, self._kind_of(topic), name, count] for topic, (name, count) in self.graph.items()]
+        one.tell(LiveItem('', 'topics', head={'topics': topics, 'total': self._total, 'problem': self.ros_problem}))
 
     def _kind_of(self, topic: str) -> str:
-        kind = KINDS.get(self.graph.get(topic, ''))
+        """How it is drawn; empty if it is not."""
+        kind = kind_of(topic, self.graph.get(topic, ('', 0))[0])
         return '' if kind is None else kind.name
+
+    def _keep(self, item: LiveItem) -> None:
+        if item.kind in KEPT and item.topic and self.wanted is not None and item.topic in self.wanted:
+            self._kept[item.topic, item.kind == 'problem'] = item
 
     # -- what is read for them -------------------------------------------------------------------------------------
 
@@ -234,6 +248,7 @@ class Viewers:
         self.wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if is_watched else None
         if self.wanted is None and before is not None:
             heap.give_back()
+        self._kept = {key: item for key, item in self._kept.items() if self.wanted and key[0] in self.wanted}
         if self.wanted != before:
             self._wake()
 
@@ -256,7 +271,11 @@ class Viewers:
         if isinstance(ping, (int, float)):
             one.tell(LiveItem('', 'pong', head={'ping': ping, 'now': round(time.monotonic() * 1e3, 2)}))
         if isinstance(watched, list):
+            before = one.viewer.watched
             one.viewer.watch(topic for topic in watched[:MAX_WATCHED] if isinstance(topic, str))
+            for (topic, _), item in self._kept.items():
+                if topic in one.viewer.watched and topic not in before:
+                    one.tell(item)
             self._rewatch_soon()
         if 'video' in said:
             self._take_video(one, said['video'])

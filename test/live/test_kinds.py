@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -290,3 +291,54 @@ def test_a_head_is_json_whatever_is_in_it() -> None:
     assert opened(packed)[0] == {'topic': '/a', 'kind': 'topics', 'problem': 'ö', 'rate': None}
     head = {'problem': 'a \ud800', 'number': 10**30}
     assert opened(LiveItem('/a', 'topics', head=head).packed)[0] == {'topic': '/a', 'kind': 'topics', **head}
+
+
+def depth(values: Any, encoding: str, *, is_bigendian: bool = False) -> bytes:
+    """An image of distances."""
+    height, width = values.shape
+    pixels = np.frombuffer(values.tobytes(), np.uint8)
+    message = new(IMAGE, header=header(), height=height, width=width, encoding=encoding, is_bigendian=int(is_bigendian),
+                  step=width * values.itemsize, data=pixels)  # fmt: skip
+    return cdr(message, IMAGE)
+
+
+@pytest.mark.parametrize(('encoding', 'dtype', 'factor'), [('16UC1', '<u2', 1000), ('16UC1', '>u2', 1000), ('32FC1', '<f4', 1)])
+def test_an_image_of_distances_has_colors_and_their_scale(encoding: str, dtype: str, factor: int) -> None:
+    """The same colors for the same distance in all encodings; gray where nothing was measured."""
+    meters = np.tile(np.linspace(0.5, 3.9, 64), (48, 1))
+    meters[:, :8] = math.nan if encoding == '32FC1' else 0.0
+    message = depth((meters * factor).astype(dtype), encoding, is_bigendian=dtype.startswith('>'))
+    found = [*frames('/depth', IMAGE, TYPES, 7.0, message, SIZES)]
+    assert [item.head for item in found] == [{'at': 7.0, 'scale': {'low': 0, 'high': 4.0, 'unit': 'm'}}] * 3
+    pixels = simplejpeg.decode_jpeg(found[0].body, 'RGB')
+    assert np.abs(pixels[20, 2].astype(int) - 118).max() < 12
+    assert np.abs(pixels[20, 60].astype(int) - (24, 26, 76)).max() < 30
+    assert simplejpeg.decode_jpeg(found[1].body, 'RGB').shape == (24, 32, 3)
+
+
+def test_an_image_of_distances_that_contradicts_itself_is_rejected() -> None:
+    """Its size is not what it says."""
+    message = new(
+        IMAGE, header=header(), height=48, width=64, encoding='16UC1', is_bigendian=0, step=128, data=np.zeros(99, np.uint8)
+    )
+    with pytest.raises(Rejected, match='size_mismatch'):
+        list(frames('/depth', IMAGE, TYPES, 7.0, cdr(message, IMAGE), (FULL,)))
+
+
+def test_a_place_on_earth_is_exact_to_a_centimeter() -> None:
+    """Degrees do not fit into a float32; without a fix there is no place."""
+    fix = 'sensor_msgs/msg/NavSatFix'
+    for status, has_fix in ((0, True), (-1, False)):
+        message = new(
+            fix, header=header(), status=new('sensor_msgs/msg/NavSatStatus', status=status, service=1), latitude=47.123456789,
+            longitude=-122.98765432, altitude=12.0, position_covariance=np.full(9, 4.0), position_covariance_type=1,
+        )  # fmt: skip
+        item = series('/fix', KINDS[fix], fix, TYPES, [(1.0, cdr(message, fix))])
+        assert item.head is not None
+        row = dict(zip(item.head['names'], np.frombuffer(item.body[8:], '<f4').astype(float), strict=True))
+        if has_fix:
+            assert row['lat'] + row['lat_rest'] == pytest.approx(47.123456789, abs=1e-8)
+            assert row['lon'] + row['lon_rest'] == pytest.approx(-122.98765432, abs=1e-8)
+            assert row['error'] == 2.0
+        else:
+            assert math.isnan(row['lat'])

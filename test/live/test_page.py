@@ -593,7 +593,7 @@ def test_an_outage_of_ten_seconds(browser: Browser, tmp_path: Path, monkeypatch:
         monkeypatch.setattr(server_module, '_listener', lambda *_: listener)
         served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', bind=ROBOT), monkeypatch)
         stack.callback(served.close)
-        served.loop.call_soon_threadsafe(served.server.viewers.on_graph, {'/imu': IMU})
+        served.loop.call_soon_threadsafe(served.server.viewers.on_graph, {'/imu': (IMU, 1)})
         stack.callback(served.every(0.03, numbered))
         program = machines.program(str(CHROMIUM), tmp_path)
         elsewhere = stack.enter_context(closing(browser.browser_type.launch(executable_path=program, args=FLAGS)))
@@ -757,7 +757,7 @@ def test_names_are_text_and_fit(browser: Browser, tmp_path: Path, monkeypatch: p
         monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
         monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: gaps)
         monkeypatch.setattr(served.server.acts, '_ask', lambda *_: {'ok': True, 'message': HOSTILE + LONG})
-        graph = {f'/{name}/{place}': 'sensor_msgs/msg/Imu' for name in NAMES for place in (1, 2)}
+        graph = {f'/{name}/{place}': ('sensor_msgs/msg/Imu', 1) for name in NAMES for place in (1, 2)}
         served.loop.call_soon_threadsafe(served.server.viewers.on_graph, graph)
         page = opened(browser, served.server.url)
         press(page.get_by_role('button', name='Sign in', exact=True))

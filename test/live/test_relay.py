@@ -25,7 +25,7 @@ from shadowhound_data_logger.live.kinds import KINDS, LiveItem, table_item
 from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 
 CAMERA, IMU = '/camera', '/imu'
-GRAPH = {CAMERA: COMPRESSED_IMAGE, IMU: 'sensor_msgs/msg/Imu'}
+GRAPH = {CAMERA: (COMPRESSED_IMAGE, 1), IMU: ('sensor_msgs/msg/Imu', 1)}
 VIEWERS = 10
 GIVEN = relay.Relay._given
 

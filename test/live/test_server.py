@@ -119,7 +119,10 @@ def test_video_is_suggested_to_who_has_had_a_narrow_link_for_a_while(tmp_path: P
     viewer = Viewer()
     one: Any = SimpleNamespace(viewer=viewer, narrow_s=None, tell=told.append)
     server = closed_server(tmp_path)
-    server.cameras.no_video, server.viewers.graph = '', {CAMERA: COMPRESSED_IMAGE, '/cloud': 'sensor_msgs/msg/PointCloud2'}
+    server.cameras.no_video, server.viewers.graph = (
+        '',
+        {CAMERA: (COMPRESSED_IMAGE, 1), '/cloud': ('sensor_msgs/msg/PointCloud2', 1)},
+    )
     clock = iter(range(10_000))
 
     def suggested(seconds: float, *, narrow: bool) -> int:
@@ -154,7 +157,7 @@ def test_a_page_on_a_narrow_link_is_told_so(tmp_path: Path, monkeypatch: pytest.
     async def run() -> dict[str, Any]:
         async with serving(tmp_path, monkeypatch, '127.0.0.1') as page:
             page.server.cameras.no_video = ''
-            page.server.viewers.on_graph({CAMERA: COMPRESSED_IMAGE})
+            page.server.viewers.on_graph({CAMERA: (COMPRESSED_IMAGE, 1)})
             frames = Frames()
             async with (
                 aiohttp.ClientSession(headers={'Origin': page.origin}) as session,

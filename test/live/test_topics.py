@@ -29,7 +29,9 @@ class Tab:
 
     def __init__(self, ws: aiohttp.ClientWebSocketResponse) -> None:
         self._ws = ws
-        self.topics: set[str] = set()
+        self.topics: list[str] = []
+        self.told: dict[str, tuple[str, str, int]] = {}
+        self.heads: dict[str, dict[str, Any]] = {}
         self.at: dict[str, set[float]] = {}
 
     async def watch(self, *topics: str) -> None:
@@ -41,8 +43,10 @@ class Tab:
         async for message in self._ws:
             for head, _ in frames.take(message.data):
                 if head['kind'] == 'topics':
-                    self.topics = {topic for topic, *_ in head['topics']}
+                    self.topics = [topic for topic, *_ in head['topics']]
+                    self.told = {topic: (kind, name, count) for topic, kind, name, count in head['topics']}
                 elif head['topic']:
+                    self.heads[head['topic']] = head
                     self.at.setdefault(head['topic'], set()).add(head['at'])
                 elif head['kind'] == 'figures':  # each second, in which a page says something too
                     await self._ws.send_json({'ping': 1})
@@ -56,7 +60,7 @@ class Robot:
     def __init__(self, server: LiveServer, node: Any) -> None:
         from sensor_msgs.msg import Image, Imu
 
-        self._origin = f'http://127.0.0.1:{server.port}'
+        self._origin, self.node = f'http://127.0.0.1:{server.port}', node
         types = {IMU: Imu, OTHER: Imu, RAW_IMAGE: Image}
         self.publishers = {topic: node.create_publisher(kind, topic, 10) for topic, kind in types.items()}
 
@@ -75,7 +79,7 @@ class Robot:
             tab = Tab(ws)
             reading = asyncio.create_task(tab.read())
             try:
-                await until(lambda: tab.topics >= {IMU, OTHER, RAW_IMAGE}, 'the topics are found')
+                await until(lambda: {*tab.topics} >= {IMU, OTHER, RAW_IMAGE}, 'the topics are found')
                 yield tab
             finally:
                 reading.cancel()
@@ -175,5 +179,90 @@ def test_a_raw_image_is_encoded_once_for_all_viewers(tmp_path: Path, monkeypatch
             assert found.read() == {RAW_IMAGE: 1}
             await until(lambda: len(made) == len({at for tab in tabs for at in tab.at[RAW_IMAGE]}), f'{made} encoded')
             assert tabs[0].at == tabs[1].at == tabs[2].at
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_topics_with_a_publisher_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever their names: of more topics than can be told, those are cut that nobody publishes."""
+    from shadowhound_data_logger.live import topics
+
+    monkeypatch.setattr(topics, 'MAX_TOPICS', 20)
+
+    async def doing(found: Robot) -> None:
+        from sensor_msgs.msg import Imu
+        from std_msgs.msg import Float32
+
+        for number in range(30):
+            found.node.create_subscription(Imu, f'/a_{number}', lambda _: None, 1)
+        publisher = found.node.create_publisher(Float32, '/zzz', 1)
+        async with found.tab() as tab:
+            await until(lambda: '/zzz' in tab.topics, 'the topic is told')
+            assert len(tab.topics) == 20
+            publishers = [count for *_, count in tab.told.values()]
+            assert publishers == sorted(publishers, key=lambda count: count < 1)
+            assert tab.told['/zzz'] == ('', 'std_msgs/msg/Float32', 1)
+            assert tab.told[IMU] == ('imu', 'sensor_msgs/msg/Imu', 1)
+            assert tab.told['/a_0'] == ('imu', 'sensor_msgs/msg/Imu', 0)
+            found.node.destroy_publisher(publisher)
+            await until(lambda: '/zzz' not in tab.topics, 'the topic is gone')
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_any_topic_is_a_tree_and_its_numbers_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one subscription, which exists only while a viewer watches it; a path that leads nowhere says so."""
+    wave, number, wrong = '/wave#', '/wave#data', '/wave#data.x'
+
+    async def doing(found: Robot) -> None:
+        from std_msgs.msg import Float32
+
+        found.publishers['/wave'] = found.node.create_publisher(Float32, '/wave', 1)
+        async with found.tab() as tab:
+            await until(lambda: '/wave' in tab.topics, 'the topic is found')
+            assert found.read() == {}
+            await tab.watch(wave, number)
+
+            def came() -> bool:
+                found.publishers['/wave'].publish(Float32(data=7.5))
+                return len(tab.at.get(wave, ())) > 3 and len(tab.at.get(number, ())) > 3
+
+            await until(came, 'it is shown', every_s=0.05)
+            head = tab.heads[wave]
+            assert head['tree'] == {'t': 'std_msgs/msg/Float32', 'f': {'data': 7.5}}
+            assert head['bytes'] == 8
+            assert 5 < head['hz'] < 21
+            assert tab.heads[number]['names'] == ['data']
+            assert found.read() == {'/wave': 1}
+            await tab.watch(wrong)
+            await until(lambda: (came(), wrong in tab.heads)[1], 'why it is not shown', every_s=0.05)
+            assert 'is not a number of this message' in tab.heads[wrong]['text']
+            await tab.watch()
+            await until(lambda: found.read() == {}, 'nobody watches', SOON_S)
+
+    run(tmp_path, monkeypatch, doing)
+
+
+def test_what_was_published_once_is_shown_to_all_who_come_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map, to the first viewer and to a second one; also when its publisher starts after the viewer began to watch."""
+
+    async def doing(found: Robot) -> None:
+        from nav_msgs.msg import OccupancyGrid
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        message = OccupancyGrid(data=[0, 100])
+        message.info.width, message.info.height, message.info.resolution = 2, 1, 0.05
+        found.node.create_publisher(OccupancyGrid, '/map', latched).publish(message)
+        waiting = found.node.create_subscription(OccupancyGrid, '/later', lambda _: None, latched)
+        async with found.tab() as first, found.tab() as second:
+            await until(lambda: {'/map', '/later'} <= {*first.topics}, 'the topics are found')
+            await first.watch('/map', '/later')
+            await until(lambda: '/map' in first.heads, 'the map is shown')
+            await second.watch('/map', '/map#')
+            await until(lambda: {'/map', '/map#'} <= {*second.heads}, 'the map is shown to the second viewer')
+            found.node.create_publisher(OccupancyGrid, '/later', latched).publish(message)
+            await until(lambda: '/later' in first.heads, 'the later map is shown')
+        assert waiting is not None
 
     run(tmp_path, monkeypatch, doing)

@@ -80,7 +80,7 @@ class Robot:
 async def robot(folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> AsyncIterator[Robot]:
     async with serving(folder, monkeypatch, '127.0.0.1', **settings) as page:
         page.server.cameras.no_video = ''
-        page.server.viewers.on_graph({CAMERA: COMPRESSED_IMAGE})
+        page.server.viewers.on_graph({CAMERA: (COMPRESSED_IMAGE, 1)})
         found = Robot(page)
         task = asyncio.create_task(found.publish())
         try:
