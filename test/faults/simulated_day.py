@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.config import SpoolSettings, StoreSettings, Up
 from shadowhound_data_logger.core.model import DataObject, ObjectInfo, Outcome, State
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores import s3
+from shadowhound_data_logger.stores import s3_puts
 from shadowhound_data_logger.stores.s3 import S3Store
 
 BUCKETS: Final = ('sensor-data', 'trajectories')
@@ -65,7 +65,8 @@ class Process:
         upload = UploadSettings(threads=rng.randint(1, MAX_THREADS))
         store = S3Store(StoreSettings(endpoint_url='http://simulated'), upload)
         parts: Any = store
-        parts._s3, parts._creating = line, VirtualLock(time)
+        parts._s3 = parts._puts._s3 = parts._puts._buckets._s3 = line
+        parts._puts._buckets._creating = VirtualLock(time)
         self.uploader = Uploader(self.spool, store, upload, self._settle, monotonic=time, rng=rng)
         parts = self.uploader
         parts._schedule.rest = time.rest_on(parts._schedule)
@@ -82,7 +83,7 @@ class Process:
         """As ``kill -9``: what is on its way stays so, what is in memory is gone, nothing is closed in order."""
         self._end()
         parts: Any = self.spool
-        parts._index.close()
+        parts._connections.writing.close()
         os.close(parts._session._lock)
 
     def stop(self) -> None:
@@ -139,7 +140,7 @@ class Day:
 
     def run(self) -> Report:
         with ExitStack() as opened:
-            opened.enter_context(mock.patch.object(s3, 'time', SimpleNamespace(monotonic=self._time)))  # for its pauses
+            opened.enter_context(mock.patch.object(s3_puts, 'time', SimpleNamespace(monotonic=self._time)))  # for its pauses
             opened.callback(self._time.end)
             self._plan()
             self._drain()

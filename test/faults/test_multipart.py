@@ -24,7 +24,7 @@ from stores.spooled import Spool
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import StoreError
 from shadowhound_data_logger.core.model import Put, SpooledObject
-from shadowhound_data_logger.stores import content, s3
+from shadowhound_data_logger.stores import content, s3_puts
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs
@@ -41,7 +41,7 @@ TEST = Path(__file__).parents[1]
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(s3, 'MULTIPART_BYTES', PART)
+    monkeypatch.setattr(s3_puts, 'MULTIPART_BYTES', PART)
     monkeypatch.setattr(content, 'PART_BYTES', PART)
 
 
@@ -165,8 +165,8 @@ def test_kill_between_parts(store: S3Store, front: Front, seaweed: Tower, item: 
 from pathlib import Path, PosixPath
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.model import SpooledObject
-from shadowhound_data_logger.stores import content, s3
-content.PART_BYTES = s3.MULTIPART_BYTES = {PART}
+from shadowhound_data_logger.stores import content, s3, s3_puts
+content.PART_BYTES = s3_puts.MULTIPART_BYTES = {PART}
 store = s3.S3Store(StoreSettings(endpoint_url={front.url!r}), UploadSettings())
 store.open()
 store.put({item!r})

@@ -16,7 +16,7 @@ from stores.spooled import MOTO, QUICK, Spool
 from shadowhound_data_logger.core.config import StoreSettings
 from shadowhound_data_logger.core.errors import ForeignObject, ObjectRefused
 from shadowhound_data_logger.core.model import Put, SpooledObject
-from shadowhound_data_logger.stores import content, s3
+from shadowhound_data_logger.stores import content, s3_puts
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -30,7 +30,7 @@ KEY = "thor/rosbags/patrol's(1)+@=/patrol_0.mcap"
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is large here is a fraction of a slice."""
-    monkeypatch.setattr(s3, 'MULTIPART_BYTES', SMALLEST_PART)
+    monkeypatch.setattr(s3_puts, 'MULTIPART_BYTES', SMALLEST_PART)
     monkeypatch.setattr(content, 'PART_BYTES', SMALLEST_PART)
 
 
@@ -113,7 +113,7 @@ def test_what_is_not_large_is_one_request(server: S3Store, spool: Spool, bucket:
 def test_parts_that_are_there_are_not_sent_again(server: S3Store, item: SpooledObject, bucket: str) -> None:
     """A try that ended after two parts is taken up by another store, which sends the third alone."""
     server.put(replace(item, key='other'))
-    uploads = server._multipart._uploads
+    uploads = server._puts._multipart._uploads
     upload = uploads.begin(item)
     with item.path.open('rb') as file:
         for number, part in enumerate(content.parts(file.fileno(), 2 * SMALLEST_PART, hashlib.sha256()), 1):
@@ -128,7 +128,7 @@ def test_parts_that_are_there_are_not_sent_again(server: S3Store, item: SpooledO
 def test_an_upload_of_other_content_is_aborted(server: S3Store, item: SpooledObject, spool: Spool, bucket: str) -> None:
     """So is one without a part: neither may lend its metadata to ours, and both would take room for ever."""
     server.put(replace(item, key='other'))
-    uploads = server._multipart._uploads
+    uploads = server._puts._multipart._uploads
     other = spool(KEY, CONTENT[::-1])
     upload = uploads.begin(other)
     with other.path.open('rb') as file:
@@ -151,7 +151,7 @@ def test_a_key_that_is_taken_meanwhile(server: S3Store, item: SpooledObject, spo
         return False  # and the server has the last word
 
     server.put(spool('a', b'x'))
-    assert not server._multipart.put(item, look)
+    assert not server._puts._multipart.put(item, look)
     assert looks == [Put.CREATED]
     assert server.get(bucket, KEY) == b'theirs'
     assert under_way(server, bucket) == []

@@ -17,7 +17,7 @@ from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.s3 import S3Store
 
 
-@pytest.mark.parametrize(('condition', 'words'), [('not implemented', 'does not know'), ('ignored', 'ignores')])
+@pytest.mark.parametrize(('condition', 'words'), [('not implemented', 'does not implement'), ('ignored', 'ignores')])
 def test_a_server_without_conditional_puts(
     condition: str, words: str, opened: Callable[..., S3Store], spool: Spool, bucket: str, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -18,7 +18,7 @@ from stores.spooled import QUICK, Spool, with_room
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import Put
-from shadowhound_data_logger.stores import s3
+from shadowhound_data_logger.stores import s3_puts
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
@@ -109,7 +109,7 @@ def test_a_large_object_is_streamed(
     opened: Callable[..., S3Store], spool: Spool, seaweed: Tower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Beyond the limit the file is sent from the disk, with checksum, hash and condition as ever."""
-    monkeypatch.setattr(s3, 'STREAM_BYTES', 1000)
+    monkeypatch.setattr(s3_puts, 'STREAM_BYTES', 1000)
     store = opened(seaweed.store_settings())
     item = spool('large', b'0123456789' * 500_000)
     assert with_room(lambda: store.put(item)) is Put.CREATED

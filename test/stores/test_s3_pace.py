@@ -16,7 +16,8 @@ from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import ForeignObject, StoreUnavailable
 from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT, LATE_S, PIECE_S
-from shadowhound_data_logger.stores.s3 import LOOK_FIRST_BYTES, S3Store
+from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_puts import LOOK_FIRST_BYTES
 
 
 class Wire(ThreadingHTTPServer):

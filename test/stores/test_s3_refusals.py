@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.errors import (
     StoreUnavailable,
 )
 from shadowhound_data_logger.core.model import Put, SpooledObject
-from shadowhound_data_logger.stores import open_store, s3
+from shadowhound_data_logger.stores import open_store, s3_puts
 from shadowhound_data_logger.stores.content import chunks
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -45,13 +45,13 @@ def test_a_file_that_goes_between_its_check_and_its_sending(
     opened: Callable[..., S3Store], spool: Spool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Evicted in that instant, say: it is refused as gone, and nothing but a store's error leaves the store."""
-    item = spool('a', bytes(s3.STREAM_BYTES + 1))
+    item = spool('a', bytes(s3_puts.STREAM_BYTES + 1))
 
     def gone(given: SpooledObject) -> Iterator[bytes]:
         yield from chunks(given)
         given.path.unlink()
 
-    monkeypatch.setattr(s3, 'chunks', gone)
+    monkeypatch.setattr(s3_puts, 'chunks', gone)
     with served(FakeS3()) as server:
         store = opened(StoreSettings(endpoint_url=server.url, access_key_id='KEYID', secret_access_key=SECRET))
         assert 'it is gone' in error_of(ObjectRefused, lambda: store.put(item))
@@ -92,7 +92,7 @@ def test_a_bucket_that_cannot_be_created(
         return store.put(spool('a', b'x', bucket='allowed'))
 
     said = error_of(BucketMissing, put, settings.secret_access_key or '')
-    assert f'there is no bucket allowed on Tower at {seaweed.endpoint_url}' in said
+    assert f'the bucket allowed does not exist at {seaweed.endpoint_url}' in said
     assert 's3 mb s3://allowed' in said
     opened(seaweed.store_settings()).put(spool('b', b'x', bucket='allowed'))
     assert put() is Put.CREATED
@@ -108,7 +108,7 @@ def test_a_refused_bucket_is_not_asked_for_by_each_object(
             said = error_of(BucketMissing, lambda: store.put(spool('a', b'x')))
             assert 'may not create it' in said
         assert server.creations == 1
-        monkeypatch.setattr(s3, 'BUCKET_PAUSE_S', 0.0)
+        monkeypatch.setattr(s3_puts, 'BUCKET_PAUSE_S', 0.0)
         error_of(BucketMissing, lambda: store.put(spool('a', b'x')))
         assert server.creations == 2
 

@@ -24,7 +24,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import Put, SpooledObject
-from shadowhound_data_logger.stores import content, s3
+from shadowhound_data_logger.stores import content, s3_puts
 from shadowhound_data_logger.stores.s3 import S3Store
 
 pytestmark = pytest.mark.seaweedfs
@@ -38,10 +38,10 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
-from shadowhound_data_logger.stores import content, s3
+from shadowhound_data_logger.stores import content, s3, s3_puts
 sys.path.insert(0, sys.argv[1])
 from tower.test_parts import KEY, PART, slice_of
-content.PART_BYTES = s3.MULTIPART_BYTES = PART
+content.PART_BYTES = s3_puts.MULTIPART_BYTES = PART
 settings = StoreSettings(endpoint_url=sys.argv[3], access_key_id=sys.argv[4], secret_access_key=sys.argv[5])
 store = s3.S3Store(settings, UploadSettings())
 store.open()
@@ -82,7 +82,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is large here is a fraction of a slice."""
-    monkeypatch.setattr(s3, 'MULTIPART_BYTES', PART)
+    monkeypatch.setattr(s3_puts, 'MULTIPART_BYTES', PART)
     monkeypatch.setattr(content, 'PART_BYTES', PART)
 
 
