@@ -104,7 +104,7 @@ def test_memory_is_bounded(request: pytest.FixtureRequest, store: ObjectStore, i
 
 def test_what_is_not_large_is_one_request(server: S3Store, spool: Spool, bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Up to the limit an object is put as a whole."""
-    monkeypatch.setattr(server, '_multipart', None)
+    monkeypatch.setattr(server._puts, '_multipart', None)
     assert server.put(spool('a', CONTENT[:SMALLEST_PART])) is Put.CREATED
     with pytest.raises(AttributeError):
         server.put(spool('b', CONTENT[: SMALLEST_PART + 1]))
