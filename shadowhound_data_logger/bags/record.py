@@ -1,4 +1,4 @@
-"""Records a bag for some time and delivers it to the store: the integration guide's ``record_and_upload_rosbag``.
+"""Records a bag for some time and delivers it to the store: ``record_and_upload_rosbag``.
 
     from shadowhound_data_logger.bags import record_and_upload_rosbag
     record_and_upload_rosbag('patrol', 60)
@@ -26,10 +26,11 @@ DEADLINE_S: Final = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A bag that is whole, and safe."""
+    """A bag that is complete, in the store or in the spool."""
 
     robot: str
     bag: str
+    """Its name."""
     messages: int
     slices: int
     bytes: int
@@ -38,21 +39,27 @@ class Recorded:
     dropped: int
     """Messages that this machine was too slow to write, or had no disk for."""
     delivered: bool
-    """Whether the store has all of it; else the spool does, and it is delivered later."""
+    """Whether the store has all of it. Otherwise the spool has the rest and delivers it later."""
     last_error: str
-    """Why it does not, where that is known."""
+    """Why it is not delivered, if that is known."""
 
     @property
     def where(self) -> str:
-        """What it is in the store, or will be."""
+        """Its URL in the store."""
         return f's3://sensor-data/{self.robot}/rosbags/{self.bag}/'
 
 
 def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
-    """Record the robot's sensors for so many seconds as ``<mission_name>_YYYYMMDD_HHMMSS`` and upload it.
+    """Record a bag of the topics that the node logs by default, at full rate, and upload it while it is recorded.
 
-    Recorded is what the node logs by default, each topic at full rate. Raises BagError when nothing could be recorded. A Tower
-    that is away is not an error: ``delivered`` says so.
+    A server that is unreachable is not an error: ``delivered`` is then False, and the rest waits in the spool.
+
+    Args:
+        mission_name: the bag is called ``<mission_name>_YYYYMMDD_HHMMSS``.
+        duration_s: for how long, in seconds.
+
+    Raises:
+        BagError: nothing could be recorded.
     """
     found = record(mission_name, duration_s)
     print(f'Uploaded: {found.where}' if found.delivered else f'Waits in the spool: {found.where}')  # noqa: T201 - as the guide's

@@ -1,6 +1,6 @@
-"""``python -m shadowhound_data_logger.cli.pages``: docs/parameters.md and docs/commands.md, made from the code.
+"""``python -m shadowhound_data_logger.cli.pages``: docs/parameters.md and docs/commands.md, generated from the code.
 
-The pages cannot drift: a test compares them with what this writes, and the environment variables with those that are read.
+A test compares the pages with what this writes, and the environment variables with those that the code reads.
 """
 
 from __future__ import annotations
@@ -22,22 +22,21 @@ COLUMNS: Final = ('parameter', 'default', 'allowed', 'live', '')
 HEAD: Final = """\
 # Parameters
 
-*Made from the code by `make docs`: change `shadowhound_data_logger/core/options.py`, not this page.*
+*Generated from the code by `make docs`: change `shadowhound_data_logger/core/options.py`, not this page.*
 
-The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`;
-[go2.yaml](../launch_configs/go2.yaml) has all of them with their defaults: copy it and delete what you do not change) or one by
-one (`--ros-args -p camera.rate_hz:=5.0`). An unknown name or a value that is not allowed stops the start with exit code 2, and
-the message says what is allowed.
+The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`) or one by one
+(`--ros-args -p camera.rate_hz:=5.0`). `shadowhound-data init` writes a file for your robot;
+[go2.yaml](../launch_configs/go2.yaml) has all parameters with the defaults for a Unitree Go2. With an unknown name
+or an invalid value the node exits with code 2, and the message says what is allowed.
 
-**Live** parameters can be changed while the node runs, the others only at its start; a value that is not allowed changes nothing:
+**Live** parameters can be changed while the node runs, the others only when it starts:
 
     shadowhound-data node set camera.rate_hz 5.0              # on the robot
     ros2 param set /sensor_logger_node camera.rate_hz 5.0     # with ROS, from anywhere
-
-`shadowhound-data node params` lists their present values.
+    shadowhound-data node params                              # the present values
 
 ## What most people set
-A whole parameter file; where the data goes is in the [environment](#environment-variables).
+A complete parameter file. Where the data goes is in the [environment](#environment-variables).
 
 ```yaml
 """
@@ -45,38 +44,44 @@ EXAMPLE: Final = """\
 /**:
   ros__parameters:
     robot: tachi
-    camera: {rate_hz: 5.0}            # pictures a second; 0.0 stores every one
-    lidar: {enabled: false}           # do not log the clouds
-    spool: {max_bytes: 100000000000}  # disk for what is not delivered yet: 100 GB
-    upload: {max_mbps: 20.0}          # leave the WiFi to others
+    camera: {rate_hz: 5.0}            # images per second; 0.0 stores all of them
+    lidar: {enabled: false}           # do not log point clouds
+    spool: {max_bytes: 100000000000}  # disk space for what is not delivered yet: 100 GB
+    upload: {max_mbps: 20.0}          # leave bandwidth to others
     bag: {record: mission}            # a bag of each mission, at full rate
     events: {topics: [imu, odom]}     # keep the last 30 s, for an event
 """
 COMMANDS: Final = """\
 # Commands
 
-*Made from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
+*Generated from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
 
-`shadowhound-data VERB --help` describes each verb with all of its options; each prints JSON with `--json`. Times
-are UTC, and all of them are written alike: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
+`shadowhound-data VERB --help` describes each verb with all of its options. Most print JSON with `--json`. Times are UTC and are
+written alike everywhere: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
 An error names the verb, what is wrong and where, and on the next line what to do:
 
-    shadowhound-data bag info: there is no bag patrol of thor in the folder /home/hound/.shadowhound/store
-      -> the store has no bag of thor; --robot names another robot
+    shadowhound-data bag info: there is no bag patrol of rover in the folder /home/hound/.shadowhound/store
+      -> the store has no bag of rover; --robot names another robot
 
-With `--json` (and `--format json`) an error is JSON as well: one line on standard error, and nothing on standard output.
+With `--json` (and `--format json`) an error is one line of JSON on standard error, and nothing is printed on standard output:
 
     {"error": "there is no sensor 'camra'", "remedy": "is it 'camera'?", "verb": "shadowhound-data query", "exit_code": 2}
 
-Names that nothing in the store has (robot, sensor, topic, field, mission, mission type, policy, label, bag) are wrong usage. If
-all names exist and nothing matches, the answer is empty and the exit code 0, in every format: `--format keys` prints nothing.
-What a terminal's encoding does not have is printed as its escape (`\\u5de1`).
+A name that does not exist in the store (robot, sensor, topic, field, mission, mission type, policy, label, bag) is a
+usage error. If all names exist and nothing matches, the answer is empty and the exit code is 0.
 
 ## Exit codes
-Of every verb; the node ends with 0, 1 or 2 in the same sense.
+The same for every verb; the node exits with 0, 1 or 2 in the same sense.
 
 """
+READERS: Final = {
+    'Operators': ('doctor', 'init', 'status', 'ledger', 'spool', 'node', 'live'),
+    'Agent authors': ('missions',),
+    'Researchers': ('query', 'search', 'fetch', 'pull', 'bag', 'label', 'export'),
+    'Administrators': ('lake', 'policy'),
+}
+"""Who uses a verb."""
 SENSOR: Final = 'SENSOR'
 """Stands for the name of any sensor."""
 
@@ -92,8 +97,8 @@ class Section(NamedTuple):
 SECTIONS: Final = (
     Section(
         'Choose what is logged',
-        'SENSOR is the name of any sensor: `camera.rate_hz`. The sensors that there are without any '
-        'setting are listed [below](#the-sensors).',
+        'SENSOR is the name of any sensor: `camera.rate_hz`. The sensors that exist without any settings are '
+        '[below](#the-sensors).',
         (
             'robot',
             'capture.topics',
@@ -108,58 +113,35 @@ SECTIONS: Final = (
     ),
     Section(
         'Choose how it is stored',
-        'What an object is, and what it is called in the bucket ([formats](formats.md)).',
-        ('SENSOR.format', 'SENSOR.batch_s', 'SENSOR.quality', 'SENSOR.dedup', 'SENSOR.key', 'SENSOR.bucket'),
+        'Object formats and keys are in [formats](formats.md).',
+        ('SENSOR.format', 'SENSOR.batch_s', 'SENSOR.quality', 'SENSOR.dedup'),
     ),
     Section(
         'Limit the disk',
-        'What waits for the store is on the disk of the robot. When that is full, the objects of the lowest '
-        'priority are deleted, the oldest first, and the ledger counts them as `evicted`.',
-        ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority', 'spool.remember_days'),
+        'Objects that wait for the store are on the disk of the robot. When it is full, those of the lowest priority '
+        'are deleted, the oldest first, and the ledger counts them as `evicted`.',
+        ('spool.max_bytes', 'spool.min_free_bytes', 'SENSOR.priority'),
     ),
     Section(
-        'Keep on the robot, and upload what is requested',
-        'What is `on_request` stays on the disk of the robot until it is requested ([keep](keep.md)).',
-        (
-            'SENSOR.ship',
-            'bag.ship',
-            'keep.max_bytes',
-            'keep.days',
-            'keep.thin_to_hz',
-            'keep.missions',
-            'keep.preview_s',
-            'keep.poll_s',
-        ),
+        'Keep data on the robot until it is requested',
+        'Data that is `on_request` stays on the disk of the robot until it is requested ([how](keep.md)).',
+        ('SENSOR.ship', 'bag.ship', 'keep.max_bytes', 'keep.days', 'keep.thin_to_hz', 'keep.missions'),
     ),
     Section(
-        'Upload fast, or leave the network to others',
-        '',
-        ('upload.max_mbps', 'upload.threads', 'upload.backoff_s', 'upload.read_timeout_s', 'shutdown.drain_s'),
-    ),
-    Section(
-        'Upload when it suits',
-        'Only while a rule holds, such as `lowstate:bms_state.soc > 30 and wifi.ssid == "lab"` '
-        '([thor](thor.md#upload-when-it-suits)).',
-        ('upload.when', 'events.when', 'keep.when'),
+        'Limit uploads',
+        'By bandwidth, or by a rule such as `lowstate:bms_state.soc > 30 and wifi.ssid == "lab"` '
+        '([how](thor.md#upload-when-it-suits)).',
+        ('upload.max_mbps', 'upload.when', 'events.when', 'keep.when'),
     ),
     Section(
         'Record bags',
-        'At full rate, whatever the sensors keep ([bags](bags.md)).',
-        (
-            'bag.record',
-            'bag.topics',
-            'bag.regex',
-            'bag.exclude',
-            'bag.slice_s',
-            'bag.slice_bytes',
-            'bag.compression',
-            'bag.priority',
-        ),
+        'At full rate, independent of what the sensors keep ([bags](bags.md)).',
+        ('bag.record', 'bag.topics', 'bag.regex', 'bag.exclude'),
     ),
     Section(
         'Keep what led to an event',
-        'The last seconds of some topics are held in memory, and an event makes a bag of them; off '
-        'while no topic is named ([bags](bags.md)).',
+        'The last seconds of some topics are held in memory, and an event makes a bag of them. Off while no topic is named '
+        '([bags](bags.md)).',
         (
             'events.topics',
             'events.regex',
@@ -168,78 +150,105 @@ SECTIONS: Final = (
             'events.post_s',
             'events.conditions',
             'events.log_event',
-            'events.max_s',
-            'events.max_bytes',
         ),
     ),
     Section(
         'Log missions',
         'What the node adds to the run of a mission of its robot ([missions](missions.md)).',
-        (
-            'mission.join',
-            'mission.frames',
-            'mission.frame_every_s',
-            'mission.battery',
-            'mission.temperature',
-            'mission.odometry',
-            'mission.period_s',
-        ),
+        ('mission.join', 'mission.frames', 'mission.frame_every_s', 'mission.battery', 'mission.temperature', 'mission.odometry'),
     ),
-    Section(
-        'Find it later',
-        'The catalog of what the store holds ([lake](lake.md)).',
-        ('catalog.enabled', 'catalog.period_s', 'SENSOR.statistics'),
+)
+ADVANCED: Final = Section(
+    'Advanced',
+    'The defaults of these fit almost every robot.',
+    (
+        'capture.rmw',
+        'queue.max_bytes',
+        'SENSOR.key',
+        'SENSOR.bucket',
+        'SENSOR.statistics',
+        'SENSOR.expected_hz',
+        'SENSOR.counter',
+        'clock.max_offset_s',
+        'clock.hold_s',
+        'spool.remember_days',
+        'catalog.enabled',
+        'catalog.period_s',
+        'upload.threads',
+        'upload.backoff_s',
+        'upload.read_timeout_s',
+        'shutdown.drain_s',
+        'keep.preview_s',
+        'keep.poll_s',
+        'bag.slice_s',
+        'bag.slice_bytes',
+        'bag.compression',
+        'bag.priority',
+        'events.max_s',
+        'events.max_bytes',
+        'mission.period_s',
     ),
-    Section(
-        'Know what was lost',
-        'Only where messages carry no numbers: without Fast DDS ([formats](formats.md)).',
-        ('SENSOR.expected_hz', 'SENSOR.counter'),
-    ),
-    Section(
-        'Clocks',
-        'Which stamps are trusted ([formats.md](formats.md#which-stamps-are-trusted)), and what happens before the clock is set.',
-        ('clock.max_offset_s', 'clock.hold_s'),
-    ),
-    Section('Fit the machine and its network', '', ('capture.rmw', 'queue.max_bytes')),
 )
 OWN: Final = """
 ## The sensors
-Where the default of a sensor is not the one above.
+The sensors of a Unitree Go2 exist without any settings; here are their topics, and their defaults where they differ
+from the ones above. Any other robot is logged by the types of its topics (`capture.topics`).
 
 """
 ENVIRONMENT: Final = """
 ## Environment variables
-Secrets are read from the environment alone: whatever is a ROS parameter can be seen by everybody on the network.
+Secrets are read from the environment only: a ROS parameter is visible to everyone on the network.
 
 | variable | default | |
 |---|---|---|
 """
+OTHERS: Final = """
+Rarely needed:
+
+| variable | default | |
+|---|---|---|
+"""
+USUAL: Final = {
+    'AWS_ENDPOINT_URL',
+    'AWS_ACCESS_KEY_ID',
+    'AWS_SECRET_ACCESS_KEY',
+    'AWS_SHARED_CREDENTIALS_FILE',
+    'MLFLOW_TRACKING_URI',
+    'MLFLOW_TRACKING_USERNAME',
+    'MLFLOW_TRACKING_PASSWORD',
+    'SHADOWHOUND_HOME',
+    'SHADOWHOUND_ROBOT',
+    'SHADOWHOUND_PARAMETERS',
+    'ROS_DOMAIN_ID',
+    'RMW_IMPLEMENTATION',
+}
+"""Variables that most people set."""
 VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
-    ('AWS_ENDPOINT_URL', 'a folder, `$SHADOWHOUND_HOME/store`', 'The S3 server, such as `http://TOWER_IP:9000`.'),
-    ('AWS_ENDPOINT_URL_S3', '', 'The same, for S3 alone: it takes precedence, as in all AWS programs.'),
+    ('AWS_ENDPOINT_URL', 'the folder `$SHADOWHOUND_HOME/store`', 'The S3 server, such as `http://SERVER:9000`.'),
+    ('AWS_ENDPOINT_URL_S3', '', 'The same for S3 only; takes precedence, as in all AWS programs.'),
     ('AWS_ACCESS_KEY_ID', '', 'Its access key.'),
     ('AWS_SECRET_ACCESS_KEY', '', 'Its secret key.'),
-    ('AWS_SESSION_TOKEN', '', 'Where the credentials are temporary.'),
-    ('AWS_REGION', '`us-east-1`', 'The region that requests are signed for; most servers of your own ignore it.'),
-    ('AWS_DEFAULT_REGION', '', 'The same, where `AWS_REGION` is not set.'),
-    ('SHADOWHOUND_HOME', '`~/.shadowhound`', 'Holds `spool/` and, without a server, `store/`.'),
-    ('SHADOWHOUND_ROBOT', '', 'The name of the robot, where the parameter `robot` is empty.'),
+    ('AWS_SESSION_TOKEN', '', 'For temporary credentials.'),
+    ('AWS_REGION', '`us-east-1`', 'The region that requests are signed for; most self-hosted servers ignore it.'),
+    ('AWS_DEFAULT_REGION', '', 'The same, if `AWS_REGION` is not set.'),
+    ('SHADOWHOUND_HOME', '`~/.shadowhound`', 'Contains `spool/` and, without a server, `store/`.'),
+    ('SHADOWHOUND_ROBOT', '', 'The name of the robot, if the parameter `robot` is empty.'),
 )
 """Name, default, meaning of each variable that config.py reads for the node and the command line."""
 OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
-    ('SHADOWHOUND_PARAMETERS', '', 'The parameter file: read by the systemd unit and the doctor, not by the node itself.'),
+    ('SHADOWHOUND_PARAMETERS', '', 'The parameter file; read by the systemd unit and the doctor, not by the node itself.'),
     ('SHADOWHOUND_POLICY', '', 'The registered model that `policy sync` and `policy run` follow.'),
-    ('SHADOWHOUND_POLICY_KEYS', '`policy-keys` in SHADOWHOUND_HOME', 'The folder of keys of who publishes policies.'),
+    ('SHADOWHOUND_POLICY_KEYS', '`policy-keys` in SHADOWHOUND_HOME', 'The folder with the keys that sign policies.'),
     (
         'SHADOWHOUND_KEY_PASSPHRASE',
         '',
-        'The passphrase of keys that `policy keys --encrypt` made; without it, the terminal is asked.',
+        'The passphrase of keys made with `policy keys --encrypt`; otherwise it is prompted for.',
     ),
-    ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens: read by its systemd unit.'),
+    ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens; read by its systemd unit.'),
     (
         'AWS_SHARED_CREDENTIALS_FILE',
         '`~/.aws/credentials`',
-        'The keys, where the two variables are not set; read again when the server refuses them ([how](thor.md#5-credentials)).',
+        'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#5-credentials)).',
     ),
     ('AWS_PROFILE', '`default`', 'The section of that file.'),
     ('HTTP_PROXY', '', 'The proxy for `http://` servers, as for `curl`; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
@@ -249,16 +258,16 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     (
         'MLFLOW_TRACKING_URI',
         'SQLite in `$SHADOWHOUND_HOME`',
-        'The MLflow server, such as `http://TOWER_IP:5001` ([missions](missions.md)).',
+        'The MLflow server, such as `http://SERVER:5001` ([missions](missions.md)).',
     ),
-    ('MLFLOW_TRACKING_USERNAME', '', 'Who logs there; else `~/.mlflow/credentials` says it.'),
-    ('MLFLOW_TRACKING_PASSWORD', '', 'And the password.'),
+    ('MLFLOW_TRACKING_USERNAME', '', 'The user name for it; otherwise from `~/.mlflow/credentials`.'),
+    ('MLFLOW_TRACKING_PASSWORD', '', 'The password.'),
     ('MLFLOW_TRACKING_SERVER_CERT_PATH', '', 'Certificate of your own authority, for MLflow.'),
-    ('MLFLOW_S3_ENDPOINT_URL', '`AWS_ENDPOINT_URL`', 'Where artifacts are, if the MLflow server does not proxy them.'),
-    ('ROS_DOMAIN_ID', '`0`', "The robot driver's."),
-    ('RMW_IMPLEMENTATION', 'that of ROS', "The robot's middleware ([thor.md](thor.md#4-middleware))."),
-    ('FASTRTPS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 2 (Humble, Jazzy). The live page omits `fastdds_shm.xml`.'),
-    ('FASTDDS_DEFAULT_PROFILES_FILE', '', 'The same of Fast DDS 3 (Kilted).'),
+    ('MLFLOW_S3_ENDPOINT_URL', '`AWS_ENDPOINT_URL`', 'The S3 server of artifacts, if MLflow does not proxy them.'),
+    ('ROS_DOMAIN_ID', '`0`', "That of the robot's driver."),
+    ('RMW_IMPLEMENTATION', 'that of ROS', "The robot's middleware ([how](thor.md#4-middleware))."),
+    ('FASTRTPS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 2 (Humble, Jazzy).'),
+    ('FASTDDS_DEFAULT_PROFILES_FILE', '', 'The profile of Fast DDS 3 (Kilted).'),
     ('CYCLONEDDS_URI', '', 'Interfaces, peers and buffers of Cyclone DDS.'),
 )
 """Those that libraries and the systemd units read."""
@@ -277,34 +286,55 @@ def main(*, write: bool) -> None:
 
 def commands() -> str:
     """The page on the verbs, as Markdown."""
+    verbs = {verb.name: verb for section in VERBS.values() for verb in section}
     parts = [COMMANDS, _row('code', 'meaning'), '|---|---|\n']
     parts += [_row(f'`{code.value}`', meaning) for code, meaning in MEANINGS.items()]
-    for title, verbs in VERBS.items():
-        parts += [f'\n## {title}\n', _row('verb', '', 'for example'), '|---|---|---|\n']
-        for verb in verbs:
-            parts += _verbs((verb.name,), verb.load())
+    for title, names in READERS.items():
+        parts += [f'\n## {title}\n', _row('verb', ''), '|---|---|\n']
+        parts += [_row(f'[`{name}`](#{name})', verbs[name].help) for name in names]
+        for name in names:
+            parts += _verb(name, verbs[name].load())
     return ''.join(parts)
 
 
-def _verbs(path: tuple[str, ...], verb: click.Command) -> Iterator[str]:
-    """A row of the verb, and of each verb of it."""
-    lines = ((verb.epilog or '').splitlines())[2:]
-    yield _row(f'`{" ".join(path)}`', verb.get_short_help_str(1000), '<br>'.join(f'`{line.strip()}`' for line in lines))
+def _verb(name: str, verb: click.Command) -> Iterator[str]:
+    """The section of a verb: its examples, and a row for each verb below it."""
+    yield f'\n### {name}\n{verb.get_short_help_str(1000)}\n\n'
+    yield from (f'    {line}\n' for line in _examples(verb))
     if isinstance(verb, click.Group):
-        for name, each in verb.commands.items():
-            yield from _verbs((*path, name), each)
+        yield '\n' + _row('verb', '', 'for example') + '|---|---|---|\n'
+        yield from _rows((name,), verb)
+
+
+def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
+    for name, verb in group.commands.items():
+        at = (*path, name)
+        listed = '<br>'.join(f'`{line}`' for line in _examples(verb))
+        yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000), listed)
+        if isinstance(verb, click.Group):
+            yield from _rows(at, verb)
+
+
+def _examples(verb: click.Command) -> list[str]:
+    return [line.strip() for line in (verb.epilog or '').splitlines()[2:]]
 
 
 def parameters() -> str:
     """The page on parameters and environment variables, as Markdown."""
     parts = [HEAD, EXAMPLE, '```\n']
     described = _described()
-    for section in SECTIONS:
-        parts += [f'\n## {section.title}\n', f'{section.text}\n\n' if section.text else '', _row(*COLUMNS)]
+    for section in (*SECTIONS, ADVANCED):
+        parts += [f'\n## {section.title}\n', f'{section.text}\n\n', _row(*COLUMNS)]
         parts += ['|---' * len(COLUMNS) + '|\n', *(described[name] for name in section.names)]
-    variables = (_row(f'`{name}`', default, text) for name, default, text in (*VARIABLES, *OTHER_VARIABLES))
-    parts += [OWN, *_sensors(), ENVIRONMENT, *variables]
-    return ''.join(parts)
+        if section is SECTIONS[-1]:
+            parts += [OWN, *_sensors(), ENVIRONMENT, *_variables(usual=True)]
+    return ''.join((*parts, OTHERS, *_variables(usual=False)))
+
+
+def _variables(*, usual: bool) -> Iterator[str]:
+    for name, default, text in (*VARIABLES, *OTHER_VARIABLES):
+        if (name in USUAL) == usual:
+            yield _row(f'`{name}`', default, text)
 
 
 def _described() -> dict[str, str]:
@@ -315,14 +345,14 @@ def _described() -> dict[str, str]:
             '',
             'a name',
             '',
-            "Leads every key; where empty, `SHADOWHOUND_ROBOT`, else the node's namespace, else `thor`.",
+            "The first part of every key. If empty: `SHADOWHOUND_ROBOT`, otherwise the node's namespace, otherwise `thor`.",
         ),
         'sensors': _row(
             '`sensors`',
             'all those below',
             'names',
             '',
-            'The sensors to log; this replaces the default. Other names also need `topics` ([how](extending.md#add-a-sensor)).',
+            'The sensors to log, instead of the default ones. Other names also need `topics` ([how](extending.md#add-a-sensor)).',
         ),
     }
     for prefix, kind in ((SENSOR, SensorSettings), *GROUPS.items()):
@@ -334,8 +364,8 @@ def _described() -> dict[str, str]:
 
 
 def _sensors() -> Iterator[str]:
-    """A row for each sensor that is there without any setting, with all in which it differs."""
-    yield _row('sensor', 'topics', 'defaults of its own')
+    """A row for each sensor that exists without any settings, with the defaults in which it differs."""
+    yield _row('sensor', 'topics', 'its defaults')
     yield '|---|---|---|\n'
     for sensor in Settings.load({}, {}).sensors:
         own = DEFAULT_SENSORS[sensor.name]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 
 class DataLoggerError(Exception):
-    """Base of everything this package raises on purpose."""
+    """Base of all errors of this package."""
 
     DEFAULT_REMEDY: ClassVar[str] = 'shadowhound-data doctor looks for the cause'
 
@@ -29,7 +29,7 @@ class DataLoggerError(Exception):
 
 
 class SettingError(DataLoggerError):
-    """A parameter or environment variable is unknown or wrong; ``data`` has name, value and allowed."""
+    """A parameter or environment variable is unknown or invalid; ``data`` has name, value and allowed."""
 
     DEFAULT_REMEDY = 'docs/parameters.md describes each parameter and environment variable'
 
@@ -43,19 +43,19 @@ class SettingError(DataLoggerError):
 
 
 class UnknownName(DataLoggerError):
-    """Nothing has the name that a question names; ``data['near']`` are the nearest names that something has."""
+    """A query names something that does not exist; ``data['near']`` has the most similar names that exist."""
 
     DEFAULT_REMEDY = 'shadowhound-data query "SELECT * FROM topics" lists what is stored'
 
 
 class NameRefused(DataLoggerError):
-    """A name that would become part of an object key is not safe there."""
+    """A name cannot be part of an object key."""
 
     DEFAULT_REMEDY = 'use letters, digits, "-", "_" and "."'
 
 
 class Rejected(DataLoggerError):
-    """A message could not be encoded; ``reason`` is the short word under which the ledger counts it."""
+    """A message could not be encoded; the ledger counts it under ``reason``."""
 
     DEFAULT_REMEDY = 'shadowhound-data ledger counts rejected messages by reason'
 
@@ -87,11 +87,11 @@ class StoreUnavailable(StoreError):
 
 
 class StoreUntrusted(StoreUnavailable):
-    """The store's certificate is not believed: nothing was sent, nothing will be until it is."""
+    """The store's certificate is not trusted: nothing is sent until it is."""
 
 
 class CredentialsRejected(StoreError):
-    """The store refuses the key, the signature or the clock: no object's fault, everything waits."""
+    """The store rejects the access key, the signature or the clock. Everything waits."""
 
 
 class BucketMissing(StoreError):
@@ -103,11 +103,11 @@ class AccessDenied(StoreError):
 
 
 class ObjectRefused(StoreError):
-    """Terminal for this object: the store will never take it (bad key, too large, ...)."""
+    """The store will never accept this object (bad key, too large, ...)."""
 
 
 class ForeignObject(StoreError):
-    """The key holds other content already; it is never overwritten."""
+    """The key already has other content, which is never overwritten."""
 
 
 class TrackingError(DataLoggerError):
@@ -117,15 +117,15 @@ class TrackingError(DataLoggerError):
 
 
 class TrackingUnavailable(TrackingError):
-    """Transient, or nobody's mission's fault: away, overloaded, credentials refused. The same request may succeed later."""
+    """Transient: unreachable, overloaded, credentials rejected. The same request may succeed later."""
 
 
 class TrackingRefused(TrackingError):
-    """Terminal for what was sent: the server will never take it."""
+    """The server will never accept what was sent."""
 
 
 class BagError(DataLoggerError):
-    """A bag, or a file that should be one, does not allow what is asked."""
+    """A bag, or a file that should be one, does not allow the operation."""
 
     DEFAULT_REMEDY = 'shadowhound-data bag list shows the bags there are'
 
@@ -137,7 +137,7 @@ class UnknownBag(BagError, UnknownName):
 
 
 class BagDamaged(BagError):
-    """A file of a bag is not whole, or its content contradicts itself; ``data['path']`` names it."""
+    """A file of a bag is damaged or incomplete; ``data['path']`` names it."""
 
     DEFAULT_REMEDY = (
         'shadowhound-data bag verify lists damaged files; bag repair recovers what they hold, bag fetch downloads them again'
@@ -151,9 +151,9 @@ class LakeError(DataLoggerError):
 
 
 class SinkUnavailable(LakeError):
-    """A server that is sent the catalog gives no answer, or asks to wait."""
+    """A server that the catalog is sent to does not answer, or is overloaded."""
 
-    DEFAULT_REMEDY = 'run it again: it goes on where it stopped'
+    DEFAULT_REMEDY = 'run it again: it continues where it stopped'
 
 
 class PolicyError(DataLoggerError):
@@ -163,7 +163,7 @@ class PolicyError(DataLoggerError):
 
 
 class PolicyRefused(PolicyError):
-    """A policy may not run here; ``data['reason']`` is the short word of docs/policies.md for why."""
+    """A policy must not run here; ``data['reason']`` is one of the reasons in docs/policies.md."""
 
     DEFAULT_REMEDY = 'docs/policies.md says what each reason means'
 

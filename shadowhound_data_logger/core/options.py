@@ -118,7 +118,7 @@ class SpoolSettings:
     """The durable spool."""
 
     max_bytes: int = _setting(
-        20 * GIBI, 'Most bytes of objects in the spool; beyond it the least important are evicted.', low=MEBI
+        20 * GIBI, 'Maximum bytes of objects in the spool; beyond it the least important are evicted.', low=MEBI
     )
     min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
     remember_days: float = _setting(
@@ -130,7 +130,9 @@ class SpoolSettings:
 class KeepSettings:
     """What stays on the robot until it is requested (``ship: on_request``)."""
 
-    max_bytes: int = _setting(500 * GIBI, 'Most bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI)
+    max_bytes: int = _setting(
+        500 * GIBI, 'Maximum bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI
+    )
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
     thin_to_hz: float = _setting(
         1.0, 'Once room runs short, old pictures and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
@@ -155,9 +157,9 @@ class UploadSettings:
     backoff_s: float = _setting(
         60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
     )
-    max_mbps: float = _setting(0.0, 'Most megabits a second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
+    max_mbps: float = _setting(0.0, 'Maximum megabits per second to an S3 server; 0 is no limit.', low=0.0, high=1e5, live=True)
     when: str = _setting(
-        '', 'Upload only while this rule holds: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
+        '', 'Upload only while this rule is true: \'lowstate:bms_state.soc > 30 and wifi.ssid == "lab"\'; empty: always.'
     )
 
 
@@ -192,7 +194,7 @@ class MissionSettings:
     """What the node does while a mission of its robot is active."""
 
     capture: str = _setting('always', 'When sensor data is stored: always, or only while a mission is active.', choices=CAPTURES)
-    join: bool = _setting(True, "Log the robot's state to the mission's run beside the agent.")
+    join: bool = _setting(True, "Log the robot's state to the mission's run in addition to what the agent logs.")
     period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
     battery: str = _setting(
         'lowstate:bms_state.soc|battery_state:percentage',
@@ -225,7 +227,7 @@ class BagSettings:
     slice_s: float = _setting(
         60.0, 'Seconds in one file of a bag; each is uploaded while the next one is recorded.', low=1.0, high=86_400.0
     )
-    slice_bytes: int = _setting(256 * MEBI, 'Most bytes in one file of a bag.', low=MEBI)
+    slice_bytes: int = _setting(256 * MEBI, 'Maximum bytes in one file of a bag.', low=MEBI)
     compression: str = _setting('zstd', 'Compression of the bag.', choices=COMPRESSIONS)
     priority: int = _setting(8, '0 is uploaded first and evicted last; 9 is uploaded last and evicted first.', low=0, high=9)
     ship: str = _setting(
@@ -246,13 +248,13 @@ class EventSettings:
     )
     max_s: float = _setting(
         120.0,
-        'Most seconds from the first trigger to the end of an event; then another event begins.',
+        'Maximum seconds from the first trigger to the end of an event; then another event begins.',
         low=1.0,
         high=1e5,
         live=True,
     )
     max_bytes: int = _setting(
-        64 * MEBI, 'Memory for what is kept; beyond it the oldest messages go, whatever pre_s is.', low=MEBI, live=True
+        64 * MEBI, 'Memory for what is kept; beyond it the oldest messages are dropped, whatever pre_s is.', low=MEBI, live=True
     )
     log_event: str = _setting(
         '.*', "An agent's log_event triggers an event where its name matches this regular expression; empty for none.", live=True
@@ -261,7 +263,7 @@ class EventSettings:
         ('',),
         'What triggers an event: "low_battery: lowstate:bms_state.soc < 20 for 5" is name, topic:field, comparison, seconds.',
     )
-    when: str = _setting('', 'Upload the bags of events only while this rule holds; empty: always, whatever upload.when says.')
+    when: str = _setting('', 'Upload the bags of events only while this rule is true; empty: always, whatever upload.when says.')
 
     @property
     def enabled(self) -> bool:

@@ -39,13 +39,13 @@ KEEP_BYTES: Final = 32 << 20
 
 
 class MissionDataset:
-    """A data set of messages with their aligned neighbours, by number (map-style).
+    """Messages of one sensor, the anchor, each with the messages of other sensors at that time. A map-style torch dataset.
 
-    Pickled it is a value: no socket, thread or content goes with it.
+    A sample is a dict of numpy arrays: ``image`` (height, width, 3) uint8 RGB or ``cloud`` (n, 4) float32, ``stamp_ns``, ``pose``
+    (x, y, yaw), ``battery_pct``; for each aligned sensor NAME its values, ``NAME_ok`` (whether there is one; for a window one per
+    row) and ``NAME_dt_s`` (how much later than the anchor it was). Missing values are NaN, a missing cloud has no points.
 
-    A sample is a dict: ``image`` (height, width, 3) uint8 RGB or ``cloud`` (n, 4) float32, ``stamp_ns``, ``pose`` (x y yaw),
-    ``battery_pct``; and for each aligned sensor NAME its numbers, ``NAME_ok`` (of a window for each row) and ``NAME_dt_s``, how
-    much later than the anchor it was. What is missing is NaN, of a cloud no point.
+    It can be pickled for the workers of a DataLoader: no socket, thread or content goes with it.
     """
 
     def __init__(
@@ -53,17 +53,24 @@ class MissionDataset:
         align: Mapping[str, float | Near | Window] | None = None, size: tuple[int, int] | None = None,
         drop_incomplete: bool = False, causal: bool = False, pull: bool = False, **flags: Any,
     ) -> None:  # fmt: skip
-        """``source``: None for the store that the environment names, or a folder of ``shadowhound-data fetch``.
+        """Query the catalog once; samples are read when they are needed.
 
-        ``align`` has sensors and how near in time they must be: seconds for the nearest message, or a ``Window``. With ``causal``
-        no aligned message counts that is later than its frame, as a robot would not have had it yet; ``pose`` and
-        ``battery_pct`` are the catalogue's all the same, for which later messages count. ``flags`` are those of ``lake.objects``,
-        for the anchor's objects; with ``as_of``, a time, the dataset is made of the tables as of then. ``drop_incomplete``
-        leaves out objects about whose time the tables have nothing of an aligned sensor; a stream leaves out single messages as
-        well. Objects without a date are not in it. With ``pull`` robots are asked for what they keep of these sensors, and it
-        waits until that has come; the log says how far it is.
+        Args:
+            source: a store, or a folder that ``shadowhound-data fetch`` wrote; by default the store that the environment names.
+            anchor: the sensor with images or clouds. Each of its messages is a sample.
+            align: sensor -> how near in time its message must be: seconds for the nearest message, or ``Near`` or ``Window``.
+            size: (height, width) to which images are scaled.
+            drop_incomplete: skip objects for which the tables have no data of an aligned sensor at that time. A stream also skips
+                single incomplete messages.
+            causal: no aligned message is later than its anchor, as a robot would not have had it yet. ``pose`` and
+                ``battery_pct`` come from the catalog, which interpolates.
+            pull: request what robots keep of these sensors, and wait until it has arrived. The log shows the progress.
+            flags: which objects of the anchor, as in ``lake.objects``, with ``as_of``. Objects without a date are never included.
 
-        Raises SettingError, StoreError, LakeError.
+        Raises:
+            SettingError: an argument is invalid.
+            StoreError: the store cannot be read.
+            LakeError: the catalog contradicts itself.
         """
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no tables
 
@@ -73,7 +80,7 @@ class MissionDataset:
         self._place, asked = selecting.place(source)
         self._lake = asked
         self.left_out = Findings()
-        """What of the catalogue is not in it, since it is not part of one; a child that was forked or spawned has none of it."""
+        """Rows and files of the catalog that were skipped because they are invalid. Empty in a worker process."""
         if pull:
             selecting.pull(asked, source, (anchor, *self.aligned), flags, self.left_out)
         self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.left_out)
@@ -110,7 +117,7 @@ class MissionDataset:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """The time of each sample by the catalogue: exact of single messages, evenly spread in an archive."""
+        """The time of each sample by the catalog: exact for single messages, evenly spread within an archive."""
         found = [
             track.stamps_ns(int(number))
             for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)
@@ -120,7 +127,7 @@ class MissionDataset:
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        """(samples, 3): x y yaw of each by the catalogue, at the times of ``stamps_ns``; NaN where it is not known."""
+        """(samples, 3): x, y and yaw by the catalog at the times of ``stamps_ns``; NaN where unknown."""
         found: list[NDArray[np.float64]] = []
         for track, chosen in zip(self._selection.anchors, self._chosen, strict=True):
             if (track.count[chosen] == 1).all():
@@ -131,10 +138,7 @@ class MissionDataset:
         return np.concatenate([np.empty((0, 3)), *found])
 
     def labels(self) -> list[list[str]]:
-        """The labels of each sample that stand now: those of its time and of its object.
-
-        A folder of ``shadowhound-data fetch`` has none. Raises StoreError.
-        """
+        """The current labels of each sample: those of its time and of its object. A folder has none. Raises StoreError."""
         from shadowhound_data_logger.lake import selecting  # noqa: PLC0415 - workers need no tables
 
         tracks = zip(self._selection.anchors, self._chosen, strict=True)
@@ -143,14 +147,18 @@ class MissionDataset:
         )
 
     def stream(self, *, shuffle: bool = False, seed: int = 0, rank: int = 0, ranks: int = 1) -> MissionStream:
-        """The same samples one after another, read ahead; a DataLoader takes it for an IterableDataset.
+        """The same samples as an iterable torch dataset, which reads ahead.
 
-        Each worker has whole shards; ``rank`` of ``ranks`` is for several processes that train together.
+        Args:
+            shuffle: in random order, by shards.
+            seed: of that order.
+            rank: of this process among those that train together; each gets other samples.
+            ranks: how many processes train together.
         """
         return MissionStream(self, seed if shuffle else None, (rank, ranks))
 
     def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[AlignedSample]:
-        """One share of (share, shares) of one epoch of a stream."""
+        """One share (number, total) of one epoch; ``MissionStream`` calls it."""
         references = shards.order(self._selection.anchors, self._chosen, share=share, seed=seed, epoch=epoch)
         with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
             samples = Samples(self._selection, prefetch)
@@ -181,7 +189,7 @@ class MissionDataset:
             waiting.append((reference, objects))
 
     def close(self) -> None:
-        """Ends the threads of this process; the next sample starts them again."""
+        """Stop the threads of this process; the next sample starts them again."""
         if self._reading is not None:
             self._reading[1].close()
             self._reading = None
@@ -216,9 +224,9 @@ class MissionDataset:
 
 
 class MissionStream:
-    """The samples of a data set one after the other, optionally shuffled.
+    """The samples of a ``MissionDataset`` one after another, optionally shuffled.
 
-    Iterable once, or several times at a time. A shuffled order depends on ``set_epoch`` and on earlier iterations.
+    Each iteration is one epoch; a shuffled one has another order. Several iterations may run at the same time.
     """
 
     def __init__(self, dataset: MissionDataset, seed: int | None, part: tuple[int, int]) -> None:
@@ -229,9 +237,9 @@ class MissionStream:
         _be_iterable()
 
     def set_epoch(self, epoch: int) -> None:
-        """The order of the next iteration is that of this epoch; the one after it has the next.
+        """Set the epoch of the next iteration.
 
-        Needed where each epoch has new workers; those of ``persistent_workers`` count by themselves.
+        Call it before each epoch if the DataLoader starts new workers for it; those of ``persistent_workers`` count on their own.
         """
         self._epoch = epoch
 

@@ -76,10 +76,10 @@ STEADY_NS: Final = SECOND // 10
 
 
 class ArchiveMember(NamedTuple):
-    """One message of an archive; that of a repeat has the content of the file that it repeats."""
+    """One message of an archive; a repeat has the content of the file that it repeats."""
 
     stamp_ns: int
-    """As in the archive: ``clock_offset_ns`` is not in it."""
+    """As in the archive, without the object's ``clock_offset_ns``."""
     body: bytes
     extension: str
 
@@ -90,9 +90,14 @@ def extension_of(key: str) -> str:
 
 
 def image(body: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
-    """(height, width, 3) uint8 in the order RGB; 16-bit depth and float images (height, width) as they are.
+    """An image object as an array: (height, width, 3) uint8 RGB; depth (uint16) and float images (height, width) unchanged.
 
-    ``size`` is (height, width): a JPEG is then decoded no larger than need be, and averaged down. Raises LakeError.
+    Args:
+        body: the bytes of the object (JPEG, PNG, TIFF).
+        size: (height, width) to scale to; a JPEG is then decoded no larger than necessary, which is faster.
+
+    Raises:
+        LakeError: this is not an image that can be read.
     """
     try:
         return _jpeg(body, size) if body.startswith(_JPEG) else _pillow(body, size)
@@ -133,7 +138,7 @@ def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
 
 
 def cloud(body: bytes) -> NDArray[np.float32]:
-    """(n, 4) float32: x y z intensity, metres; a field that the cloud does not have is NaN. Raises LakeError."""
+    """A PCD object as (n, 4) float32: x, y, z in meters and intensity; a missing field is NaN. Raises LakeError."""
     try:
         return _cloud(body)
     except _BROKEN as error:
@@ -141,7 +146,7 @@ def cloud(body: bytes) -> NDArray[np.float32]:
 
 
 def cloud_points(body: bytes) -> NDArray[Any]:
-    """(n,) structured: all fields of a cloud's points, under their names. Raises LakeError."""
+    """A PCD object as a structured array (n,) with all fields of its points. Raises LakeError."""
     try:
         found = _points(body)
         return found.view(np.dtype([(name.partition(':')[2], found.dtype[name]) for name in found.dtype.names or ()]))
@@ -177,7 +182,7 @@ def _cloud(body: bytes) -> NDArray[np.float32]:
 
 
 def records(body: bytes) -> list[dict[str, Any]]:
-    """The samples of a batch, or the one document as a list. Raises LakeError."""
+    """The messages of a JSON object: the samples of a batch, or its one document as a list. Raises LakeError."""
     try:
         check_size(len(body), _MOST_JSON_BYTES)
         document = shallow(orjson.loads(body))
@@ -190,7 +195,7 @@ def records(body: bytes) -> list[dict[str, Any]]:
 
 
 def members(body: bytes, extension: str) -> list[ArchiveMember]:
-    """The messages of a tar or zip in their order, repeats among them. Raises LakeError."""
+    """The messages of a tar or zip object in order, including repeats. Raises LakeError."""
     try:
         return list(_members(dict(_tar(body) if extension == 'tar' else _zip(body))))
     except _BROKEN as error:
@@ -238,10 +243,9 @@ def _is_stamp(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The numbers of the messages of one object, in the order of their times.
+    """The numbers of the messages of one object, ordered by time.
 
-    A field is a path such as ``pose.pose.position.x``; one that is a list, or lies in the elements of one, becomes several
-    columns.
+    A field is a path such as ``pose.pose.position.x``; a list, or a field of a list's elements, becomes several columns.
     """
 
     stamps: NDArray[np.int64]
@@ -251,6 +255,7 @@ class Table:
 
     @property
     def nbytes(self) -> int:
+        """How much memory it takes."""
         return self.stamps.nbytes + self.values.nbytes
 
 
@@ -268,9 +273,17 @@ def arrivals(times_ns: NDArray[np.int64], first_ns: int, last_ns: int) -> NDArra
 
 def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str], offset_ns: int,
           received_ns: tuple[int, int] | None = None) -> Table:  # fmt: skip
-    """The numbers of these messages of a type, of JSON. Raises LakeError where a field is missing or not a number.
+    """The numbers of the messages that ``records`` returned, as arrays.
 
-    With ``received_ns``, when the first and the last of them arrived, the times are those of ``arrivals``.
+    Args:
+        samples: the messages.
+        kind: their type, such as ``nav_msgs/msg/Odometry``.
+        fields: paths of numbers; none for the usual ones of the type (``FIELDS``), or all.
+        offset_ns: is added to the stamps: ``clock_offset_ns`` of the object's metadata, otherwise 0.
+        received_ns: when the first and the last of them arrived; the times are then those of arrival.
+
+    Raises:
+        LakeError: a field is missing or not a number.
     """
     asked = tuple(fields)
     stamps = np.array([sample['stamp_ns'] for sample in samples], np.int64) + offset_ns

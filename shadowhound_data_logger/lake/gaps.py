@@ -73,7 +73,7 @@ class StatedGap:
 
 
 class Stretch(NamedTuple):
-    """A time with the same state throughout: from ``begin_ns`` until before ``end_ns``."""
+    """A part of a time that has one state: complete, with losses, or unknown. ``end_ns`` is exclusive."""
 
     begin_ns: int
     end_ns: int
@@ -116,7 +116,7 @@ class Known:
 
     @property
     def complete_ns(self) -> int:
-        """Up to here losses are known: the watermark, within this time."""
+        """Up to here all losses are known: the watermark, within this time."""
         return next((each.begin_ns for each in self.stretches if each.is_open), self.end_ns)
 
     def between(self, begin_ns: int, end_ns: int) -> Known:
@@ -138,12 +138,24 @@ class Known:
 def known(robot: str, topic: str, since: str | datetime | int, until: str | datetime | int = 'now', *,  # noqa: PLR0913 - parts of a query
           sink: str = OBJECTS, source: Bucket | None = None, findings: Findings | None = None,
           by: str = BY_STAMP) -> Known:  # fmt: skip
-    """What is known about a topic from ``since`` until before ``until``: times as in ``query``, or in ns since 1970.
+    """What is known about a topic in a time: which parts are complete, have gaps, or are unknown.
 
-    Each stretch is complete, or has gaps, or is unknown. Without sequence numbers or a regular rate (``received-only``) losses
-    are unknown. For several times, call it once for all of them, and then ``Known.between``. Without a source, it reads the store
-    that the environment names. Invalid row files are ignored: they are in ``findings``, or the log warns. Raises SettingError,
-    StoreError.
+    Without sequence numbers or a regular rate (``received-only``) losses are unknown. For several times, call it once for all of
+    them and use ``Known.between``.
+
+    Args:
+        robot: its name.
+        topic: such as ``/imu``.
+        since: the start, as in ``query`` (``yesterday``, ``2h``, ``2026-11-20T12:30``), or in ns since 1970.
+        until: the end, exclusive.
+        sink: ``objects``, ``bags`` or ``events``.
+        source: the store; by default the one that the environment names.
+        findings: receives invalid row files, which are skipped; by default they are logged.
+        by: ``stamp``, or ``received`` for the times of arrival.
+
+    Raises:
+        SettingError: an argument is invalid.
+        StoreError: the store cannot be read.
     """
     now_ns = time.time_ns()
     if sink not in SINKS:

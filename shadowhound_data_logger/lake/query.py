@@ -129,12 +129,26 @@ class Shape:
 def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLUMNS), order: str | None = None,
             limit: int | None = None, distinct: bool = False, as_of: str | datetime | None = None,
             findings: Findings | None = None, **flags: Any) -> pa.Table:  # fmt: skip
-    """One row per object, with the columns of ``formats/rows/schema.py``.
+    """The stored objects that match the flags, one row per object.
 
-    ``flags`` are those of ``select.wanted``: ``sensor topic robot since until near mission mission_type success where``;
-    ``order`` is SQL, such as ``t_start_ns DESC``. Without a source, it queries the store that the environment names. With
-    ``as_of`` it answers from the tables as of that time. Invalid rows and files are ignored: they are in ``findings``, or the log
-    warns. Raises SettingError, LakeError for an invalid query, StoreError.
+    Args:
+        source: the store; by default the one that the environment names.
+        columns: the columns of the result, by default all of [the catalog](../formats.md#the-catalog).
+        order: SQL, such as ``t_start_ns DESC``.
+        limit: the maximum number of rows.
+        distinct: without repeated rows.
+        as_of: answer from the tables as they were at that time.
+        findings: receives invalid rows and files, which are skipped; by default they are logged.
+        flags: what to select, as in ``shadowhound-data query``: ``sensor topic robot since until near mission mission_type
+            success policy label where by``, such as ``since='2h'``, ``near=(3.2, 1.5, 2)``, ``where='battery_pct < 30'``.
+
+    Returns:
+        An Arrow table; ``.to_pandas()`` makes a DataFrame of it.
+
+    Raises:
+        SettingError: a flag is invalid.
+        LakeError: the query is invalid.
+        StoreError: the store cannot be read.
     """
     lake = _Asked.of(source, findings, as_of)
     return _objects(lake, wanted(time.time_ns(), **flags), Shape(columns, order, limit, distinct))
@@ -153,18 +167,29 @@ def object_batches(source: Bucket | None = None, *, columns: Sequence[str] = tup
 
 def missions(source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
              **flags: Any) -> pa.Table:  # fmt: skip
-    """One row per mission with selected objects, and how it ended."""
+    """The missions with objects that match the flags, one row per mission, and how it ended. Arguments as in ``objects``."""
     return _missions(_Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags))
 
 
 def topics(source: Bucket | None = None, *, findings: Findings | None = None, **flags: Any) -> pa.Table:
-    """One row per robot and topic: how many objects, bytes and messages, from when to when."""
+    """One row per robot and topic: objects, bytes, messages, first and last time. Arguments as in ``objects``."""
     return sql('SELECT * FROM topics', source, findings=findings, **flags)
 
 
 def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | None = None, findings: Findings | None = None,
         **flags: Any) -> pa.Table:  # fmt: skip
-    """SQL over the views, each restricted by the flags. Raises LakeError for invalid SQL or an unknown column."""
+    """The answer to a query in SQL over the views ``objects missions topics gaps watermarks labels forgotten``.
+
+    Args:
+        query: a SELECT in DataFusion's SQL.
+        source: the store; by default the one that the environment names.
+        as_of: answer from the tables as they were at that time.
+        findings: receives invalid rows and files, which are skipped; by default they are logged.
+        flags: restrict each view, as in ``objects``.
+
+    Raises:
+        LakeError: invalid SQL, or an unknown column.
+    """
     lake, asked = _Asked.of(source, findings, as_of), wanted(time.time_ns(), **flags)
     more: dict[str, pa.Table] = {}
     if _MISSIONS.search(query):

@@ -30,12 +30,12 @@ DECODED_BYTES: Final = 48 << 20
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """The one message of a sensor that is nearest in time."""
+    """Align the one message of a sensor that is nearest in time."""
 
     tolerance_s: float
-    """At most so far away."""
+    """The maximum distance in seconds."""
     fields: tuple[str, ...] = ()
-    """Paths of numbers such as ``bms_state.soc``; none: those of ``decode.FIELDS``."""
+    """Numbers of the message, such as ``bms_state.soc``; by default the usual ones of its type (``lake.decode.FIELDS``)."""
     is_causal: bool = False
     """Only messages at or before the anchor's time count: what a robot would have known then."""
 
@@ -48,15 +48,19 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """The last ``rows`` messages of a sensor from ``before_s`` before the anchor's time to ``after_s`` after it, oldest first.
+    """Align the last ``rows`` messages of a sensor around the anchor's time, oldest first.
 
-    Where there are fewer, the first rows are NaN, so that all samples have one shape.
+    If there are fewer, the first rows are NaN, so that all samples have the same shape.
     """
 
     before_s: float
+    """From so many seconds before the anchor's time."""
     rows: int
+    """How many messages."""
     after_s: float = 0.0
+    """To so many seconds after it."""
     fields: tuple[str, ...] = ()
+    """As in ``Near``."""
 
     @property
     def reach_ns(self) -> tuple[int, int]:

@@ -44,10 +44,19 @@ def digest_of(folder: Path, info: bytes | None = None) -> str:
 
 
 def log_dataset(run: Any, folder: Path | str) -> str:
-    """Say in a run of MLflow what it is trained on: tags with the digest and the name. Returns the digest.
+    """Record in an MLflow run which dataset it is trained on, as tags with the dataset's digest and name.
 
-    ``run`` is a run (``mlflow.active_run()``) or the id of one; the server is MLflow's own in this process, else that of
-    MLFLOW_TRACKING_URI. Raises LakeError, TrackingUnavailable, TrackingRefused.
+    Args:
+        run: a run (``mlflow.active_run()``) or its id. The server is that of the process's MLflow, otherwise MLFLOW_TRACKING_URI.
+        folder: a dataset that ``shadowhound-data export lerobot`` wrote.
+
+    Returns:
+        The digest: a SHA-256 that stands for how the dataset was made, all its sources, and the known gaps.
+
+    Raises:
+        LakeError: the folder is not such a dataset.
+        TrackingUnavailable: the server does not answer.
+        TrackingRefused: the server refuses the tags.
     """
     folder = Path(folder)
     digest = digest_of(folder)

@@ -42,24 +42,37 @@ CLOSE_S: Final = 5.0
 
 
 class MissionDataLogger:
-    """Logs the missions of one agent. Lifecycle: New; any number of missions, one at a time; close once, or never.
+    """Logs the missions of one agent, one mission at a time. No call waits for a server or raises because of one.
 
-    The constructor starts the sender, a child process (loading MLflow takes seconds, for which the start of a mission should not
-    wait), and the thread ``missions``, which syncs journals. In a program without a Python interpreter (embedded or frozen)
-    missions are only journaled, with one warning. All methods may be called from any thread. ``_lock`` guards the active mission.
-    Raises SettingError for an invalid argument or variable, such as a robot name that cannot be in a key, and nothing else.
+    What is logged is in a journal on the disk when the call returns. A child process, the sender, delivers it to MLflow and
+    the store, and keeps running after the agent exits until everything is sent. In a frozen or embedded program, which has no
+    interpreter to start, missions are only journaled, with one warning. All methods may be called from any thread.
+
+    Lifecycle: New; any number of missions; ``close`` once, or never.
     """
+
+    # ``_lock`` guards the active mission.
 
     def __init__(
         self, *, robot: str | None = None, home: str | os.PathLike[str] | None = None, tracking_uri: str | None = None,
         experiment: str | None = None, start_timeout_s: float = 2.0, frame_artifact_every_s: float = 5.0,
         replay: bool = True,
     ) -> None:  # fmt: skip
-        """Defaults: SHADOWHOUND_HOME, MLFLOW_TRACKING_URI; robot: SHADOWHOUND_ROBOT, else the one whose node has run here, else
-        ``thor``; experiment: ROBOT_missions.
+        """Start the sender and the thread that syncs journals.
 
-        Of the frames, one every ``frame_artifact_every_s`` seconds becomes an artifact of the run. ``replay=False`` only writes
-        journals: another logger of the same home sends them.
+        Args:
+            robot: the robot's name, the first part of every key. By default ``SHADOWHOUND_ROBOT``, otherwise the robot whose node
+                has run on this machine.
+            home: the folder of journals and spool. By default ``SHADOWHOUND_HOME``, otherwise ``~/.shadowhound``.
+            tracking_uri: the MLflow server. By default ``MLFLOW_TRACKING_URI``, otherwise a SQLite file in ``home``.
+            experiment: the MLflow experiment. By default ``ROBOT_missions``.
+            start_timeout_s: for how long the start of a mission may wait for the run's id.
+            frame_artifact_every_s: of the camera frames, one per so many seconds becomes an artifact of the run; the store
+                gets all of them.
+            replay: False only writes journals; another logger with the same home sends them.
+
+        Raises:
+            SettingError: an argument or variable is invalid, such as a robot name that cannot be part of a key.
         """
         uri = _text('tracking_uri', tracking_uri)
         environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': uri} if uri else {})
@@ -95,19 +108,26 @@ class MissionDataLogger:
     # -- a mission's life ------------------------------------------------------------------------------------------
 
     def start_mission(self, mission_type: str, mission_command: str) -> str:
-        """Start a mission; an active mission ends as KILLED.
+        """Start a mission. If another one is active, it ends as KILLED.
 
-        Returns the MLflow run's id, or the mission's own id if no server answers or ``start_timeout_s`` is over: both find the
-        mission from then on (tag ``shadowhound.mission_id`` of the run, and ``missions/<mission id>/run.json``). The type keeps
-        its spelling (at most 128 characters) everywhere but in keys and names of files, where other characters than A-Z, a-z,
-        0-9, ``_``, ``-`` and ``.`` are replaced.
+        Args:
+            mission_type: such as ``patrol``; at most 128 characters. In keys and file names, characters other than A-Z, a-z, 0-9,
+                ``_``, ``-`` and ``.`` are replaced.
+            mission_command: what the robot is to do, as free text.
+
+        Returns:
+            The MLflow run's id, or the mission's own id if no server answers within ``start_timeout_s``. Either finds the mission
+            later: the run has the tag ``shadowhound.mission_id``, and ``missions/MISSION_ID/run.json`` has the run's id.
         """
         mission = self._start(mission_type, mission_command)
         return mission.run_id or mission.id
 
     @contextmanager
     def mission(self, mission_type: str, mission_command: str) -> Iterator[Mission]:
-        """A mission as a context manager: an exception ends it as FAILED, is recorded, and is raised again."""
+        """A mission as a context manager, which yields the ``Mission``.
+
+        It ends as FINISHED; an exception ends it as FAILED, is recorded in it, and is raised again.
+        """
         mission = self._start(mission_type, mission_command)
         try:
             yield mission
@@ -122,7 +142,13 @@ class MissionDataLogger:
             self._leave(mission)
 
     def end_mission(self, success: bool, distance_m: float, duration_s: float) -> None:
-        """End the active mission as FINISHED or FAILED. Where 0 is stated, a measured value is used."""
+        """End the active mission.
+
+        Args:
+            success: True for FINISHED, False for FAILED.
+            distance_m: the distance covered in meters; 0 for what the node measured.
+            duration_s: the duration in seconds; 0 for the measured one.
+        """
         if mission := self._active('end_mission'):
             mission.end(success, distance_m, duration_s)
             self._leave(mission)
@@ -130,34 +156,43 @@ class MissionDataLogger:
     # -- what happens in it ----------------------------------------------------------------------------------------
 
     def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
-        """See Mission, as of the calls below; without a mission they do nothing."""
+        """As ``Mission.log_camera_frame``, for the active mission. Without one it does nothing, with one warning."""
         if mission := self._active('log_camera_frame'):
             mission.log_camera_frame(frame_data, frame_id)
 
     def log_robot_state(self, battery_pct: float, temperature_c: float, step: int) -> None:
+        """As ``Mission.log_robot_state``, for the active mission."""
         if mission := self._active('log_robot_state'):
             mission.log_robot_state(battery_pct, temperature_c, step)
 
     def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
+        """As ``Mission.log_trajectory``, for the active mission."""
         if mission := self._active('log_trajectory'):
             mission.log_trajectory(trajectory_csv_path)
 
     def log_metric(self, key: str, value: float, step: int | None = None) -> None:
+        """As ``Mission.log_metric``, for the active mission."""
         if mission := self._active('log_metric'):
             mission.log_metric(key, value, step)
 
     def log_event(self, name: str, /, **data: Any) -> None:
+        """As ``Mission.log_event``, for the active mission."""
         if mission := self._active('log_event'):
             mission.log_event(name, **data)
 
     def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
+        """As ``Mission.log_artifact``, for the active mission."""
         if mission := self._active('log_artifact'):
             mission.log_artifact(path, artifact_path)
 
     # -- sending ---------------------------------------------------------------------------------------------------
 
     def flush(self, deadline_s: float = 10.0) -> Report:
-        """Wait until everything that agent and node have logged is sent, at most ``deadline_s``. Never raises."""
+        """Wait until everything that agent and node have logged is sent, for at most ``deadline_s`` seconds. Never raises.
+
+        Returns:
+            What has arrived of the newest mission, and what it waits for otherwise.
+        """
         self._sync()
         if self._replayer:
             self._replayer.wake()
@@ -168,9 +203,10 @@ class MissionDataLogger:
         return report(folder)
 
     def close(self, deadline_s: float = 0.0) -> Report:
-        """End an active mission as KILLED, wait for the sender for at most ``deadline_s``, and release it; idempotent.
+        """End an active mission as KILLED and release the sender. Idempotent.
 
-        What is unsent then is sent by the sender, which keeps running, or by the next one.
+        Args:
+            deadline_s: for how long to wait for the sender. The sender keeps running and sends the rest, or the next one does.
         """
         if mission := self._mission:
             log.warning('mission %s is still active when its logger is closed: it ends as KILLED', mission.id)

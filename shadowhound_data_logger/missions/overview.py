@@ -185,7 +185,7 @@ def _is_locked(folder: MissionFolder) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """How far one mission is sent."""
+    """How much of one mission has been sent."""
 
     mission_id: str
     run_id: str | None
@@ -197,7 +197,7 @@ class Report:
     missing: int = 0
     """Frames and trajectories with a file that was deleted before it was spooled."""
     last_error: str = ''
-    """What delays it now, or was refused last; empty if nothing was."""
+    """What delays it now, or was refused last; otherwise empty."""
     remedy: str = ''
     refused: int = 0
     """Points, params and tags that the tracking server refused permanently."""

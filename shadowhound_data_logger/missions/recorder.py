@@ -34,12 +34,15 @@ MOST_FRAME_ARTIFACTS: Final = 500
 
 
 class Mission:
-    """The calls by which an agent logs one mission.
+    """An active mission. Every method writes to the journal, returns within a millisecond, and never raises.
 
-    Lifecycle: made by MissionDataLogger; log_... from any thread; end once, after which calls only warn once.
+    What cannot be logged, such as a value that is not a number, is skipped and counted in the mission's summary, with one warning
+    per reason.
 
-    ``_lock`` guards the journal together with the list of what must be synced and the flag that the mission has ended.
+    Lifecycle: created by MissionDataLogger; ``log_...`` from any thread; ``end`` once, after which calls only warn once.
     """
+
+    # ``_lock`` guards the journal together with the list of what must be synced and the flag that the mission has ended.
 
     def __init__(self, folder: MissionFolder, journal: Journal, frame_artifact_every_s: float, clock: Clock,
                  policy: str | None = None, new_run: NewRun | None = None) -> None:  # fmt: skip
@@ -79,12 +82,16 @@ class Mission:
 
     @property
     def is_active(self) -> bool:
+        """Whether it has not ended yet."""
         return not self._ended
 
     def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
-        """The bytes of a JPEG, or an array of pixels, which this call encodes: uint8, gray, RGB or RGBA (see ``values.jpeg``).
+        """Log one image of the robot's camera. All of them are stored; a sample also becomes artifacts of the run.
 
-        All frames are stored; a sample of them (``frame_artifact_every_s``) also becomes artifacts of the run.
+        Args:
+            frame_data: the bytes of a JPEG; or a uint8 array (height, width), (height, width, 3) RGB or (height, width, 4) RGBA,
+                which this call encodes.
+            frame_id: its number.
         """
         try:
             number = values.integer(frame_id, 'frame_id')
@@ -98,15 +105,20 @@ class Mission:
             self._lose(error)
 
     def log_robot_state(self, battery_pct: float, temperature_c: float, step: int) -> None:
-        """Two points with the same time: percent and degrees Celsius."""
+        """Log battery (percent) and temperature (degrees Celsius) as two metrics with the same time and step."""
         self._log({BATTERY: battery_pct, TEMPERATURE: temperature_c}, step)
 
     def log_metric(self, key: str, value: float, step: int | None = None) -> None:
-        """One point; without a step it is 0, as in MLflow."""
+        """Log one value of a metric. Without a step, the step is 0, as in MLflow."""
         self._log({key: value}, 0 if step is None else step)
 
     def log_event(self, name: str, /, **data: Any) -> None:
-        """An event; the run's ``events.jsonl`` has all of them, the summary also lists those named ``error``."""
+        """Log something that happened. The run's ``events.jsonl`` has all events; the summary also lists those named ``error``.
+
+        Args:
+            name: what happened, such as ``door_open``.
+            data: details, as values that JSON can hold.
+        """
         try:
             self._append('event', name=values.text(name, values.MAX_KEY), data=values.bounded(values.plain(data)))
         except Rejected as error:
@@ -115,7 +127,7 @@ class Mission:
             self._lose(error)
 
     def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
-        """Copy the current content of a CSV file with the header ``timestamp,x,y,yaw``; it is stored unchanged."""
+        """Copy the current content of a CSV file with the header ``timestamp,x,y,yaw``. It is stored unchanged."""
         self._log_file('trajectory', trajectory_csv_path, {})
 
     def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
@@ -140,7 +152,15 @@ class Mission:
 
     def end(self, success: bool = True, distance_m: float | None = None, duration_s: float | None = None, *,
             status: str | None = None, error: str | None = None) -> None:  # fmt: skip
-        """The last record: FINISHED or FAILED, or ``status`` (KILLED). Values that are not stated are measured."""
+        """End the mission. Values that are not given are measured.
+
+        Args:
+            success: True for FINISHED, False for FAILED.
+            distance_m: the distance covered in meters.
+            duration_s: the duration in seconds.
+            status: another MLflow status, such as KILLED.
+            error: why it failed.
+        """
         elapsed_s = (self._clock.boot_ns() - self._began_ns) / SECOND
         stated: dict[str, Any] = {'success': values.boolean(success), 'elapsed_s': round(elapsed_s, 6)}
         for name, value in (('distance_m', distance_m), ('duration_s', duration_s)):
@@ -158,7 +178,7 @@ class Mission:
             self._lose(refused)
 
     def close(self) -> None:
-        """Sync and close the journal, after ``end``; idempotent."""
+        """Sync and close the journal, after ``end``. MissionDataLogger calls it. Idempotent."""
         self.sync()
         self._frames.close()
         self._journal.close()

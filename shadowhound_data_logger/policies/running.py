@@ -23,12 +23,12 @@ LEAST_STEPS: Final = 20
 
 @dataclass(slots=True)
 class ActivePolicy:
-    """A version that stays on the disk for as long as the ``with`` of ``active`` lasts. One thread."""
+    """A verified version of a policy, which stays on the disk while the ``with`` of ``active`` lasts. For one thread."""
 
     id: str
     """Such as ``go2_patrol@7#0123456789abcdef``."""
     path: Path
-    """Its folder, with the files that the manifest names; they were verified when it was opened."""
+    """Its folder, with the files that the manifest names. They were verified when it was opened."""
     manifest: PolicyManifest
     _folder: PolicyFolder
     _steps: deque[tuple[bool, float]] = field(default_factory=lambda: deque(maxlen=WINDOW))
@@ -39,11 +39,19 @@ class ActivePolicy:
         return self.path / self.manifest.model
 
     def is_current(self) -> bool:
-        """Whether it is the active one still: leave the ``with`` and open the next one where it is not."""
+        """Whether it is still the active one. If not, leave the ``with`` and call ``active`` again."""
         return self._folder.current() == self.id
 
     def report(self, latency_s: float, *, failed: bool = False) -> bool:
-        """One step; whether it may go on. A policy that breaks its manifest's limits is rolled back before this returns."""
+        """Report one step of the policy.
+
+        Args:
+            latency_s: how long it took.
+            failed: whether it failed.
+
+        Returns:
+            Whether the policy may continue. One that exceeds the limits of its manifest has been rolled back.
+        """
         self._steps.append((failed, latency_s * 1000.0))
         failures = sum(failed for failed, _ in self._steps)
         slowest = sorted(ms for _, ms in self._steps)
@@ -65,9 +73,15 @@ def judge(folder: PolicyFolder, name: str, manifest: PolicyManifest, failures: i
 
 @contextmanager
 def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str] = os.environ) -> Iterator[ActivePolicy]:
-    """The active policy, verified once more, every hash of it; nobody removes it within the ``with``.
+    """The active policy as a context manager. Every hash is verified again; the files are not removed within the ``with``.
 
-    ``home`` is SHADOWHOUND_HOME's folder. Raises PolicyError where none is active, PolicyRefused where it is not what was signed.
+    Args:
+        home: the folder; by default SHADOWHOUND_HOME.
+        environ: the environment variables.
+
+    Raises:
+        PolicyError: no policy is active.
+        PolicyRefused: the files are not those that were signed.
     """
     folder = PolicyFolder(config.home({'SHADOWHOUND_HOME': os.fspath(home)} if home else environ))
     while True:

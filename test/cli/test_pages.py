@@ -11,7 +11,18 @@ from ruamel.yaml import YAML
 
 from shadowhound_data_logger.cli.common import MEANINGS, ExitCode
 from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.cli.pages import DOCS, EXAMPLE, SECTIONS, VARIABLES, commands, main, parameters
+from shadowhound_data_logger.cli.pages import (
+    ADVANCED,
+    DOCS,
+    EXAMPLE,
+    READERS,
+    SECTIONS,
+    USUAL,
+    VARIABLES,
+    commands,
+    main,
+    parameters,
+)
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings, default_parameters
 
 PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'
@@ -44,11 +55,17 @@ def test_every_parameter_is_on_it() -> None:
 
 def test_each_is_in_one_section() -> None:
     """Of what a person wants to do, in whatever group its name is."""
-    listed = Counter(name for section in SECTIONS for name in section.names)
+    listed = Counter(name for section in (*SECTIONS, ADVANCED) for name in section.names)
     known = {
         f'SENSOR.{name.partition(".")[2]}' if name.partition('.')[0] in DEFAULT_SENSORS else name for name in default_parameters()
     }
     assert listed == Counter(known)
+
+
+def test_each_verb_is_for_one_reader() -> None:
+    """And each variable that most people set is on the page."""
+    assert sorted(name for names in READERS.values() for name in names) == sorted(cli.commands)
+    assert [name for name in USUAL if f'| `{name}` |' not in parameters()] == []
 
 
 def test_the_example_is_a_parameter_file() -> None:
