@@ -246,6 +246,11 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens; read by its systemd unit.'),
     (
+        'SHADOWHOUND_PORT_GUARD',
+        '`on`',
+        'With `off`, ports in shared memory that killed listeners leave are not repaired (reliability.md).',
+    ),
+    (
         'AWS_SHARED_CREDENTIALS_FILE',
         '`~/.aws/credentials`',
         'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#5-credentials)).',

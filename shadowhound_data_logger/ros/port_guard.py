@@ -17,6 +17,9 @@ A process that is killed while it makes a port leaves one that is never finished
 
 As a program, which ``flock`` becomes when the lock of its parent is free, it settles what that one left. It imports nothing of
 the package.
+
+This is the only place that writes into files of another library. ``SHADOWHOUND_PORT_GUARD=off`` turns it off
+(docs/decisions/0026).
 """
 
 from __future__ import annotations
@@ -63,6 +66,11 @@ IN_USE, WAITING, PROCESSING = 1, 2, 4
 """Flags in the first byte of a listener, which it alone writes."""
 
 
+def is_enabled() -> bool:
+    """Whether the operator has not turned the guard off."""
+    return os.environ.get('SHADOWHOUND_PORT_GUARD', 'on').lower() not in {'off', '0', 'false', 'no'}
+
+
 def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
     """Ports of this user in which a dead listener is still said to be at work, or that nobody finishes.
 
@@ -70,6 +78,8 @@ def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
     removed the lock's file, only a port that Fast DDS has marked is settled: a listener that lives leaves such a port by itself,
     and takes that word back, too.
     """
+    if not is_enabled():
+        return []
     try:
         found = sorted(folder.iterdir())
     except OSError:

@@ -85,7 +85,8 @@ def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Pat
 
 
 class PortGuard:
-    """A process that outlives this one for an instant, to settle its ports where it is killed; none where it has no ports.
+    """A process that keeps running for a moment after this one was killed, to repair its ports; none if it has no ports.
+
 
     Life: New once the participants are made; ``close`` when they are gone. Until then it is ``flock`` (1.8 MB), which waits for a
     lock that this process has and nobody can take over, and then becomes ``port_guard``.
@@ -93,7 +94,7 @@ class PortGuard:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        if not _has_ports():
+        if not port_guard.is_enabled() or not _has_ports():
             return
         self._locked = os.memfd_create('port_guard')
         lock(self._locked)

@@ -154,6 +154,21 @@ def test_a_program_without_ports_has_no_guard(monkeypatch: pytest.MonkeyPatch) -
     PortGuard().close()
 
 
+def test_an_operator_can_turn_it_off(monkeypatch: pytest.MonkeyPatch, shm: Path) -> None:
+    """No guard is started and no port is written to, although one is left that would be settled otherwise."""
+    (shm / PORT).touch()
+    left = time.time() - MAKING_S - 1
+    os.utime(shm / PORT, (left, left))
+    monkeypatch.setenv('SHADOWHOUND_PORT_GUARD', 'off')
+    assert settle(shm) == []
+    monkeypatch.setattr('shadowhound_data_logger.ros.shared_memory._has_ports', lambda: True)
+    with monkeypatch.context() as context:
+        context.setattr(subprocess, 'Popen', None)
+        PortGuard().close()
+    monkeypatch.delenv('SHADOWHOUND_PORT_GUARD')
+    assert settle(shm, is_done=False) == [PORT]
+
+
 def until(condition: Callable[[], bool], what: str) -> None:
     end = time.monotonic() + WAIT_S
     while not condition():
