@@ -170,7 +170,7 @@ def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified:
 
 
 def _taken(out: Path) -> BagError:
-    return BagError(f'{out} exists already', remedy='remove it, or choose another --output')
+    return BagError(f'{out} exists already', remedy='remove it, or choose another --to')
 
 
 def _beside(path: Path) -> Path:

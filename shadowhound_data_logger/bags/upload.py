@@ -120,7 +120,7 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
         except sqlite3.Error as error:
             raise spool.unwritable(error) from error
     if len(placed) < len(objects):
-        remedy = 'raise spool.max_bytes, or send it with --now, past the spool'
+        remedy = 'raise spool.max_bytes, or send it with --direct, past the spool'
         raise BagError(f'the spool {spool.root} has no room for {plan.bag}: {plan.size} bytes', remedy=remedy)
 
 
@@ -169,7 +169,7 @@ def _is_done(row: sqlite3.Row | None, bag: str) -> bool:
         raise _taken(bag, row['key'])
     if row['state'] in {State.EVICTED.value, State.QUARANTINED.value}:
         text = f'{row["key"]} is {row["state"]} ({row["reason"]}), so the spool does not deliver it'
-        raise BagError(text, remedy='send it with --now, past the spool', key=row['key'])
+        raise BagError(text, remedy='send it with --direct, past the spool', key=row['key'])
     return False
 
 
@@ -210,7 +210,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 
 def _taken(bag: str, key: str) -> BagError:
-    remedy = f'is it another bag? then send it under another name: --name {bag}_b'
+    remedy = f'is it another bag? then send it under another name: --bag-name {bag}_b'
     return BagError(f'{key} is there already with other content', remedy=remedy, key=key)
 
 

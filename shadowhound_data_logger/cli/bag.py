@@ -114,7 +114,10 @@ def _in_store(name: str) -> Iterator[None]:
 
 
 _robot = click.option(
-    '--robot', callback=robot_name, help='Robot of the bags  [default: SHADOWHOUND_ROBOT, else that of this machine or store]'
+    '--robot',
+    metavar='NAME',
+    callback=robot_name,
+    help='The robot  [default: SHADOWHOUND_ROBOT, else that of this machine or store]',
 )
 _bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
@@ -134,9 +137,7 @@ def bag() -> None:
 
 
 @bag.command('list', epilog=examples('bag list --since yesterday', 'bag list --robot tachi --json'))
-@click.option(
-    '--since', default='', metavar='TIME', help='Begun at or after TIME: yesterday, 2025-10-18, 2025-10-18T12:00, 90min, 2d.'
-)
+@click.option('--since', default='', metavar='TIME', help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).')
 @_robot
 @as_json
 def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
@@ -198,7 +199,7 @@ def bag_info(*, bag: str | Path, robot: str | None, as_json: bool) -> ExitCode:
 
 
 @bag.command('verify', epilog=examples('bag verify patrol_20251018_120000 --deep'))
-@click.option('--deep', is_flag=True, help='Read every byte: checksums, every CRC, and the summary against the messages.')
+@click.option('--deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
 @_bag_or_folder
 @_robot
 @as_json
@@ -228,14 +229,14 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool)
     return exit_code(finding=not (found.is_intact and found.state != GROWING))
 
 
-@bag.command('repair', epilog=examples('bag repair my_bag', 'bag repair my_bag/my_bag_3.mcap -o whole.mcap'))
+@bag.command('repair', epilog=examples('bag repair my_bag', 'bag repair my_bag/my_bag_3.mcap --to repaired.mcap'))
 @click.argument('path', metavar='PATH', type=click.Path(path_type=Path, exists=True))
-@click.option('-o', '--output', type=click.Path(path_type=Path), help='New folder or file  [default: PATH_repaired]')
+@click.option('--to', type=click.Path(path_type=Path), metavar='PATH', help='Where to write it  [default: PATH_repaired]')
 @click.option('--in-place', is_flag=True, help='Replace the damaged files. What is damaged in them is gone then.')
 @click.option('--keep-damaged', is_flag=True,
               help='Also keep the messages of chunks whose checksum does not match: some of them are wrong.')  # fmt: skip
 @as_json
-def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged: bool, as_json: bool) -> ExitCode:
+def bag_repair(*, path: Path, to: Path | None, in_place: bool, keep_damaged: bool, as_json: bool) -> ExitCode:
     """Repair a bag or one of its files.
 
     PATH is a folder or an MCAP or SQLite file of any recorder: torn by a crash or a full disk, without its end or summary, with
@@ -243,10 +244,10 @@ def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged:
 
     Nothing is written if nothing is damaged. Exit code 1 means that something was.
     """
-    if in_place and output is not None:
-        raise BadUsage('--in-place and --output exclude each other', 'leave one of them out')
+    if in_place and to is not None:
+        raise BadUsage('--in-place and --to exclude each other', 'omit one of them')
     with progress('read', of='bytes') as bar:
-        found = repair_bag(path, output, in_place=in_place, unverified=keep_damaged, progress=bar)
+        found = repair_bag(path, to, in_place=in_place, unverified=keep_damaged, progress=bar)
     if as_json:
         print_json({**asdict(found), 'is_damaged': found.is_damaged})
     else:
@@ -257,14 +258,18 @@ def bag_repair(*, path: Path, output: Path | None, in_place: bool, keep_damaged:
 @bag.command('fetch', epilog=examples('bag fetch patrol_20251018_120000 --to bags'))
 @click.argument('bag', metavar='BAG')
 @click.option(
-    '--to', type=click.Path(path_type=Path, file_okay=False), required=True, help='Folder in which the folder BAG is made.'
+    '--to',
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    metavar='DIR',
+    help='Where to write it.',
 )
 @_robot
 @as_json
 def bag_fetch(*, bag: str, to: Path, robot: str | None, as_json: bool) -> ExitCode:
     """Download a bag, verified.
 
-    It becomes TO/BAG. Run it again after an interruption: files that are already complete are skipped. A bag that is still
+    It becomes DIR/BAG. Run it again after an interruption: files that are already complete are skipped. A bag that is still
     growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
@@ -289,22 +294,20 @@ def bag_fetch(*, bag: str, to: Path, robot: str | None, as_json: bool) -> ExitCo
 @bag.command(
     'cut',
     epilog=examples(
-        'bag cut patrol_20251018_120000 --start +30 --end +60 --output cut',
-        'bag cut ./patrol_20251018_120000 --topics /imu,/odom --output cut',
+        'bag cut patrol_20251018_120000 --start +30 --end +60 --to cut',
+        'bag cut ./patrol_20251018_120000 --topic /imu --topic /odom --to cut',
     ),
 )
 @_bag_or_folder
 @click.option('--start', default='', metavar='TIME', help='From this time on  [default: the start of the bag]')
 @click.option('--end', default='', metavar='TIME', help='Before this time  [default: the end of the bag]')
 @ranges_option
-@click.option(
-    '--topics', '--topic', multiple=True, metavar='TOPIC', help='Only these topics: repeat it, or separate them with commas.'
-)
+@click.option('--topic', 'topics', multiple=True, metavar='NAME', help='Only of this topic; may be repeated.')
 @click.option('--regex', default='', help='Also topics whose name matches this regular expression.')
-@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='New folder for the bag.')
+@click.option('--to', type=click.Path(path_type=Path), required=True, metavar='DIR', help='Where to write it.')
 @_robot
 @as_json
-def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: str | None, as_json: bool, ranges: list[Any] | None,
+def bag_cut(*, bag: str | Path, topics: tuple[str, ...], to: Path, robot: str | None, as_json: bool, ranges: list[Any] | None,
             **wanted: str) -> ExitCode:  # fmt: skip
     """Copy a span of time or some topics into a new bag.
 
@@ -318,14 +321,13 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], output: Path, robot: st
     little earlier: query --pad 1 makes each longer. Of a bag in the store, only the chunks that are needed
     are read. Exit code 1 when a slice of that time is missing or cannot be read.
     """  # noqa: D301 - click's mark for lines that stay as they are
-    names = tuple(name.strip() for each in topics for name in each.split(',') if name.strip())
-    choice = Choice(topics=names, spans=None if ranges is None else _spans(ranges), **wanted)
+    choice = Choice(topics=topics, spans=None if ranges is None else _spans(ranges), **wanted)
     if isinstance(bag, Path):
         with _in_folder():
-            found = cut_folder(bag, output, choice)
+            found = cut_folder(bag, to, choice)
     else:
         with _in_store(bag), the_store(STORE_THREADS) as store:
-            found = cut_remote(store, find_bag(store, the_robot(robot, in_store=True), bag), output, choice)
+            found = cut_remote(store, find_bag(store, the_robot(robot, in_store=True), bag), to, choice)
     if as_json:
         print_json(with_dates({**asdict(found), 'folder': str(found.folder)}))
     else:
@@ -341,43 +343,45 @@ def _spans(ranges: list[Any]) -> tuple[tuple[int, int], ...]:
     return tuple((span.since_ns, span.until_ns + 1) for span in chosen.spans)
 
 
-@bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --name patrol_2 --tar-gz'))
+@bag.command('upload', epilog=examples('bag upload my_bag', 'bag upload my_bag --bag-name patrol_2 --tar-gz'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path))
 @click.option(
-    '--name',
+    '--bag-name',
+    metavar='NAME',
     default='',
-    help='The name of the bag in the store  [default: that of DIR, or the nearest valid one]',
+    help='Name of the bag in the store  [default: that of DIR, or the nearest valid one]',
 )
 @click.option('--tar-gz', is_flag=True, help='Store one ROBOT/rosbags/NAME.tar.gz instead of the files.')
-@click.option('--now', is_flag=True, help='Bypass the spool: nothing is kept here if Tower does not take it in time.')
-@click.option('--deadline', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, help='Seconds to wait for Tower.')
+@click.option('--direct', is_flag=True, help='Bypass the spool: nothing is kept here if the store does not take it in time.')
+@click.option('--timeout', type=click.FloatRange(0.0, 1e7), default=600.0, show_default=True, metavar='S',
+              help='Give up after S seconds.')  # fmt: skip
 @_robot
 @as_json
 def bag_upload(
-    *, folder: Path, name: str, now: bool, deadline: float, robot: str | None, as_json: bool, tar_gz: bool
+    *, folder: Path, bag_name: str, direct: bool, timeout: float, robot: str | None, as_json: bool, tar_gz: bool
 ) -> ExitCode:
     """Upload a finished bag.
 
     SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
 
     The bag goes through the spool of this machine, and the command waits until the store has it. If Tower cannot be reached
-    before the deadline, the exit code is 1 and the bag stays safely in the spool: the node that runs here, or the next upload,
+    within --timeout, the exit code is 1 and the bag stays safely in the spool: the node that runs here, or the next upload,
     delivers it. DIR itself is never changed.
     """
     robot, folder = the_robot(robot), folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
     with (
         _in_folder(),
-        planned(folder, robot, name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
+        planned(folder, robot, bag_name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
         progress('sent', of='bytes') as bar,
     ):
-        if now:
+        if direct:
             with the_store(STORE_THREADS) as store:
-                found = upload_now(store, sent, deadline_s=deadline, progress=bar)
+                found = upload_now(store, sent, deadline_s=timeout, progress=bar)
         else:
             with opened_spool(settings, clock) as spool:
                 spool_upload(sent, spool)
-                found = deliver(settings, spool, sent, deadline_s=deadline, progress=bar)
+                found = deliver(settings, spool, sent, deadline_s=timeout, progress=bar)
     if as_json:
         facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks), 'renamed': dict(sent.renamed)}
         print_json({**asdict(found), 'is_delivered': found.is_delivered, **facts})
@@ -418,28 +422,33 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_
             return ExitCode.FINE
 
 
-@bag.command('record', epilog=examples('bag record kitchen --duration 60 --topics /imu,/odom'))
+@bag.command('record', epilog=examples('bag record kitchen --duration 60 --topic /imu --topic /odom'))
 @click.argument('name')
 @click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True,
-              help='Seconds from the first message; Ctrl-C ends it earlier.')  # fmt: skip
-@click.option('--topic', '--topics', 'topics', multiple=True, help='Topic to record: repeat it, or separate them with commas.')
-@click.option('--regex', default='', help='Also topics whose name matches this regular expression; ".*" is all of them.')
+              metavar='S', help='Stop after S seconds; Ctrl-C stops it earlier.')  # fmt: skip
+@click.option('--topic', 'topics', multiple=True, metavar='NAME', help='Only of this topic; may be repeated.')
+@click.option('--regex', default='', help='Also topics whose name matches this regular expression.')
 @click.option(
-    '--deadline', type=click.FloatRange(0.0, 1e6), default=DEADLINE_S, show_default=True, help='Seconds to wait for Tower.'
+    '--timeout',
+    type=click.FloatRange(0.0, 1e7),
+    default=DEADLINE_S,
+    show_default=True,
+    metavar='S',
+    help='Give up after S seconds.',
 )
 @_robot
 @as_json
 def bag_record(*, topics: tuple[str, ...], robot: str | None, as_json: bool, **wanted: Any) -> ExitCode:
     """Record topics into a bag and upload it.
 
-    The bag is NAME_YYYYMMDD_HHMMSS; without --topic it has the topics that the node logs by default.
+    The bag is NAME_YYYYMMDD_HHMMSS; without --topic it has the topics that the node logs by default;
+    --regex '.*' records all.
 
     It needs ROS 2, but neither rosbag2 nor a running node. Slices are uploaded while it records. If Tower cannot be reached, the
     bag waits in the spool, and the exit code is 1.
     """
-    names = [name.strip() for each in topics for name in each.split(',') if name.strip()]
-    duration, deadline = wanted.pop('duration'), wanted.pop('deadline')
-    found = record(duration_s=duration, deadline_s=deadline, topics=names, robot=the_robot(robot), **wanted)
+    duration, timeout = wanted.pop('duration'), wanted.pop('timeout')
+    found = record(duration_s=duration, deadline_s=timeout, topics=topics, robot=the_robot(robot), **wanted)
     if as_json:
         print_json({**asdict(found), 'where': found.where})
     else:

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
 from shadowhound_data_logger.core.config import UploadSettings, home, store_settings
-from shadowhound_data_logger.core.errors import NameRefused, StoreError
+from shadowhound_data_logger.core.errors import NameRefused, SettingError, StoreError
 from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.options import StoreSettings
+from shadowhound_data_logger.core.times import age_in_ns
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.stores.base import ObjectStore
 
+    _Number = click.ParamType[int]
+else:
+    _Number = click.ParamType  # older versions of click have no type arguments
+
 PROGRAM: Final = 'shadowhound-data'
+DAY_NS: Final = 86_400_000_000_000
+_SIZE: Final = re.compile(r'(\d{1,15}(?:\.\d{1,9})?)\s*([kMGTP]?)(i?)B?', re.ASCII)
 
 
 class ExitCode(IntEnum):
@@ -101,6 +109,40 @@ class LazyCommands(MutableMapping[str, click.Command]):
 
     def __contains__(self, name: object) -> bool:
         return name in self._found
+
+
+class Size(_Number):
+    """Bytes, as ``2TB``, ``500 GB`` or ``8GiB``."""
+
+    name = 'size'
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        match = _SIZE.fullmatch(value.strip())
+        if match is None:
+            self.fail(f'{value!r} is not a size such as 500GB, 2TB or 8GiB', param, ctx)
+        return int(float(match[1]) * (1024 if match[3] else 1000) ** ' kMGTP'.index(match[2] or ' '))
+
+
+class Age(_Number):
+    """Nanoseconds, as ``30min``, ``2h`` or ``7d``."""
+
+    name = 'age'
+
+    def __init__(self, longest_ns: int | None = None) -> None:
+        self._longest_ns = longest_ns
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        try:
+            found = age_in_ns('', value)
+        except SettingError:
+            self.fail(f'{value!r} is not an age such as 30min, 2h or 7d', param, ctx)
+        if self._longest_ns is not None and not 0 < found <= self._longest_ns:
+            self.fail(f'{value!r} is not an age of at most {self._longest_ns // DAY_NS} days', param, ctx)
+        return found
 
 
 def robot_name(_: click.Context, __: click.Parameter, name: str | None) -> str | None:

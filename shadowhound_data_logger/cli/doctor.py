@@ -73,11 +73,16 @@ def _is_of(check: str, name: str) -> bool:
     help='Repair what is safe (modes of files, missing buckets, orphaned shared memory); the rest is printed for you to paste.',
 )
 @click.option(
-    '--timeout', type=click.FloatRange(0.5, 600.0), default=TIMEOUT_S, show_default=True, help='Seconds for all checks.'
+    '--timeout',
+    type=click.FloatRange(0.5, 600.0),
+    default=TIMEOUT_S,
+    show_default=True,
+    metavar='S',
+    help='Give up after S seconds.',
 )
 @click.option('--params-file', type=click.Path(path_type=Path, dir_okay=False, exists=True), envvar='SHADOWHOUND_PARAMETERS',
               help="The node's parameter file  [default: none]")  # fmt: skip
-@click.option('--namespace', default='/', help='The namespace of the node, as in -r __ns:=/tachi.')
+@click.option('--namespace', default='/', metavar='NAME', show_default=True, help='Namespace of the node, as in -r __ns:=/tachi.')
 @click.option('--rate', 'rates', multiple=True, metavar='TOPIC=HZ', callback=_rates, help='Expect this rate; may be repeated.')
 @click.option('-v', '--verbose', is_flag=True, help='Also show what is fine.')
 def doctor(  # noqa: PLR0913 - one for each option

@@ -83,12 +83,10 @@ def _missions(command: _Command) -> _Command:
 )
 @click.argument('name')
 @_missions
-@click.option('--to', metavar='DIR|s3://...', help='Target  [default: the folder NAME]')
+@click.option('--to', metavar='DIR|s3://...', help='Where to write it  [default: the folder NAME]')
 @click.option('--task', is_flag=True,
               help='Make NAME/synchronized/lerobot, and beside it what robot and arm recorded: go2, soarm.')  # fmt: skip
-@click.option(
-    '--fps', default='auto', show_default=True, metavar='N', help='Frames a second; auto: the rate of the slowest camera.'
-)
+@click.option('--fps', default='auto', show_default=True, metavar='N', help='Frames per second.')
 @click.option('--state', default='pose', show_default=True, metavar='WORDS',
               help='What observation.state is made of: pose, twist, velocity, imu, joints, battery.')  # fmt: skip
 @click.option('--action', type=click.Choice(['auto', 'cmd_vel', 'odometry']), default='auto', show_default=True,
@@ -113,13 +111,13 @@ def _missions(command: _Command) -> _Command:
 @click.option(
     '--validation-label', default='', metavar='NAME', help='Mark missions with this label in a frame as validation, too.'
 )
-@click.option('--labels', is_flag=True, help='Add a column with the labels of each frame, and a table with what they say.')
-@click.option('--arm', default='', metavar='NAME', help='Also export an arm, whose topics are below /NAME.')
+@click.option('--labels', is_flag=True, help='Add a column with the labels.')
+@click.option('--arm', default='', metavar='NAME', help='Name of the arm.')
 @click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
               help='Events that both robot and arm timed, in addition to those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
-@click.option('--wait', is_flag=True, help='Wait until it is known what each mission lacks.')
+@click.option('--wait', is_flag=True, help='Wait until the data have arrived.')
 @click.option('--pull', is_flag=True, help='Ask robots for what they keep of these missions, and wait until it has come.')
-@click.option('--dry-run', is_flag=True, help='Only say what would be exported.')
+@click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--workers', type=click.IntRange(1, 1024), metavar='N',
               help='Episodes at a time  [default: 1; with Ray the cores of the cluster]')  # fmt: skip
 @click.option('--runner', type=click.Choice(['native', 'ray']), default='native', show_default=True,
@@ -278,9 +276,9 @@ def _report(result: Exported, where: str, *, is_dry: bool) -> Iterator[Text]:
 @export.command('verify', epilog=examples('export verify go2_patrol', 'export verify s3://lerobot/datasets/go2/go2_patrol --all'))
 @_place
 @click.option('--all', 'is_all', is_flag=True, help='Compare every frame with its source, not five of each episode.')
-@click.option('--read', 'is_read', is_flag=True, help='Read every source again, instead of asking for its checksum.')
+@click.option('--deep', 'is_deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
 @as_json
-def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> ExitCode:
+def export_verify(*, place: str, is_all: bool, is_deep: bool, as_json: bool) -> ExitCode:
     """Prove that a dataset is as it was written.
 
     It checks that the files are whole, the sources unchanged, and the pictures those of their sources.
@@ -297,7 +295,7 @@ def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> 
         if stored is not None:
             folder = Path(temporary)
             fetch_dataset(stored, folder, store, bar.say)
-        found = library.verify(folder, store, frames=None if is_all else library.FRAMES, is_read=is_read, forgotten=_forgotten,
+        found = library.verify(folder, store, frames=None if is_all else library.FRAMES, is_read=is_deep, forgotten=_forgotten,
                                say=bar.say)  # fmt: skip
     if as_json:
         print_json(asdict(found))
@@ -306,7 +304,7 @@ def export_verify(*, place: str, is_all: bool, is_read: bool, as_json: bool) -> 
     return exit_code(finding=found.wrong)
 
 
-_arm = click.option('--arm', default='soarm', show_default=True, metavar='NAME', help='Whose recording it is.')
+_arm = click.option('--arm', default='soarm', show_default=True, metavar='NAME', help='Name of the arm.')
 _times = click.option('--times', type=click.Path(path_type=Path), metavar='FILE',
                       help="When each episode began, by the arm's clock: CSV with episode,begin_ns.")  # fmt: skip
 
@@ -333,7 +331,7 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
 @click.argument('files', type=click.Path(dir_okay=False, path_type=Path), metavar='FILE...', nargs=-1, required=True)
 @_arm
 @_times
-@click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, help='Samples a second.')
+@click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, metavar='N', help='Frames per second.')
 @click.option('--joints', default='', metavar='NAMES', help='Of qpos, in their order  [default: joint_0, joint_1, ...]')
 @as_json
 def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
@@ -380,7 +378,7 @@ def _proof(found: VerifyResult, place: str) -> Iterator[Text]:
 @export.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))
 @click.argument('key')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Search only here  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
+              help='Only in this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Find the datasets and models that saw an object.
@@ -468,7 +466,7 @@ def _uses(key: str, places: tuple[str, ...]) -> Iterator[DatasetUse]:
 @export.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
 @click.argument('mission')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Only from this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
+              help='Only in this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
 @as_json
 def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
     """Take the episode of a mission out of datasets.

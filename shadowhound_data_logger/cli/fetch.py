@@ -43,18 +43,18 @@ SHOWN: Final = 20
 )
 @click.argument('prefix', required=False)
 @question
-@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N matching objects, the earliest first.')
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N results.')
 @click.option(
     '--to',
     type=click.Path(file_okay=False, path_type=Path),
     required=True,
     metavar='DIR',
-    help='Target folder; objects are written to DIR/KEY.',
+    help='Where to write it.',
 )
 @click.option('--bucket', default='sensor-data', show_default=True, help='Bucket of PREFIX.')
-@click.option('--verify', is_flag=True, help='Read and compare the files that are already there.')
+@click.option('--deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
 @as_json
-def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, verify: bool,
+def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to: Path, bucket: str, deep: bool,
           as_json: bool) -> ExitCode:  # fmt: skip
     """Download objects, verified.
 
@@ -88,7 +88,7 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
             bar.have(size)
             bar.say(f'{number(here)} of {number(len(wishes))} objects')
 
-        found = lake.fetch(wishes, to, source, verify=verify, threads=THREADS, tell=tell)
+        found = lake.fetch(wishes, to, source, verify=deep, threads=THREADS, tell=tell)
         keep_rows(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:

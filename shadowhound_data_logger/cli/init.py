@@ -61,30 +61,31 @@ class Proposal:
 
 @click.command(
     epilog=examples(
-        'init --output robot.yaml',
-        'init --seconds 30 --namespace /robot0 --robot robot0 --output robot0.yaml',
+        'init --to robot.yaml',
+        'init --duration 30 --namespace /robot0 --robot robot0 --to robot0.yaml',
         'init | less',
     )
 )
-@click.option('--output', type=click.Path(path_type=Path, dir_okay=False), help='The file to write  [default: standard output]')
-@click.option('--seconds', type=click.FloatRange(1, 600), default=10.0, show_default=True, help='How long to listen.')
-@click.option(
-    '--namespace', default='/', show_default=True, help='Propose only topics below it, for the node of one of several robots.'
-)
+@click.option('--to', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
+              help='Where to write it  [default: standard output]')  # fmt: skip
+@click.option('--duration', type=click.FloatRange(1, 600), default=10.0, show_default=True, metavar='S',
+              help='Stop after S seconds; Ctrl-C stops it earlier.')  # fmt: skip
+@click.option('--namespace', default='/', metavar='NAME', show_default=True, help='Namespace of the node, as in -r __ns:=/tachi.')
 @click.option(
     '--robot',
-    help='Name of the robot, which begins every key  [default: SHADOWHOUND_ROBOT, else the namespace, else the host name]',
+    metavar='NAME',
+    help='The robot  [default: SHADOWHOUND_ROBOT, else the namespace, else the host name]',
 )
-@click.option('--force', is_flag=True, help='Overwrite the file.')
+@click.option('--overwrite', is_flag=True, help='Overwrite the file.')
 @as_json
-def init(output: Path | None, seconds: float, namespace: str, robot: str | None, *, force: bool, as_json: bool) -> ExitCode:
+def init(to: Path | None, duration: float, namespace: str, robot: str | None, *, overwrite: bool, as_json: bool) -> ExitCode:
     """Write a parameter file for this robot.
 
     Listens to the ROS graph, and proposes a sensor for each topic by its type, with the measured rate and size and what it would
     store in an hour. Nothing is published, and nothing else is written.
     """
-    if output is not None and output.exists() and not force:
-        raise BadUsage(f'{output} exists', 'name another file, or overwrite it with --force')
+    if to is not None and to.exists() and not overwrite:
+        raise BadUsage(f'{to} exists', 'name another file, or add --overwrite')
     namespace = '/' + namespace.strip('/')
     of_machine = re.sub(r'[^A-Za-z0-9_-]', '_', namespace.strip('/') or socket.gethostname()).strip('_-') or 'robot'
     name = robot or os.environ.get('SHADOWHOUND_ROBOT') or of_machine
@@ -92,17 +93,17 @@ def init(output: Path | None, seconds: float, namespace: str, robot: str | None,
         raise BadUsage(f'{name!r} is not a name of a robot', '--robot NAME, of letters, digits, - and _')
     if find_spec('rclpy') is None:
         raise DataLoggerError('rclpy cannot be imported', remedy='source ROS in this shell: . /opt/ros/humble/setup.bash')
-    click.echo(f'listening for {seconds:g} s ...', err=True)
-    found = _proposals(seconds, namespace, name)
+    click.echo(f'listening for {duration:g} s ...', err=True)
+    found = _proposals(duration, namespace, name)
     text = '\n'.join(_yaml(found, name, namespace)) + '\n'
-    if output is not None:
-        output.write_text(text, encoding='utf-8')
+    if to is not None:
+        to.write_text(text, encoding='utf-8')
     if as_json:
         print_json({'robot': name, 'topics': [_document(each) for each in found]})
-    elif output is None:
+    elif to is None:
         sys.stdout.write(text)
     logged = [each for each in found if each.sensor is not None]
-    click.echo(f'{len(logged)} of {len(found)} topics are logged{"" if output is None else f" with {output}"}.', err=True)
+    click.echo(f'{len(logged)} of {len(found)} topics are logged{"" if to is None else f" with {to}"}.', err=True)
     if not found:
         click.echo('No topic has a publisher: is the robot running, and ROS_DOMAIN_ID the same? `shadowhound-data doctor` looks.',
                    err=True)  # fmt: skip

@@ -42,8 +42,10 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.labels import Label
 
 SHOWN: Final = 100
-_robot = click.option('--robot', metavar='NAME', callback=robot_name, help='Whose data  [default: SHADOWHOUND_ROBOT]')
-_by = click.option('--by', metavar='NAME', help='Who labels  [default: the user of this machine]')
+_robot = click.option('--robot', metavar='NAME', callback=robot_name,
+                      help='The robot  [default: SHADOWHOUND_ROBOT, else that of this machine or store]')  # fmt: skip
+_only_robot = click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
+_user = click.option('--user', metavar='NAME', help='Who does it  [default: the user of this machine]')
 
 
 @click.group(epilog=examples('label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31', 'label list'))
@@ -59,26 +61,26 @@ def label() -> None:
     'add',
     epilog=examples(
         'label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31 --note "the cellar"',
-        'label add person --robot thor --key thor/camera/20261120/123005_front.jpg --box 40,60,120,300',
+        'label add person --robot thor --object thor/camera/20261120/123005_front.jpg --box 40,60,120,300',
         'label add bump --robot thor --ranges bumps.json',
     ),
 )
 @click.argument('name')
 @_robot
-@click.option('--since', metavar='TIME', help='Start: 2h ago, 2026-11-20T12:30 (UTC).')
-@click.option('--until', metavar='TIME', help='End, included.')
-@click.option('--key', metavar='KEY', help='Of this object instead, as `query --format keys` prints it.')
-@click.option('--box', metavar='X,Y,W,H', help='Of this box in it, in pixels from the upper left corner.')
+@click.option('--since', metavar='TIME', help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).')
+@click.option('--until', metavar='TIME', help='Before TIME.')
+@click.option('--object', 'key', metavar='KEY', help='Label this object instead of a time, as `query --format keys` prints it.')
+@click.option('--box', metavar='X,Y,W,H', help='Label this box of the object, in pixels from the upper left corner.')
 @ranges_option
 @click.option('--note', default='', metavar='TEXT', help='A remark.')
-@_by
+@_user
 @as_json
 def label_add(*, name: str, robot: str | None, since: str | None, until: str | None, key: str | None, box: str | None,  # noqa: PLR0913 - one an option
-              ranges: list[Any] | None, note: str, by: str | None, as_json: bool) -> ExitCode:  # fmt: skip
+              ranges: list[Any] | None, note: str, user: str | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Label a time, an object, or the times of an answer."""
     ways = (bool(since and until), key is not None, ranges is not None)
     if sum(ways) != 1 or bool(since) != bool(until) or (box and not key):
-        raise BadUsage('give either --since and --until, or --key, or --ranges; --box goes with --key', 'label add --help')
+        raise BadUsage('give either --since and --until, or --object, or --ranges; --box needs --object', 'label add --help')
     with asking():
         from shadowhound_data_logger.lake.labels import Label  # noqa: PLC0415
         from shadowhound_data_logger.lake.select import spans_of  # noqa: PLC0415
@@ -103,15 +105,15 @@ def label_add(*, name: str, robot: str | None, since: str | None, until: str | N
             now_ns = SystemClock.of_this_machine().wall_ns()
             found = [Label(robot=_named(robot), since_ns=moment('--since', since or '', now_ns),
                            until_ns=moment('--until', until or '', now_ns), **of)]  # fmt: skip
-    return _add(found, by, is_json=as_json)
+    return _add(found, user, is_json=as_json)
 
 
 @label.command('import', epilog=examples('label import labels.csv --robot thor', 'label import coco.json'))
 @click.argument('file', type=click.File('rb'))
 @_robot
-@_by
+@_user
 @as_json
-def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool) -> ExitCode:
+def label_import(*, file: Any, robot: str | None, user: str | None, as_json: bool) -> ExitCode:
     """Import labels from a CSV, or boxes from a COCO file.
 
     A CSV names its columns: label, since and until, or key; and any of robot bucket x y width height note. The file names of a
@@ -125,12 +127,12 @@ def label_import(*, file: Any, robot: str | None, by: str | None, as_json: bool)
 
         is_json = body.lstrip()[:1] == b'{'
         found = labels.from_coco(body, robot) if is_json else labels.from_csv(body, _named(robot), now_ns)
-    return _add(found, by, is_json=as_json)
+    return _add(found, user, is_json=as_json)
 
 
 @label.command('list', epilog=examples('label list', 'label list --label stairs --json'))
-@_robot
-@click.option('--label', 'name', metavar='NAME', help='Only this label.')
+@_only_robot
+@click.option('--label', 'name', metavar='NAME', help='Only with this label.')
 @as_json
 def label_list(*, robot: str | None, name: str | None, as_json: bool) -> ExitCode:
     """Show the labels in force."""
@@ -164,11 +166,11 @@ _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', '
 
 @label.command('remove', epilog=examples('label remove 3f2a9c0d11e45b67', 'label remove --label stairs --robot thor'))
 @click.argument('ids', nargs=-1)
-@_robot
-@click.option('--label', 'name', metavar='NAME', help='All labels with this name.')
-@_by
+@_only_robot
+@click.option('--label', 'name', metavar='NAME', help='Only with this label.')
+@_user
 @as_json
-def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by: str | None, as_json: bool) -> ExitCode:
+def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, user: str | None, as_json: bool) -> ExitCode:
     """Remove labels, by their ids or all of a name.
 
     A layer records the removal; what was labeled before stays in the store. Exit code 1 if some of the ids do not exist.
@@ -186,7 +188,7 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
             _check(source, labels.read(source, None, findings=quietly()), robots={robot}, labels={name}, ids=ids)
     unknown = sorted(set(ids) - {each.id for each in found})
     with the_store() as store:
-        keys = [labels.write(store, of, some, by=by or _me(), is_removal=True) for of, some in labels.by_robot(found)]
+        keys = [labels.write(store, of, some, by=user or _me(), is_removal=True) for of, some in labels.by_robot(found)]
     if as_json:
         print_json({'removed': len(found), 'unknown': unknown, 'layers': keys})
     else:
@@ -196,7 +198,7 @@ def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, by:
     return exit_code(finding=unknown or report_skipped(left_out))
 
 
-def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
+def _add(found: Sequence[Label], user: str | None, *, is_json: bool) -> ExitCode:
     from shadowhound_data_logger.lake import labels  # noqa: PLC0415
     from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
@@ -206,7 +208,7 @@ def _add(found: Sequence[Label], by: str | None, *, is_json: bool) -> ExitCode:
         kept, absent = labels.timed(source, found, left_out)
         checked = [each.checked() for each in kept]
         with the_store() as store:
-            keys = [labels.write(store, robot, some, by=by or _me()) for robot, some in labels.by_robot(checked)]
+            keys = [labels.write(store, robot, some, by=user or _me()) for robot, some in labels.by_robot(checked)]
     if is_json:
         print_json({'added': len(checked), 'ids': [each.id for each in checked], 'absent': absent, 'layers': keys})
     else:

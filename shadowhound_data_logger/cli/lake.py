@@ -19,9 +19,11 @@ from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import finding_lines, findings
 from shadowhound_data_logger.cli.common import (
+    Age,
     BadUsage,
     ExitCode,
     LazyCommands,
+    Size,
     Verb,
     as_json,
     examples,
@@ -112,14 +114,14 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
 
 
 @lake.command('ingest', epilog=examples('lake ingest', 'lake ingest --follow'))
-@click.option('--follow', is_flag=True, help='Continue until interrupted, as the service of a Tower does.')
+@click.option('--follow', is_flag=True, help='Continue until Ctrl-C, with what is new.')
 @click.option(
-    '--every', type=click.FloatRange(1.0), default=30.0, show_default=True, metavar='S', help='Seconds between two rounds.'
+    '--interval', type=click.FloatRange(1.0), default=30.0, show_default=True, metavar='S', help='Seconds between two rounds.'
 )
-@click.option('--expire', type=click.FloatRange(0.0), metavar='MIN',
-              help='Delete row files this many minutes after they were ingested  [default: keep them]')  # fmt: skip
+@click.option('--delete-after', type=Age(), metavar='AGE',
+              help='Delete row files that were ingested AGE ago, such as 2h  [default: keep them]')  # fmt: skip
 @as_json
-def lake_ingest(*, follow: bool, every: float, expire: float | None, as_json: bool) -> ExitCode:
+def lake_ingest(*, follow: bool, interval: float, delete_after: int | None, as_json: bool) -> ExitCode:
     """Make tables of the rows that robots wrote.
 
     On a server with a bucket `lake` the tables are in that bucket and shared by all readers, otherwise in this user's home.
@@ -133,7 +135,7 @@ def lake_ingest(*, follow: bool, every: float, expire: float | None, as_json: bo
         from shadowhound_data_logger.lake.tables import Tables  # noqa: PLC0415
 
     source, left_out = default_source(the_store_settings()), quietly()
-    grace = None if expire is None else timedelta(minutes=expire)
+    grace = None if delete_after is None else timedelta(microseconds=delete_after / 1000)
     with asking():
         tables = Tables.for_ingest(source)
     while True:
@@ -152,7 +154,7 @@ def lake_ingest(*, follow: bool, every: float, expire: float | None, as_json: bo
                 click.echo(_about_ingest(done, tables.root))
         if not follow:
             return report_skipped(left_out)
-        time.sleep(every)
+        time.sleep(interval)
 
 
 def _about_ingest(done: Ingested, root: str) -> str:
@@ -171,20 +173,21 @@ def _about_ingest(done: Ingested, root: str) -> str:
     ),
 )
 @click.option('--keep', 'rules', required=True, metavar='RULES', help='Sensors, and for how long to keep each: "camera 90d, ..."')
-@click.option('--max-bytes', 'most', metavar='SIZE',
-              help='Where more is left, such as 2TB, also delete the oldest days of these sensors.')  # fmt: skip
+@click.option('--max-bytes', 'most', type=Size(), metavar='SIZE',
+              help='Keep at most SIZE, such as 2TB.')  # fmt: skip
 @_robot
-@click.option('--dry-run', is_flag=True, help='Only say what would be deleted.')
+@click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--force', is_flag=True, help='Also delete what datasets, labels and open requests refer to.')
 @click.option('--yes', is_flag=True, help='Do not ask.')
 @as_json
 def lake_prune(
-    *, rules: str, most: str | None, robot: str | None, dry_run: bool, force: bool, yes: bool, as_json: bool
+    *, rules: str, most: int | None, robot: str | None, dry_run: bool, force: bool, yes: bool, as_json: bool
 ) -> ExitCode:
     """Delete old objects from the store.
 
     By sensor and age; `bags`, `events` and `missions` are sensors here, too, and go as a whole. What no rule names stays, and so
-    does what a dataset, a label or an open request (`pull`) refers to. The catalog keeps the rows, as forgotten.
+    does what a dataset, a label or an open request (`pull`) refers to. With --max-bytes, the oldest days of the named sensors are
+    deleted too, until no more is left. The catalog keeps the rows, as forgotten.
 
     It asks before it deletes all of a sensor or, with --force, what something refers to; without a terminal it then does nothing.
     Exit code 1 when it did nothing for that reason, or when more is left than --max-bytes.
@@ -197,7 +200,7 @@ def lake_prune(
         from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         keep = library.keep_rules(rules, now_ns)
-        how: dict[str, Any] = {'robot': robot, 'most_bytes': None if most is None else library.size_of(most), 'is_forced': force}
+        how: dict[str, Any] = {'robot': robot, 'most_bytes': most, 'is_forced': force}
     source, left_out = default_source(the_store_settings()), quietly()
     with progress('looking at what there is') as bar:
         made = library.plan(source, keep, exported=_exported(bar.say), findings=left_out, tell=bar.say, **how)
@@ -288,7 +291,7 @@ def _reasons(made: PrunePlan) -> Iterator[str]:
 
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))
-@click.option('--robot', metavar='NAME', required=True, help='Robot of the objects.')
+@click.option('--robot', metavar='NAME', required=True, help='The robot.')
 @click.option('--statistics', is_flag=True, help='Instead, open objects without statistics of their fields, and add those.')
 @as_json
 def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
@@ -321,8 +324,8 @@ def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
 @question
 @click.option('--catalog', type=click.Path(exists=True, file_okay=False, path_type=Path), metavar='DIR',
               help='Catalog of another store, downloaded by `fetch ROBOT/_catalog/ --to DIR`.')  # fmt: skip
-@click.option('--deep', is_flag=True, help='Read every object back.')
-@click.option('--again', is_flag=True, help='Verify from the beginning, even if a run was interrupted.')
+@click.option('--deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
+@click.option('--again', is_flag=True, help='Verify from the start, even if a run was interrupted.')
 @as_json
 def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, again: bool, as_json: bool) -> ExitCode:
     """Check that the store has what the catalog says.
@@ -377,7 +380,9 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
 @lake.command(
     'coverage',
     epilog=examples(
-        'lake coverage --since yesterday', 'lake coverage --topic /imu --map imu.png', 'lake coverage --since 7d --wifi wifi.png'
+        'lake coverage --since yesterday',
+        'lake coverage --topic /imu --chart imu.png',
+        'lake coverage --since 7d --wifi wifi.png',
     ),
 )
 @_robot
@@ -385,11 +390,15 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
 @click.option('--sink', type=click.Choice(['objects', 'bags', 'events']), default='objects', show_default=True,
               help='Messages stored by the sensors, recorded in bags, or kept by events.')  # fmt: skip
 @click.option(
-    '--since', metavar='TIME', default='1d', show_default=True, help='From TIME on: yesterday, 2h, 2026-11-20T12:30 (UTC).'
+    '--since',
+    metavar='TIME',
+    default='1d',
+    show_default=True,
+    help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).',
 )
 @click.option('--until', metavar='TIME', default='now', show_default=True, help='Before TIME.')
 @by_option
-@click.option('--map', 'chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
+@click.option('--chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
 @click.option('--wifi', type=click.Path(path_type=Path), metavar='FILE.png',
               help='Draw instead how fast uploads went where the robot was: where to dock.')  # fmt: skip
 @as_json

@@ -67,16 +67,14 @@ ACCOUNTING: Final = {
 )
 @as_json
 @spool_folder
-@click.option('--verify', 'ask', is_flag=True, help='Ask the store for every delivered object: is it there, with its checksum?')
-@click.option('--deep', is_flag=True, help='Verify by reading every object back.')
-@click.option('--again', is_flag=True, help='Verify from the beginning, even if a run was interrupted.')
+@click.option('--verify', 'ask', is_flag=True, help='Check that the store has every delivered object, with its checksum.')
+@click.option('--deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
+@click.option('--again', is_flag=True, help='Verify from the start, even if a run was interrupted.')
 @click.option('--gaps', 'when', is_flag=True, help='Show when messages were lost, how many, why, and in which mission.')
-@click.option('--topic', default='', metavar='TOPIC', help='With --gaps: only of this topic.')
-@click.option(
-    '--since', default='', metavar='TIME', help='With --gaps: that end at or after TIME: yesterday, 2h, 2026-11-20T12:30.'
-)
-@click.option('--until', default='', metavar='TIME', help='With --gaps: that begin at or before TIME.')
-@click.option('--cause', default='', metavar='WORD', help='With --gaps: only of this cause or kind: restart, missed, no_room.')
+@click.option('--topic', default='', metavar='NAME', help='Only of this topic.')
+@click.option('--since', default='', metavar='TIME', help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).')
+@click.option('--until', default='', metavar='TIME', help='Before TIME.')
+@click.option('--cause', default='', metavar='WORD', help='Only of this cause or kind, such as restart, missed or no_room.')
 def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: bool, when: bool, topic: str, since: str,  # noqa: PLR0913 - one an option
            until: str, cause: str) -> ExitCode:  # fmt: skip
     """Account for every message: stored, or lost and why.

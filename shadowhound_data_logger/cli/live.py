@@ -49,7 +49,7 @@ RTSP_PORT = 8554
     help='Serve https with these files.',
 )
 @click.option(
-    '--name', 'names', multiple=True, metavar='HOST', help='Another name of this machine in addresses; may be repeated.'
+    '--hostname', 'names', multiple=True, metavar='HOST', help='Another name of this machine in addresses; may be repeated.'
 )
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
               help='Limit of uploads in Mbit/s while a viewer watches over the network; 0: no limit.')  # fmt: skip
@@ -59,7 +59,8 @@ RTSP_PORT = 8554
 @click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
               help="The file with a viewer's token there.")  # fmt: skip
-@click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Robot to show  [default: the one that ran here]')
+@click.option('--robot', metavar='NAME', envvar='SHADOWHOUND_ROBOT', callback=robot_name,
+              help='The robot  [default: the one that ran here]')  # fmt: skip
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option

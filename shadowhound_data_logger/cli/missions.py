@@ -106,11 +106,12 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
     return exit_code(finding=_late([found]))
 
 
-@missions.command(epilog=examples('missions resume --deadline 300'))
-@click.option('--deadline', type=click.FloatRange(0.0, 1e6), default=60.0, show_default=True, help='Seconds to wait.')
-@click.option('--experiment', help='The MLflow experiment of new runs.  [default: ROBOT_missions]')
+@missions.command(epilog=examples('missions resume --timeout 300'))
+@click.option('--timeout', type=click.FloatRange(0.0, 1e7), default=60.0, show_default=True, metavar='S',
+              help='Give up after S seconds.')  # fmt: skip
+@click.option('--experiment', metavar='NAME', help='The MLflow experiment of new runs  [default: ROBOT_missions]')
 @as_json
-def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCode:
+def resume(*, timeout: float, experiment: str | None, as_json: bool) -> ExitCode:
     """Send what is unsent, and wait for it.
 
     Exit code 1 if something is left after the deadline; sending continues for ten more minutes in the background.
@@ -126,7 +127,7 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
     replayer.start()
     replayer.wake()
     try:
-        left = _wait(where, time.monotonic() + deadline)
+        left = _wait(where, time.monotonic() + timeout)
     finally:
         replayer.release()
     if as_json:
@@ -134,13 +135,16 @@ def resume(*, deadline: float, experiment: str | None, as_json: bool) -> ExitCod
         return exit_code(finding=left)
     for each in left:
         print_page(*_reason(each), console=Console(highlight=False, stderr=True))
-    click.echo(f'{number(len(left))} not sent within {deadline:g} s.' if left else 'All is sent.')
+    click.echo(f'{number(len(left))} not sent within {timeout:g} s.' if left else 'All is sent.')
     return exit_code(finding=left)
 
 
 @missions.command('export', epilog=examples('missions export patrol_20251018_120000 --format csv --to mission.csv'))
-@click.option('--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='What to write.')
-@click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', help='The file  [default: standard output]')
+@click.option(
+    '--format', 'kind', type=click.Choice(['json', 'csv']), default='json', show_default=True, help='Format of the output.'
+)
+@click.option('--to', type=click.File('w', encoding='utf-8', lazy=True), default='-', metavar='FILE',
+              help='Where to write it  [default: standard output]')  # fmt: skip
 @as_json
 @_mission
 def export_(*, folder: MissionFolder, kind: str, to: IO[str], as_json: bool) -> ExitCode:

@@ -24,10 +24,10 @@ LIVE: Final = {True: 'at a start', False: 'yes'}
 
 def _of_node(verb: F) -> F:
     """The options that each verb has."""
-    whose = 'Robot of the node  [default: the only one that runs here]'
+    whose = 'The robot  [default: the only one that runs here]'
     for option in (
         as_json,
-        click.option('--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help=whose),
+        click.option('--robot', metavar='NAME', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help=whose),
         spool_folder,
     ):
         verb = option(verb)
@@ -69,7 +69,7 @@ _add(bag, 'resume', 'bag resume', 'Record again.')
 
 @node.command(epilog=examples('node event', "node event slipped --note 'wet floor'"))
 @click.argument('name', default='manual')
-@click.option('--note', default='', help='What happened, for the manifest.')
+@click.option('--note', default='', metavar='TEXT', help='A remark.')
 @_of_node
 def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
     """Save the seconds before and after now as a bag.

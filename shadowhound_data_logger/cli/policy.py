@@ -16,8 +16,11 @@ from typing import Any, Final, TypeVar
 import click
 
 from shadowhound_data_logger.cli.common import (
+    DAY_NS,
+    Age,
     BadUsage,
     ExitCode,
+    Size,
     as_json,
     examples,
     exit_code,
@@ -29,7 +32,6 @@ from shadowhound_data_logger.cli.common import (
 from shadowhound_data_logger.cli.output import plain_table, print_json, print_page
 from shadowhound_data_logger.core.errors import DataLoggerError, PolicyError, PolicyRefused
 from shadowhound_data_logger.core.mlflow_rest import MlflowRest
-from shadowhound_data_logger.core.options import GIBI
 from shadowhound_data_logger.missions.active import MissionFinder
 from shadowhound_data_logger.policies import packing, running
 from shadowhound_data_logger.policies.folder import PolicyFolder
@@ -65,21 +67,25 @@ def _signs(verb: _Verb) -> _Verb:
                         )(verb)  # fmt: skip
 
 
-_key = click.option('--key', type=_file, help='Private key to sign with  [default: targets.key in the folder of keys]')
+_key = click.option(
+    '--key', type=_file, metavar='FILE', help='Private key to sign with  [default: targets.key in the folder of keys]'
+)
 _root_keys = click.option('--root-key', 'publics', type=_file, multiple=True, metavar='PUB',
                           help='Public key of a person who keeps a part of the root; may be repeated.')  # fmt: skip
 _encrypt = click.option('--encrypt', is_flag=True, help='Ask for a passphrase for the keys that are made, except online.key.')
 
 
-@policy.command(epilog=examples('policy keys', 'policy keys --only alice',
+@policy.command(epilog=examples('policy keys', 'policy keys --person alice',
                                 'policy keys --threshold 2 --root-key alice.pub --root-key bob.pub'))  # fmt: skip
 @_root_keys
-@click.option('--threshold', type=click.IntRange(1), default=1, show_default=True, help='How many of them must sign a root.')
-@click.option('--only', metavar='NAME', help='One key for one person: NAME.key to keep, NAME.pub to hand out.')
+@click.option(
+    '--threshold', type=click.IntRange(1), default=1, show_default=True, metavar='N', help='How many keys of a root must sign it.'
+)
+@click.option('--person', metavar='NAME', help='Make one key for this person: NAME.key to keep, NAME.pub to pass on.')
 @_encrypt
 @_signs
 @as_json
-def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt: bool, folder: Path | None, as_json: bool
+def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encrypt: bool, folder: Path | None, as_json: bool
          ) -> ExitCode:  # fmt: skip
     """Make the keys that say which policies may run.
 
@@ -88,9 +94,9 @@ def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt
     """
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
     files, repository = _signers()
-    if only:
+    if person:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        private = place / f'{only}{files.PRIVATE}'
+        private = place / f'{person}{files.PRIVATE}'
         keyid, public = files.make_key(private, passphrase).public_key.keyid, private.with_suffix(files.PUBLIC)
         told: dict[str, object] = {'key': keyid, 'private': str(private), 'public': str(public)}
         lines = [f'{private}: keep it', f'{public}: for who runs policy keys or policy delegate']
@@ -111,7 +117,7 @@ def keys(*, publics: tuple[Path, ...], threshold: int, only: str | None, encrypt
 
 @policy.command(name='sign-root', epilog=examples('policy sign-root root.json --key alice.key'))
 @click.argument('root', type=_file)
-@click.option('--key', type=_file, required=True, help='Private key of a person who keeps a part of the root.')
+@click.option('--key', type=_file, required=True, metavar='FILE', help='Private key to sign with.')
 @as_json
 def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
     """Sign a new root with another key."""
@@ -126,12 +132,14 @@ def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples('policy rotate', 'policy rotate root --root-secret usb/root.key', 'policy rotate online'))
+@policy.command(epilog=examples('policy rotate', 'policy rotate root --key usb/root.key', 'policy rotate online'))
 @click.argument('roles', nargs=-1, type=click.Choice(['root', 'targets', 'online']))
-@click.option('--root-secret', 'secrets', type=_file, multiple=True, metavar='KEY',
-              help='Private key of the root; may be repeated  [default: root.key in the folder of keys]')  # fmt: skip
+@click.option('--key', 'secrets', type=_file, multiple=True, metavar='FILE',
+              help='Private key to sign with; may be repeated  [default: root.key in the folder of keys]')  # fmt: skip
 @_root_keys
-@click.option('--threshold', type=click.IntRange(1), help='How many keys of a new root must sign  [default: as before]')
+@click.option(
+    '--threshold', type=click.IntRange(1), metavar='N', help='How many keys of a root must sign it  [default: as before]'
+)
 @_encrypt
 @_signs
 @as_json
@@ -169,19 +177,19 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples("policy delegate alice.pub --for 'go2/go2_patrol/*'", 'policy delegate alice --end'))
+@policy.command(epilog=examples("policy delegate alice.pub --for 'go2/go2_patrol/*'", 'policy delegate alice --revoke'))
 @click.argument('who', metavar='PUB|NAME')
 @click.option('--for', 'paths', multiple=True, metavar='PATTERN', help='ROBOT_TYPE/POLICY/VERSION, * for any; may be repeated.')
-@click.option('--end', is_flag=True, help='Take the right from NAME: no robot runs any longer what only that key listed.')
+@click.option('--revoke', is_flag=True, help='Take the right from NAME: robots no longer run what only that key listed.')
 @_key
 @_signs
 @as_json
-def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, folder: Path | None, as_json: bool) -> ExitCode:
+def delegate(*, who: str, paths: tuple[str, ...], revoke: bool, key: Path | None, folder: Path | None, as_json: bool) -> ExitCode:
     """Let another key list versions of some policies."""
-    if end == bool(paths):
-        raise BadUsage('either --for or --end', "policy delegate alice.pub --for 'go2/go2_patrol/*'")
+    if revoke == bool(paths):
+        raise BadUsage('either --for or --revoke', "policy delegate alice.pub --for 'go2/go2_patrol/*'")
     with _signing(folder) as signing:
-        if end:
+        if revoke:
             names = list(signing.end_delegation(who, key))
             text = f'no longer may sign: {", ".join(names)}'
         else:
@@ -191,18 +199,18 @@ def delegate(*, who: str, paths: tuple[str, ...], end: bool, key: Path | None, f
     return ExitCode.FINE
 
 
-@policy.command(epilog=examples('policy refresh', 'policy refresh --days 3'))
-@click.option('--days', type=click.FloatRange(0.01, 365.0), default=FRESH_DAYS, show_default=True,
-              help='How long robots take new versions without another one.')  # fmt: skip
+@policy.command(epilog=examples('policy refresh', 'policy refresh --expires 3d'))
+@click.option('--expires', type=Age(365 * DAY_NS), metavar='AGE', default=f'{FRESH_DAYS:g}d', show_default=True,
+              help='How long it is valid, such as 2h or 30d.')  # fmt: skip
 @_signs
 @as_json
-def refresh(*, days: float, folder: Path | None, as_json: bool) -> ExitCode:
+def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
     """Renew the signed timestamp, once a day.
 
     It needs online.key and runs from cron.
     It takes in what other signers have published, and puts a root in force that has all its signatures by now.
     """
-    with _signing(folder, days) as signing:
+    with _signing(folder, expires / DAY_NS) as signing:
         state = signing.refresh()
         listed = signing.listed()
     told = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
@@ -212,23 +220,34 @@ def refresh(*, days: float, folder: Path | None, as_json: bool) -> ExitCode:
     return exit_code(finding=soon)
 
 
-@policy.command(epilog=examples('policy pack outputs/go2_patrol --name go2_patrol --smoke sample.npz -o packed'))
+@policy.command(epilog=examples('policy pack outputs/go2_patrol --name go2_patrol --smoke sample.npz --to packed'))
 @click.argument('folder', metavar='DIR', type=_folder)
-@click.option('--name', required=True, help='Name of the registered model.')
+@click.option('--name', required=True, metavar='NAME', help='Name of the registered model.')
 @click.option('--version', type=click.IntRange(1), help="Its version  [default: the registry's next one]")
 @click.option('--smoke', type=_file, required=True, metavar='NPZ', help='An array for each input, for the smoke run.')
 @click.option('--dataset', default='', metavar='DIGEST', help='Digest of the training set.')
 @click.option('--run', 'run_id', default='', metavar='ID', help='MLflow run that trained it.')
-@click.option('--robot-type', 'robot_types', multiple=True, default=('go2',), show_default=True, help='Robots it is for.')
-@click.option('--fps', type=click.FloatRange(0.01, 1000.0), default=10.0, show_default=True, help='Steps a second.')
+@click.option(
+    '--robot-type',
+    'robot_types',
+    multiple=True,
+    default=('go2',),
+    show_default=True,
+    metavar='TYPE',
+    help='Type of robot; may be repeated.',
+)
+@click.option(
+    '--fps', type=click.FloatRange(0.01, 1000.0), default=10.0, show_default=True, metavar='N', help='Frames per second.'
+)
 @click.option('--tolerance', type=click.FloatRange(0.0, min_open=True), default=1e-4, show_default=True,
               help="How much the sample's output may differ on a robot.")  # fmt: skip
-@click.option('--p99-ms', type=click.FloatRange(0.0, min_open=True), default=100.0, show_default=True,
-              help='The slowest p99 of a step that is allowed.')  # fmt: skip
-@click.option('--failures', type=click.IntRange(0), default=3, show_default=True, help='Failed steps of 100 that are allowed.')
-@click.option('-o', '--output', type=click.Path(path_type=Path), required=True, help='A new folder.')
+@click.option('--max-p99-ms', 'p99_ms', type=click.FloatRange(0.0, min_open=True), default=100.0, show_default=True,
+              help='Longest p99 of a step that is allowed.')  # fmt: skip
+@click.option('--max-failures', 'failures', type=click.IntRange(0), default=3, show_default=True,
+              help='Failed steps among the last 100 that are allowed.')  # fmt: skip
+@click.option('--to', type=click.Path(path_type=Path), required=True, metavar='DIR', help='Where to write it.')
 @as_json
-def pack(*, folder: Path, name: str, version: int | None, smoke: Path, output: Path, run_id: str, as_json: bool, **given: Any
+def pack(*, folder: Path, name: str, version: int | None, smoke: Path, to: Path, run_id: str, as_json: bool, **given: Any
          ) -> ExitCode:  # fmt: skip
     """Make a folder with a manifest of what a training wrote.
 
@@ -236,35 +255,32 @@ def pack(*, folder: Path, name: str, version: int | None, smoke: Path, output: P
     run on a robot has to give.
     """
     number = version or 1 + max((each.version for each in _registry().versions(name)), default=0)
-    manifest = packing.pack(folder, smoke, output, packing.Packing(name=name, version=number, run=run_id, **given))
-    told = {'policy': manifest.id, 'folder': str(output), 'files': len(manifest.files), 'bytes': manifest.size}
-    print_json(told) if as_json else click.echo(
-        f'{manifest.id}: {len(manifest.files)} files, {manifest.size:,} bytes in {output}'
-    )
+    manifest = packing.pack(folder, smoke, to, packing.Packing(name=name, version=number, run=run_id, **given))
+    told = {'policy': manifest.id, 'folder': str(to), 'files': len(manifest.files), 'bytes': manifest.size}
+    print_json(told) if as_json else click.echo(f'{manifest.id}: {len(manifest.files)} files, {manifest.size:,} bytes in {to}')
     return ExitCode.FINE
 
 
 @policy.command(
-    epilog=examples('policy publish packed --alias champion', 'policy publish packed --alias canary --robots thor,tachi')
+    epilog=examples('policy publish packed --alias champion', 'policy publish packed --alias canary --canary thor --canary tachi')
 )
 @click.argument('packed', type=_folder)
 @click.option('--alias', 'aliases', multiple=True, help=f'Such as {CHAMPION}, {CANARY} or robot-NAME; may be repeated.')
-@click.option('--robots', default='', metavar='NAMES', help=f'The robots that take it as {CANARY}, with commas between.')
+@click.option('--canary', 'robots', multiple=True, metavar='ROBOT', help=f'Robot that takes it as {CANARY}; may be repeated.')
 @_key
 @_signs
 @as_json
 def publish(
-    *, packed: Path, aliases: tuple[str, ...], robots: str, key: Path | None, folder: Path | None, as_json: bool
+    *, packed: Path, aliases: tuple[str, ...], robots: tuple[str, ...], key: Path | None, folder: Path | None, as_json: bool
 ) -> ExitCode:
     """Upload what was packed, register it, and sign that it may run.
 
     May be repeated, also to give a version that is there another alias. Nothing is overwritten.
     """
-    names = [robot.strip() for robot in robots.split(',') if robot.strip()]
     with the_store() as store:
         signing = _signers()[1].Repository(_keys_folder(folder), store, _passphrase)
-        manifest, is_told = packing.publish(packed, store, _registry(), signing, key=key, aliases=aliases, robots=names)
-    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': names, 'refreshed': is_told}
+        manifest, is_told = packing.publish(packed, store, _registry(), signing, key=key, aliases=aliases, robots=robots)
+    told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': list(robots), 'refreshed': is_told}
     text = f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}'
     print_json(told) if as_json else click.echo(
         text if is_told else f'{text}; robots take it after policy refresh, where online.key is'
@@ -274,7 +290,15 @@ def publish(
 
 @policy.command(epilog=examples('policy withdraw go2_patrol@7'))
 @click.argument('name', metavar='NAME@VERSION')
-@click.option('--robot-type', 'robot_types', multiple=True, default=('go2',), show_default=True, help='Robots it was for.')
+@click.option(
+    '--robot-type',
+    'robot_types',
+    multiple=True,
+    default=('go2',),
+    show_default=True,
+    metavar='TYPE',
+    help='Type of robot; may be repeated.',
+)
 @_key
 @_signs
 @as_json
@@ -306,16 +330,21 @@ _isolation = click.option(
 def _follows(verb: _Verb) -> _Verb:
     """The options of what a robot follows."""
     for option in reversed((
-        click.option('--name', envvar='SHADOWHOUND_POLICY', required=True, help='Registered model  [$SHADOWHOUND_POLICY]'),
-        click.option('--robot', default=lambda: the_robot(None), callback=robot_name, show_default='that of this machine'),
-        click.option('--robot-type', default='go2', show_default=True, help='What the manifest has to be for.'),
+        click.option('--name', envvar='SHADOWHOUND_POLICY', required=True, metavar='NAME',
+                     help='Name of the registered model  [default: $SHADOWHOUND_POLICY]'),
+        click.option('--robot', metavar='NAME', default=lambda: the_robot(None), callback=robot_name,
+                     show_default='that of this machine', help='The robot.'),
+        click.option('--robot-type', default='go2', show_default=True, metavar='TYPE', help='Type of robot.'),
         click.option('--max-mbps', type=click.FloatRange(0.0, 1e5), default=0.0, show_default=True,
-                     help='Most megabits a second to download; 0: no limit.'),
-        click.option('--max-gib', type=click.FloatRange(0.001), default=8.0, show_default=True, help='Most disk for policies.'),
-        click.option('--min-free-gib', type=click.FloatRange(0.0), default=2.0, show_default=True, help='Disk to leave free.'),
-        click.option('--keep', type=click.IntRange(2), default=3, show_default=True, help='Versions to keep on the disk.'),
+                     metavar='N', help='Download at most N Mbit/s; 0: no limit.'),
+        click.option('--max-bytes', type=Size(), metavar='SIZE', default='8GiB', show_default=True,
+                     help='Keep at most SIZE, such as 2TB.'),
+        click.option('--min-free-bytes', type=Size(), metavar='SIZE', default='2GiB', show_default=True,
+                     help='Leave SIZE of the disk free.'),
+        click.option('--keep-versions', 'keep', type=click.IntRange(2), default=3, show_default=True, metavar='N',
+                     help='Versions to keep on the disk.'),
         _isolation,
-        click.option('--now', is_flag=True, help='Activate also while a mission is active.'),
+        click.option('--now', is_flag=True, help='Activate it even while a mission is active.'),
     )):  # fmt: skip
         verb = option(verb)
     return verb
@@ -333,10 +362,11 @@ def sync(*, as_json: bool, **given: Any) -> ExitCode:
 
 
 @policy.command(epilog=examples('policy run --name go2_patrol --max-mbps 20'))
-@click.option('--every', type=click.FloatRange(0.1, 86_400.0), default=30.0, show_default=True, help='Seconds between two looks.')
+@click.option('--interval', type=click.FloatRange(0.1, 86_400.0), default=30.0, show_default=True, metavar='S',
+              help='Seconds between two rounds.')  # fmt: skip
 @_follows
 @as_json
-def run(*, every: float, as_json: bool, **given: Any) -> ExitCode:
+def run(*, interval: float, as_json: bool, **given: Any) -> ExitCode:
     """Follow the registry until interrupted.
 
     With --json, each change is one line of JSON on standard output.
@@ -359,7 +389,7 @@ def run(*, every: float, as_json: bool, **given: Any) -> ExitCode:
             if text != said:
                 said = text
                 print_json(told, is_line=True) if as_json else print(text, file=sys.stderr, flush=True)
-            time.sleep(every * random.uniform(1.0 - JITTER, 1.0 + JITTER))
+            time.sleep(interval * random.uniform(1.0 - JITTER, 1.0 + JITTER))
     return ExitCode.FINE
 
 
@@ -418,7 +448,7 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
 
 @policy.command(epilog=examples('policy use go2_patrol@7'))
 @click.argument('name')
-@click.option('--now', is_flag=True, help='Also while a mission is active.')
+@click.option('--now', is_flag=True, help='Activate it even while a mission is active.')
 @_isolation
 @as_json
 def use(*, name: str, now: bool, isolation: str, as_json: bool) -> ExitCode:
@@ -526,9 +556,7 @@ def _policies() -> PolicyFolder:
 @contextmanager
 def _syncing(given: dict[str, Any]) -> Iterator[PolicySync]:
     is_now = given.pop('now')
-    settings = PolicySettings(
-        max_bytes=int(given.pop('max_gib') * GIBI), min_free_bytes=int(given.pop('min_free_gib') * GIBI), **given
-    )
+    settings = PolicySettings(**given)
     with the_store(1) as store:
         may_activate = (lambda: True) if is_now else _no_mission(settings.robot)
         yield PolicySync(_policies(), store, _registry(), settings, may_activate)

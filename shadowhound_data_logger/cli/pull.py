@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from shadowhound_data_logger.cli.common import (
+    Age,
     BadUsage,
     ExitCode,
     as_json,
@@ -34,7 +35,6 @@ from shadowhound_data_logger.core.mailbox import (
     RequestAnswer,
     offer,
 )
-from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import visible
 
 if TYPE_CHECKING:
@@ -53,17 +53,28 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
 )
 @question
 @click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters.")
-@click.option('--priority', type=click.IntRange(0, 9), default=DEFAULT_PRIORITY, show_default=True, help='0 is sent first.')
 @click.option(
-    '--expires', metavar='AGE', default='7d', show_default=True, help='How long the request is valid, such as 2h or 30d.'
+    '--priority',
+    type=click.IntRange(0, 9),
+    default=DEFAULT_PRIORITY,
+    show_default=True,
+    help='Priority of the request; 0 is sent first.',
 )
-@click.option('--by', metavar='NAME', help='Who requests it  [default: the user]')
-@click.option('--wait', 'is_waiting', is_flag=True, help='Wait for the last answer, and until `query` knows what came.')
-@click.option('--dry-run', is_flag=True, help='Only print what would be requested.')
+@click.option(
+    '--expires',
+    type=Age(LONGEST_NS),
+    metavar='AGE',
+    default='7d',
+    show_default=True,
+    help='How long it is valid, such as 2h or 30d.',
+)
+@click.option('--user', metavar='NAME', help='Who does it  [default: the user of this machine]')
+@click.option('--wait', 'is_waiting', is_flag=True, help='Wait until the data have arrived.')
+@click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--list', 'is_listing', is_flag=True, help='List the requests and how far they are.')
 @click.option('--cancel', metavar='ID', help='Cancel a request.')
 @as_json
-def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: str, by: str | None, is_waiting: bool,  # noqa: PLR0913 - one an option
+def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: int, user: str | None, is_waiting: bool,  # noqa: PLR0913 - one an option
          dry_run: bool, is_listing: bool, cancel: str | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Request data that a robot keeps (ship: on_request).
 
@@ -81,9 +92,9 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
         source, left_out = default_source(the_store_settings()), quietly()
         robot = the_robot(flags.get('robot'), in_store=True, must_exist=True)
         check_name_of('robot', robot, robots(source))
-        name = by or lake.requester()
+        name = user or lake.requester()
         if not is_name(name):
-            raise BadUsage(f'--by {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
+            raise BadUsage(f'--user {name!r} is not a name', 'use letters, digits, "_", "-" and "."')
         if is_listing:
             return _list(lake.listed(source, robot), is_json=as_json)
         with the_store() as store:
@@ -102,7 +113,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: s
             answer: RequestAnswer | None = None
             request_id = None
             if not dry_run and offered.objects:
-                request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=_expiry_ns(expires))
+                request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=expires)
                 request_id = request.id
                 if not as_json:
                     click.echo(f'Requested: request {request.id}.')
@@ -220,11 +231,3 @@ def _named(rows: Any, want: KeptFilter, asked: Wanted) -> tuple[Any, KeptFilter]
     if len(rows) > MAX_KEYS:
         raise BadUsage(f'this chooses {len(rows):,} objects: more than {MAX_KEYS:,} cannot be requested by name', 'request less')
     return rows, replace(want, patterns=(), keys=frozenset(rows['key'].to_pylist()))
-
-
-def _expiry_ns(text: str) -> int:
-    now_ns = time.time_ns()
-    age_ns = now_ns - moment('expires', text, now_ns)
-    if not 0 < age_ns <= LONGEST_NS:
-        raise BadUsage(f'--expires {text!r} is not an age of at most 90 days', 'such as 2h or 7d')
-    return age_ns

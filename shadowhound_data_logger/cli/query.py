@@ -64,8 +64,15 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 @question
 @by_flag
 @click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
-@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N rows.')
-@click.option('--format', 'kind', type=click.Choice(['table', 'csv', 'json', 'keys']), default='table', show_default=True)
+@click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N results.')
+@click.option(
+    '--format',
+    'kind',
+    type=click.Choice(['table', 'csv', 'json', 'keys']),
+    default='table',
+    show_default=True,
+    help='Format of the output.',
+)
 @click.option('--when', metavar='EXPRESSION',
               help="When values in the objects were so: 'imu.accelerometer.2 > 15'. The answer is times.")  # fmt: skip
 @click.option('--scan', is_flag=True, help='With --when: open objects without statistics as well.')
@@ -77,7 +84,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 @click.option('--like-text', metavar='TEXT', help='The pictures that are most like these words; needs --model.')
 @model_option
 @click.option('--as-of', metavar='TIME', help='Answer from the tables as they were at this time, to the second.')
-@click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels of each object.')
+@click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
 @click.option(

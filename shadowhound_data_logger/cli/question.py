@@ -24,20 +24,18 @@ ranges_option = click.option(
     type=click.File('rb'),
     metavar='FILE.json',
     callback=lambda _, __, file: _ranges(file),
-    help='In one of these times: the answer of `query --when ... --json`; - is stdin.',
+    help='Only in these times: the answer of `query --when ... --json`; - is stdin.',
 )
 by_option = click.option(
     '--by', type=click.Choice(CLOCKS), default=BY_STAMP, show_default=True,
-    help='Which time of the messages counts: measured, or arrived.',
+    help='Which time of a message counts: when it was measured, or when it arrived.',
 )  # fmt: skip
 FLAGS: Final = {
     'robot': click.option('--robot', metavar='NAME', help='Only of this robot.'),
-    'sensor': click.option('--sensor', metavar='NAME', help='Only of this sensor: camera, lidar, odom, ...'),
+    'sensor': click.option('--sensor', metavar='NAME', help='Only of this sensor.'),
     'topic': click.option('--topic', metavar='NAME', help='Only of this topic.'),
-    'since': click.option(
-        '--since', metavar='TIME', help='Begun at or after TIME: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'
-    ),
-    'until': click.option('--until', metavar='TIME', help='Begun before TIME.'),
+    'since': click.option('--since', metavar='TIME', help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'),
+    'until': click.option('--until', metavar='TIME', help='Before TIME.'),
     'near': click.option('--near', metavar='X,Y,R', help='Within R meters of X,Y in the odometry frame.'),
     'mission': click.option('--mission', metavar='ID', help='Only of missions whose id, or whose run id, begins with ID.'),
     'mission_type': click.option('--mission-type', metavar='TYPE', help='Only of missions of this type.'),
@@ -49,7 +47,7 @@ FLAGS: Final = {
     ),
     'policy': click.option('--policy', metavar='NAME[@7]', help='Only of missions in which this policy was active.'),
     'where': click.option('--where', metavar='SQL', help="SQL over the columns, such as 'battery_pct < 30'."),
-    'label': click.option('--label', metavar='NAME', help='With this label, or of a time that has it.'),
+    'label': click.option('--label', metavar='NAME', help='Only with this label.'),
     'ranges': ranges_option,
 }
 _RANGES: Final = 'it is what `query --when ... --json` prints'

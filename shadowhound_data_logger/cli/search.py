@@ -68,8 +68,8 @@ def _flags(command: _Command) -> _Command:
 @click.argument('words', nargs=-1, required=True)
 @_flags
 @click.option('--kind', type=click.Choice(['mission', 'event', 'error', 'label']), help='Only what is one of these.')
-@click.option('--limit', type=click.IntRange(1, 10_000), default=20, show_default=True, metavar='N', help='At most so many.')
-@click.option('--index', metavar='FILE|s3://...', help='The index  [default: $SHADOWHOUND_HOME/search.db]')
+@click.option('--limit', type=click.IntRange(1, 10_000), default=20, show_default=True, metavar='N', help='At most N results.')
+@click.option('--index', metavar='FILE|s3://...', help='The index of words  [default: $SHADOWHOUND_HOME/search.db]')
 @as_json
 def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None, limit: int, index: str | None,
            as_json: bool) -> ExitCode:  # fmt: skip
@@ -106,10 +106,10 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
     return ExitCode.FINE
 
 
-@click.command('index', epilog=examples('lake index', 'lake index --to s3://sensor-data/_search/search.db'))
-@click.option('--to', metavar='FILE|s3://...', help='Where  [default: $SHADOWHOUND_HOME/search.db]')
+@click.command('index', epilog=examples('lake index', 'lake index --index s3://sensor-data/_search/search.db'))
+@click.option('--index', metavar='FILE|s3://...', help='The index of words  [default: $SHADOWHOUND_HOME/search.db]')
 @as_json
-def lake_index(*, to: str | None, as_json: bool) -> ExitCode:
+def lake_index(*, index: str | None, as_json: bool) -> ExitCode:
     """Make the index of words for `search`, or update it.
 
     One file, made of the store alone: of the summaries of missions, and of labels. Only what is new is read. With s3:// it is
@@ -119,8 +119,8 @@ def lake_index(*, to: str | None, as_json: bool) -> ExitCode:
         from shadowhound_data_logger.lake import search as library  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
 
-        place = _place(to) if to and '://' in to else None
-        path = the_home() / FILE if place or not to else Path(to)
+        place = _place(index) if index and '://' in index else None
+        path = the_home() / FILE if place or not index else Path(index)
         left_out = quietly()
         with progress('reading summaries'):
             found = library.update(path, default_source(the_store_settings()), left_out)
@@ -128,9 +128,9 @@ def lake_index(*, to: str | None, as_json: bool) -> ExitCode:
             with the_store() as store:
                 library.put(store, *place, path)
     if as_json:
-        print_json({'index': to or str(path), **asdict(found)})
+        print_json({'index': index or str(path), **asdict(found)})
     else:
-        print_lines(f'{counted(found.missions, "mission")} added; {number(found.documents)} documents are in {to or path}.')
+        print_lines(f'{counted(found.missions, "mission")} added; {number(found.documents)} documents are in {index or path}.')
         if found.waiting:
             print_lines(f'{counted(found.waiting, "mission")} without a summary yet.')
     return report_skipped(left_out)

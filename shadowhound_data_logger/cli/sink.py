@@ -21,19 +21,21 @@ SHOWN: Final = 10
 
 
 @click.command('sink', epilog=examples(
-    'lake sink http://127.0.0.1:9200', 'lake sink https://elastic.lan:9200 --index robots --follow'
+    'lake sink http://127.0.0.1:9200', 'lake sink https://elastic.lan:9200 --prefix robots --follow'
 ))  # fmt: skip
 @click.argument('url')
-@click.option('--index', default='robots', show_default=True, metavar='NAME',
-              help='Indexes are NAME-objects, NAME-gaps, NAME-missions, NAME-events, NAME-labels.')  # fmt: skip
+@click.option('--prefix', default='robots', show_default=True, metavar='NAME',
+              help='Name the indexes NAME-objects, NAME-gaps, NAME-missions, NAME-events and NAME-labels.')  # fmt: skip
 @click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
 @click.option('--ca', type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar='FILE',
               help="Certificate of the authority that signed the server's.")  # fmt: skip
-@click.option('--follow', is_flag=True, help='Keep running until Ctrl-C, and send what is new.')
-@click.option('--every', type=click.FloatRange(1.0), default=60.0, show_default=True, metavar='S',
-              help='With --follow: seconds between checks.')  # fmt: skip
+@click.option('--follow', is_flag=True, help='Continue until Ctrl-C, with what is new.')
+@click.option('--interval', type=click.FloatRange(1.0), default=60.0, show_default=True, metavar='S',
+              help='Seconds between two rounds.')  # fmt: skip
 @as_json
-def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follow: bool, every: float, as_json: bool) -> ExitCode:
+def lake_sink(
+    *, url: str, prefix: str, robot: str | None, ca: Path | None, follow: bool, interval: float, as_json: bool
+) -> ExitCode:
     """Send the catalog to Elasticsearch or OpenSearch.
 
     It sends catalog rows, gaps, missions, their events, and labels. $SHADOWHOUND_HOME/sink records what the server has
@@ -49,11 +51,11 @@ def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follo
     source, left_out, total = default_source(the_store_settings()), quietly(), library.SinkTally()
     with (
         closing(library.SearchServer(url, library.authorization(os.environ), ca)) as server,
-        library.opened(server, index, the_home()) as position,
-        progress(f'sending to {index}') as bar,
+        library.opened(server, prefix, the_home()) as position,
+        progress(f'sending to {prefix}') as bar,
     ):
         sink = library.Sink(
-            source, server, index, position, left_out, tries=float('inf') if follow else library.TRIES, tell=bar.say
+            source, server, prefix, position, left_out, tries=float('inf') if follow else library.TRIES, tell=bar.say
         )
         while True:
             try:
@@ -65,10 +67,10 @@ def lake_sink(*, url: str, index: str, robot: str | None, ca: Path | None, follo
                 bar.say(f'{error.what}; trying again')
             if not follow:
                 break
-            time.sleep(every)
+            time.sleep(interval)
     if as_json:
         print_json(
-            {'url': server.url, 'index': index, 'position': str(position.path), **asdict(total), 'refused': dict(total.refused)}
+            {'url': server.url, 'prefix': prefix, 'position': str(position.path), **asdict(total), 'refused': dict(total.refused)}
         )
     else:
         print_lines(f'{counted(total.added, "document")} sent; {number(total.present)} were already there.')

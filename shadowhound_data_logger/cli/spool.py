@@ -64,10 +64,8 @@ def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitC
 )
 @click.argument('prefix', default='', metavar='[BUCKET/PREFIX]')
 @click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only objects in this state.')
-@click.option('--sensor', help='Only of this sensor.')
-@click.option(
-    '--limit', type=click.IntRange(1), default=MOST, show_default=True, help='At most N objects, the oldest first.', metavar='N'
-)
+@click.option('--sensor', metavar='NAME', help='Only of this sensor.')
+@click.option('--limit', type=click.IntRange(1), default=MOST, show_default=True, help='At most N results.', metavar='N')
 @as_json
 @click.pass_obj
 def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> ExitCode:
@@ -92,11 +90,11 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
 
 
 @spool.command(epilog=examples('spool drain', 'spool --spool /mnt/dead_robot/spool drain'))
-@click.option('--patience', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True,
-              help='Give up after this many seconds without progress.')  # fmt: skip
+@click.option('--idle-timeout', type=click.FloatRange(1.0, 1e6), default=60.0, show_default=True, metavar='S',
+              help='Give up after S seconds without progress.')  # fmt: skip
 @as_json
 @click.pass_obj
-def drain(folder: Path, *, patience: float, as_json: bool) -> ExitCode:
+def drain(folder: Path, *, idle_timeout: float, as_json: bool) -> ExitCode:
     """Upload everything that waits, without a node.
 
     Use it before a robot is put away, or with the disk of a broken one. It needs the AWS_... variables of the node: without them
@@ -104,7 +102,7 @@ def drain(folder: Path, *, patience: float, as_json: bool) -> ExitCode:
     is left or refused. Ctrl-C loses nothing.
     """
     _check(folder)
-    return _drain(folder, patience_s=patience, as_json=as_json)
+    return _drain(folder, patience_s=idle_timeout, as_json=as_json)
 
 
 @spool.command(epilog=examples('spool retry', 'spool retry --reason access_denied'))

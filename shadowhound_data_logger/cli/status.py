@@ -77,11 +77,20 @@ class Page:
 @click.command(epilog=examples('status', 'status --watch'))
 @click.option('--watch', is_flag=True, help='Repeat until Ctrl-C: a live view, or with --json one line each time.')
 @click.option(
-    '--interval', type=click.FloatRange(0.05, 3600.0), default=1.0, show_default=True, help='Seconds between two updates.'
+    '--interval',
+    type=click.FloatRange(0.05, 3600.0),
+    default=1.0,
+    show_default=True,
+    metavar='S',
+    help='Seconds between two rounds.',
 )
 @as_json
 @click.option(
-    '--robot', envvar='SHADOWHOUND_ROBOT', callback=robot_name, help='Robot of the node  [default: the one that runs here]'
+    '--robot',
+    metavar='NAME',
+    envvar='SHADOWHOUND_ROBOT',
+    callback=robot_name,
+    help='The robot  [default: the one that runs here]',
 )
 @spool_folder
 def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> ExitCode:

@@ -43,14 +43,27 @@ def moment(name: str, given: str | datetime, now_ns: int) -> int:
     if text.lower() in _DAYS_AGO:
         midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
         return _ns(midnight - timedelta(days=_DAYS_AGO[text.lower()]))
-    if age := _AGE.fullmatch(text):
-        seconds = Decimal(age[1]) * _UNITS[age[2].lower()]
-        found = now_ns - int(seconds * SECOND) if seconds < MAX_AGE_S else None
-    else:
-        found = _iso_ns(text)
+    age_ns = _age_ns(text)
+    found = _iso_ns(text) if age_ns is None else now_ns - age_ns
     if found is None or not _is_a_date(found):
         raise SettingError(name, given, TIMES)
     return found
+
+
+def age_in_ns(name: str, text: str) -> int:
+    """Nanoseconds of an age such as 30min, 2h or 3d. Raises SettingError with ``name``."""
+    found = _age_ns(text.strip())
+    if found is None:
+        raise SettingError(name, text, 'an age such as 30min, 2h or 3d')
+    return found
+
+
+def _age_ns(text: str) -> int | None:
+    age = _AGE.fullmatch(text)
+    if age is None:
+        return None
+    seconds = Decimal(age[1]) * _UNITS[age[2].lower()]
+    return int(seconds * SECOND) if seconds < MAX_AGE_S else None
 
 
 def moment_in_bag(name: str, text: str, t_start_ns: int, t_end_ns: int) -> int:

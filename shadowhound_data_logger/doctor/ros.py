@@ -156,7 +156,7 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
             )
             return
     if published:
-        remedy = 'shadowhound-data init --output robot.yaml  # settings for the topics that are published'
+        remedy = 'shadowhound-data init --to robot.yaml  # settings for the topics that are published'
         yield error('ros.topics', what, 'this is another robot than the settings are for', remedy)
         return
     yield error(

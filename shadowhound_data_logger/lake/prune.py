@@ -68,7 +68,6 @@ RULES: Final = "a text such as 'camera 90d, lidar 14d, events forever': a sensor
 DAY_NS: Final = 24 * HOUR_NS
 _RULE: Final = re.compile(r'([A-Za-z0-9][\w-]*)\s+(\S+)', re.ASCII)
 _DATE: Final = re.compile(r'(?<!\d)20\d{6}(?!\d)', re.ASCII)
-_SIZE: Final = re.compile(r'(\d{1,15}(?:\.\d{1,9})?)\s*([kMGTP]?)(i?)B?', re.ASCII)
 _COLUMNS: Final = ('robot', 'sensor', 'topic', 'bucket', 'key', 'bytes', 't_start', 't_start_ns', 't_end_ns', 'count',
                    'mission_id', 'run_id', 'mission_type', 'x', 'y')  # fmt: skip
 
@@ -97,14 +96,6 @@ def keep_rules(text: str, now_ns: int) -> tuple[RetentionRule, ...]:
             raise SettingError('--keep', text, f'a time that has passed, which {match[2]} has not')
         found[sensor] = RetentionRule(sensor, f'{sensor} {match[2]}', since_ns)
     return tuple(found.values())
-
-
-def size_of(text: str) -> int:
-    """Bytes of ``2TB``, ``500 GB`` or ``1TiB``. Raises SettingError."""
-    match = _SIZE.fullmatch(text.strip())
-    if match is None:
-        raise SettingError('--max-bytes', text, 'a size such as 500GB, 2TB or 2TiB')
-    return int(float(match[1]) * (1024 if match[3] else 1000) ** ' kMGTP'.index(match[2] or ' '))
 
 
 @dataclass(slots=True)

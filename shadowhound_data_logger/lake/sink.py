@@ -446,7 +446,7 @@ def position_path(home: Path, url: str, name: str) -> Path:
 def opened(server: SearchServer, name: str, home: Path) -> Iterator[Position]:
     """The position, for one process at a time. Raises SettingError, LakeError."""
     if not _NAME.fullmatch(name):
-        raise SettingError('--index', name[:100], 'small letters, digits, "-", "_" and ".", beginning with a letter or digit')
+        raise SettingError('--prefix', name[:100], 'small letters, digits, "-", "_" and ".", beginning with a letter or digit')
     path = position_path(home, server.url, name)
     path.parent.mkdir(parents=True, exist_ok=True)
     with flock(path.with_suffix('.lock'), wait=False) as had:

@@ -69,7 +69,7 @@ class Auth:
     def _problem_of(self, request: web.Request) -> web.StreamResponse | None:
         own = request.transport.get_extra_info('sockname') if request.transport is not None else None
         if not self._names.has(request.host, own[0] if own else ''):
-            return problem(403, f'this page is not called {request.host[:100]!r}: see --name')
+            return problem(403, f'this page is not called {request.host[:100]!r}: see --hostname')
         is_ws = request.path == '/ws'
         if is_ws or request.method not in ('GET', 'HEAD'):
             if not is_same_origin(request.headers.get('Origin'), request.host, self._scheme):

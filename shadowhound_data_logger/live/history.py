@@ -446,7 +446,7 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: st
     of = f'--robot {shlex.quote(robot)}'
     span = f'{of} --since {since} --until {until}'
     cuts = [
-        ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {start} --end {end} --output cut']
+        ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {start} --end {end} --to cut']
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
     if by == BY_RECEIVED:

@@ -233,7 +233,7 @@ class Repository:
             gone = [path for path in paths if listed.targets.pop(path, None)]
             if not gone:
                 raise PolicyError(
-                    f'{role} does not list {", ".join(sorted(paths))}', remedy='who does? policy delegate NAME --end'
+                    f'{role} does not list {", ".join(sorted(paths))}', remedy='who does? policy delegate NAME --revoke'
                 )
         return self._refresh_if_here()
 
@@ -364,7 +364,7 @@ class Repository:
         """The keys of the root that sign the next one: these, or the one in this folder. Raises PolicyError."""
         if not paths and not (self._folder / ROOT_KEY).is_file():
             raise PolicyError(f'a new root is signed with the keys of the one before, and {ROOT_KEY} is not in {self._folder}',
-                              remedy='name them, wherever they are: --root-secret /media/usb/root.key')  # fmt: skip
+                              remedy='name them, wherever they are: --key /media/usb/root.key')  # fmt: skip
         signers = [keys.load_key(path, self._passphrase) for path in paths or [self._folder / ROOT_KEY]]
         for path, signer in zip(paths, signers, strict=False):
             if signer.public_key.keyid not in root.roles[ROOT_ROLE].keyids:

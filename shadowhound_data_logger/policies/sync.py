@@ -270,7 +270,7 @@ class PolicySync:
         room = min(free, self.settings.max_bytes - there)
         if manifest.size > room:
             text = f'{manifest.id} has {manifest.size:,} bytes, and there is room for {max(0, room):,} in {self.folder.path}'
-            raise PolicyRefused('disk', text, remedy='--max-gib and --min-free-gib say how much policies may take')
+            raise PolicyRefused('disk', text, remedy='--max-bytes and --min-free-bytes limit what policies may take')
 
     def _download(self, wanted: ObjectInfo, path: Path, traffic: _Traffic) -> None:
         """Goes on for as long as each attempt brings something; what an earlier one brought whole is not fetched again.

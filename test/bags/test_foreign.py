@@ -136,7 +136,7 @@ def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: in
     described = info_of(store, 'thor', 'b', tmp_path / 'home').description
     assert (described.messages, described.t_start_ns, described.t_end_ns, described.remarks) == (30, T0, T0 + 29 * S, cut.remarks)
     assert cut_remote(store, find_bag(store, 'thor', 'b'), tmp_path / 'remote', Choice()).messages == 30
-    for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
+    for verb in (['info'], ['verify'], ['cut', '--to', str(tmp_path / 'cli')]):
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert ran.return_value == 0, ran.output
         assert ran.output.count('metadata.yaml claims') == 1
@@ -196,7 +196,7 @@ def test_a_torn_file_of_a_split_bag(tmp_path: Path) -> None:
     )  # fmt: skip
     assert [check.name for check in verify_remote(store, remote).findings] == ['b_1.mcap']
     assert cut_remote(store, remote, tmp_path / 'remote', Choice()).messages == 20
-    for verb in (['info'], ['verify'], ['cut', '-o', str(tmp_path / 'cli')]):
+    for verb in (['info'], ['verify'], ['cut', '--to', str(tmp_path / 'cli')]):
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert (ran.return_value, 'b_1.mcap' in ran.output) == (1, True)
         assert ' '.join(ran.output.split()).count('b_1.mcap has no end of an MCAP file') == 1

@@ -185,7 +185,7 @@ def test_attachments_alone(tmp_path: Path) -> None:
 
     folder = write(tmp_path / 'b' / 'b_0.mcap', fill)
     assert topics(folder) == {('/x', STRING[0]): 1, ('/silent', STRING[0]): 0}
-    ran = CliRunner().invoke(bag, ['cut', f'{folder}/b_0.mcap', '-o', str(tmp_path / 'piece')], standalone_mode=False)
+    ran = CliRunner().invoke(bag, ['cut', f'{folder}/b_0.mcap', '--to', str(tmp_path / 'piece')], standalone_mode=False)
     assert 'Not copied: 2 attachments or metadata records.' in ran.output
     assert '1 message on 1 topic' in ran.output
     assert 'Read ' not in ran.output
@@ -220,7 +220,7 @@ def test_folders_of_any_name(tmp_path: Path, name: str, monkeypatch: pytest.Monk
     write(tmp_path / name / f'{name}_0.mcap', lambda writer: writer.add_message(
         writer.register_channel('/x', 'cdr', writer.register_schema(*STRING)), 1, CDR, 1))  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    for verb in (['info'], ['verify'], ['cut', '-o', 'piece']):
+    for verb in (['info'], ['verify'], ['cut', '--to', 'piece']):
         ran = CliRunner().invoke(bag, [*verb, f'./{name}'], standalone_mode=False)
         assert ran.return_value == 0, (verb, ran.output, ran.exception)
     monkeypatch.chdir(tmp_path / name)

@@ -94,11 +94,11 @@ def test_another_bag_of_that_name_is_refused(settings: Settings, store: Director
     if is_now:
         with (
             planned(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
-            pytest.raises(BagError, match='--name'),
+            pytest.raises(BagError, match='--bag-name'),
         ):
             upload_now(store, sent, deadline_s=DEADLINE_S)
     else:
-        with pytest.raises(BagError, match='--name'):
+        with pytest.raises(BagError, match='--bag-name'):
             send(settings, tmp_path / 'other' / NAME)
     assert len(find_bag(store, 'thor', NAME).files) == 3
 
@@ -138,7 +138,7 @@ def test_a_spool_without_room_says_so(tmp_path: Path) -> None:
         {'spool.max_bytes': 1 << 20, 'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path / 'home')}
     )
     write_ours(tmp_path / NAME, each=1500)
-    with pytest.raises(BagError, match='--now'):
+    with pytest.raises(BagError, match='--direct'):
         send(settings, tmp_path / NAME)
 
 

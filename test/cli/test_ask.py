@@ -67,7 +67,7 @@ def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Pat
     ranges = tmp_path / 'high.json'
     ranges.write_text(run(home, 'query', '--when', 's.a > 10', '--json').output, encoding='utf-8')
     assert told(home, 'label', 'add', 'high', '--ranges', str(ranges))['added'] == 1
-    assert told(home, 'label', 'add', 'person', '--key', LAST, '--box', '1,2,3,4')['added'] == 1
+    assert told(home, 'label', 'add', 'person', '--object', LAST, '--box', '1,2,3,4')['added'] == 1
     table = tmp_path / 'labels.csv'
     table.write_text('label,since,until\nfirst,2026-10-28T12:00,2026-10-28T12:00:30\n', encoding='utf-8')
     coco = tmp_path / 'coco.json'
@@ -78,7 +78,7 @@ def test_labels_are_added_listed_removed_and_asked_for(home: Path, tmp_path: Pat
                         {'image_id': 2, 'category_id': 7, 'bbox': [1, 2, 3, 4]}],
     }), encoding='utf-8')  # fmt: skip
     assert told(home, 'label', 'import', str(table))['added'] == 1
-    imported = told(home, 'label', 'import', str(coco), '--by', 'ann')
+    imported = told(home, 'label', 'import', str(coco), '--user', 'ann')
     assert (imported['added'], imported['absent']) == (1, ['thor/s/none.json'])
     standing = told(home, 'label', 'list')
     assert [(each['label'], each['by'] == 'ann', each['width']) for each in standing] == [

@@ -89,11 +89,13 @@ def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
     """A second fetch says that nothing was downloaded; a cut says how little was read."""
     assert 'downloaded 3' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
     assert 'downloaded 0 B' in run(home, 'fetch', NAME, '--to', tmp_path / 'here').output
-    found = run(home, 'cut', NAME, '--start', '-2', '--topics', 'imu,/camera/blob', '-o', tmp_path / 'piece', '--json')
+    found = run(
+        home, 'cut', NAME, '--start', '-2', '--topic', 'imu', '--topic', '/camera/blob', '--to', tmp_path / 'piece', '--json'
+    )
     told = json.loads(found.output)
     assert (found.return_value, told['topics'], told['messages']) == (0, 2, 221)
     assert told['read_bytes'] < told['bag_bytes'] / 3
-    found = run(home, 'cut', tmp_path / 'here' / NAME, '--end', '1', '--regex', 'imu', '-o', tmp_path / 'other')
+    found = run(home, 'cut', tmp_path / 'here' / NAME, '--end', '1', '--regex', 'imu', '--to', tmp_path / 'other')
     assert '100 messages on 1 topic,' in found.output
     assert run(home, 'verify', tmp_path / 'other').return_value == 0
 
@@ -101,9 +103,9 @@ def test_fetch_and_cut(home: Path, tmp_path: Path) -> None:
 def test_upload_and_watch(home: Path, tmp_path: Path) -> None:
     """Confirmed by the store, and found there."""
     write_ours(tmp_path / 'recordings' / 'by_hand', slices=1, each=20)
-    found = run(home, 'upload', tmp_path / 'recordings' / 'by_hand', '--name', 'named')
+    found = run(home, 'upload', tmp_path / 'recordings' / 'by_hand', '--bag-name', 'named')
     assert (found.return_value, 'confirmed by the store' in found.output) == (0, True)
-    assert run(home, 'upload', '--now', '--tar-gz', tmp_path / 'recordings' / 'by_hand').return_value == 0
+    assert run(home, 'upload', '--direct', '--tar-gz', tmp_path / 'recordings' / 'by_hand').return_value == 0
     found = run(home, 'watch', tmp_path / 'recordings', '--once', '--settle', '0.1', '--json')
     assert [json.loads(line)['what'] for line in found.output.splitlines()] == ['spooled', 'stored']
     assert found.return_value == 0
@@ -115,7 +117,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
     """Exit code 1 and why; a list says that the store is away, and what is here all the same."""
     write_ours(tmp_path / 'by_hand', slices=1, each=20)
     away = {'AWS_ENDPOINT_URL': 'http://127.0.0.1:9', 'AWS_ACCESS_KEY_ID': 'k', 'AWS_SECRET_ACCESS_KEY': 's'}
-    found = run(home, 'upload', tmp_path / 'by_hand', '--deadline', '0.5', **away)
+    found = run(home, 'upload', tmp_path / 'by_hand', '--timeout', '0.5', **away)
     assert (found.return_value, '3 of 3 files wait in the spool' in found.output) == (1, True)
     found = run(home, 'list', '--json', **away)
     assert (found.return_value, '127.0.0.1:9' in found.stderr) == (1, True)
@@ -126,8 +128,8 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(('arguments', 'error', 'text'), [
     (('info', 'patrol_2025'), BagError, f'the store has {NAME}'),
-    (('cut', NAME, '--topic', '/imv', '-o', 'new'), BagError, 'is it /imu?'),
-    (('cut', NAME, '--start', 'noon', '-o', 'new'), SettingError, 'seconds since the start'),
+    (('cut', NAME, '--topic', '/imv', '--to', 'new'), BagError, 'is it /imu?'),
+    (('cut', NAME, '--start', 'noon', '--to', 'new'), SettingError, 'seconds since the start'),
     (('list', '--since', 'tomorrow'), SettingError, 'yesterday'),
     (('upload', '/nowhere'), BagError, 'is not a folder'),
     (('verify', './nowhere'), Exception, 'there is no folder'),
@@ -151,7 +153,7 @@ def test_from_a_real_server(seaweed: Tower, tmp_path: Path) -> None:
     assert run(home, 'verify', '--robot', 'spot', '--deep', 'far', **environ).return_value == 0
     assert run(home, 'fetch', '--robot', 'spot', 'far', '--to', tmp_path / 'here', **environ).return_value == 0
     span = ('--start', '3', '--end', '4')
-    found = run(home, 'cut', '--robot', 'spot', 'far', *span, '-o', tmp_path / 'piece', '--json', **environ)
+    found = run(home, 'cut', '--robot', 'spot', 'far', *span, '--to', tmp_path / 'piece', '--json', **environ)
     assert json.loads(found.output)['messages'] == 110
     store = open_store(seaweed.store_settings(), QUICK)
     try:
@@ -204,12 +206,12 @@ def test_pages_of_a_bag_whose_times_are_a_counter(tmp_path: Path) -> None:
     there = home / 'store' / 'sensor-data' / 'thor' / 'rosbags' / 'b'
     there.mkdir(parents=True)
     (there / 'b_0.mcap').write_bytes((folder / 'b_0.mcap').read_bytes())
-    found = run(home, 'cut', 'b', '-o', tmp_path / 'piece').output
+    found = run(home, 'cut', 'b', '--to', tmp_path / 'piece').output
     assert 'Read all 8.0 KB in 3 requests.' in found
     assert '%' not in found
     (folder / 'b_0.mcap').write_bytes((folder / 'b_0.mcap').read_bytes()[:-1])
     for verb in ('info', 'cut'):
-        ran = run(home, verb, f'{folder}/', *(('-o', tmp_path / 'other') if verb == 'cut' else ()))
+        ran = run(home, verb, f'{folder}/', *(('--to', tmp_path / 'other') if verb == 'cut' else ()))
         assert isinstance(ran.exception, BagDamaged)
         assert 'fetch' not in str(ran.exception)
 
@@ -219,7 +221,7 @@ def test_a_folder_without_a_slash_is_hinted_at(home: Path, tmp_path: Path, monke
     """A name is that of a bag in the store; where only a folder has it, the error says how a folder is written."""
     monkeypatch.chdir(tmp_path)
     write_ours(tmp_path / 'mine')
-    error = run(home, verb, 'mine', *(('-o', tmp_path / 'other') if verb == 'cut' else ())).exception
+    error = run(home, verb, 'mine', *(('--to', tmp_path / 'other') if verb == 'cut' else ())).exception
     assert isinstance(error, BagError)
     assert './mine' in error.remedy
 
@@ -237,13 +239,13 @@ def test_repair(tmp_path: Path) -> None:
     for text in (f'{NAME}_repaired: ', '1 of them damaged', 'a chunk that is torn', 'rebuilt: the summary and the footer'):
         assert text in found.output
     assert run(tmp_path, 'verify', f'{folder}_repaired', '--deep').return_value == 0
-    told = said(run(tmp_path, 'repair', folder, '-o', tmp_path / 'other', '--json'))
+    told = said(run(tmp_path, 'repair', folder, '--to', tmp_path / 'other', '--json'))
     assert isinstance(told, dict)
     assert (told['out'], told['is_damaged']) == (str(tmp_path / 'other'), True)
     (file,) = [each for each in told['files'] if each['losses']]
     assert (file['name'], file['messages'] + file['lost_messages'], file['losses'][0]['messages']) == (torn.name, 550, None)
     assert 'exists already' in str(run(tmp_path, 'repair', folder).exception)
-    assert 'exclude each other' in str(run(tmp_path, 'repair', folder, '--in-place', '-o', 'x').exception)
+    assert 'exclude each other' in str(run(tmp_path, 'repair', folder, '--in-place', '--to', 'x').exception)
     assert run(tmp_path, 'repair', folder, '--in-place').return_value == 1
     assert run(tmp_path, 'repair', folder, '--in-place').return_value == 0
 
@@ -255,7 +257,7 @@ def test_a_torn_bag_says_how_it_is_repaired(tmp_path: Path) -> None:
     torn = folder / f'{NAME}_1.mcap'
     torn.write_bytes(torn.read_bytes()[:-100_000])
     (folder / 'manifest.json').unlink()
-    for arguments in (('cut', folder, '-o', tmp_path / 'piece'), ('verify', folder), ('info', folder)):
+    for arguments in (('cut', folder, '--to', tmp_path / 'piece'), ('verify', folder), ('info', folder)):
         found = run(tmp_path, *arguments)
         assert found.return_value == 1
         assert torn.name in found.output

@@ -96,7 +96,8 @@ def test_prune_says_what_goes_and_asks_before_all_of_a_sensor_does(home: Path) -
     assert '46 objects' in ended(home, *rules).output
     assert 'There is nothing to delete' in ended(home, *rules).output
     assert json.loads(ended(home, *rules, '--force', '--yes', '--json').output)['deleted'] == 2
-    assert (run(home, 'prune', '--keep', 'camera').exit_code, run(home, *rules, '--max-bytes', 'much').exit_code) == (2, 2)
+    assert run(home, 'prune', '--keep', 'camera').exit_code == 2
+    assert 'is not a size' in run(home, *rules, '--max-bytes', 'much').output
     assert ended(home, *rules, '--max-bytes', '1', '--dry-run').return_value == 1
 
 
@@ -157,7 +158,7 @@ def test_coverage_for_programs(told: Path) -> None:
 
 def test_coverage_as_a_picture(told: Path, tmp_path: Path) -> None:
     """Blue where it is stored, red where it is lost, gray where nobody knows."""
-    assert run(told, *TWO_HOURS, '--map', str(tmp_path / 'coverage.png')).exit_code == 0
+    assert run(told, *TWO_HOURS, '--chart', str(tmp_path / 'coverage.png')).exit_code == 0
     with Image.open(tmp_path / 'coverage.png') as picture:
         colors = {color for _, color in picture.convert('RGB').getcolors(1 << 24) or ()}
     assert colors >= {(0x1F, 0x6F, 0xB2), (0xC0, 0x39, 0x2B), (0x9C, 0xC4, 0xE4), (0xC7, 0xCF, 0xD6)}

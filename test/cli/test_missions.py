@@ -169,11 +169,11 @@ def test_what_cannot_be_sent_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """After the deadline it says what is left, with exit code 1."""
     monkeypatch.setattr(Replayer, 'start', lambda _: None)
     mission_id = fly(tmp_path)
-    found = run(tmp_path, 'resume', '--deadline', '0.3')
+    found = run(tmp_path, 'resume', '--timeout', '0.3')
     assert found.return_value == 1
     assert f'{mission_id}: not sent yet' in found.output
     assert '1 not sent within 0.3 s' in found.output
-    found = run(tmp_path, 'resume', '--deadline', '0.3', '--json')
+    found = run(tmp_path, 'resume', '--timeout', '0.3', '--json')
     assert (found.return_value, [each['mission_id'] for each in json.loads(found.stdout)['left']]) == (1, [mission_id])
 
 

@@ -96,7 +96,7 @@ def test_a_team_whose_root_needs_two(team: Team) -> None:
     """Nothing is signed before two of three have; one alone rotates nothing; a robot follows from the first root to the last."""
     people = {name: team.home / 'people' / f'{name}.key' for name in ('alice', 'bob', 'carol')}
     for name in people:
-        team.run('keys', '--only', name, '--keys', team.home / 'people')
+        team.run('keys', '--person', name, '--keys', team.home / 'people')
     publics = [part for key in people.values() for part in ('--root-key', key.with_suffix('.pub'))]
     assert 'cannot sign' in team.run('keys', '--threshold', 4, *publics, code=1)
     assert 'lacks 2 signatures' in team.run('keys', '--threshold', 2, *publics)
@@ -112,7 +112,7 @@ def test_a_team_whose_root_needs_two(team: Team) -> None:
     assert team.publish('go2/go2_patrol/1')
     assert team.listed(robot, 'go2/go2_patrol/1')
 
-    assert 'lacks 1 signatures' in team.run('rotate', '--root-secret', people['alice'])
+    assert 'lacks 1 signatures' in team.run('rotate', '--key', people['alice'])
     assert team.publish('go2/go2_patrol/2'), 'the old keys are in force until then'
     assert 'complete' in team.run('sign-root', team.keys / 'root.next.json', '--key', people['carol'])
     assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1', 'go2/go2_patrol/2']
@@ -196,7 +196,7 @@ def test_another_key_signs_some_policies(team: Team) -> None:
     team.run('keys')
     robot = team.robot('thor')
     dora = team.home / 'dora'
-    team.run('keys', '--only', 'dora', '--keys', dora)
+    team.run('keys', '--person', 'dora', '--keys', dora)
     assert 'is not a pattern' in team.run('delegate', dora / 'dora.pub', '--for', 'go2_patrol', code=1)
     team.run('delegate', dora / 'dora.pub', '--for', 'go2/go2_patrol/*')
     (dora / 'root.json').write_bytes((team.keys / 'root.json').read_bytes())
@@ -207,16 +207,16 @@ def test_another_key_signs_some_policies(team: Team) -> None:
     assert team.listed(robot, 'go2/go2_patrol/1')
     with pytest.raises(DataLoggerError, match='may not sign go2/stairs/1'):
         hers.publish({'go2/stairs/1': b'{}'})
-    assert 'no longer may sign' in team.run('delegate', 'dora', '--end')
+    assert 'no longer may sign' in team.run('delegate', 'dora', '--revoke')
     assert not team.listed(robot, 'go2/go2_patrol/1')
-    assert "nothing is delegated to 'dora'" in team.run('delegate', 'dora', '--end', code=1)
+    assert "nothing is delegated to 'dora'" in team.run('delegate', 'dora', '--revoke', code=1)
 
 
 def test_a_public_key_is_of_who_has_the_private_one(team: Team) -> None:
     """A file that somebody else changed, or that names another key as its own, is refused."""
     team.run('keys')
     for name in ('eve', 'alice'):
-        team.run('keys', '--only', name, '--keys', team.home / 'people')
+        team.run('keys', '--person', name, '--keys', team.home / 'people')
     eve, alice = (json.loads((team.home / 'people' / f'{name}.pub').read_bytes()) for name in ('eve', 'alice'))
     changed = team.home / 'changed.pub'
     for change in (
@@ -292,7 +292,7 @@ def test_signing_answers_in_json(team: Team) -> None:
 
     people = team.home / 'people'
     for name in ('alice', 'bob'):
-        told('keys', '--only', name, '--keys', people)
+        told('keys', '--person', name, '--keys', people)
     publics = [part for name in ('alice', 'bob') for part in ('--root-key', people / f'{name}.pub')]
     assert told('keys', '--threshold', 2, *publics)['missing_signatures'] == 2
     root = team.keys / 'root.json'
@@ -302,12 +302,12 @@ def test_signing_answers_in_json(team: Team) -> None:
     team.publish('go2/go2_patrol/7')
     (name,) = told('delegate', people / 'alice.pub', '--for', 'go2/stairs/*')['names']
     assert name.startswith('alice-')
-    assert told('delegate', 'alice', '--end') == {'names': [name], 'may_sign': []}
+    assert told('delegate', 'alice', '--revoke') == {'names': [name], 'may_sign': []}
     assert told('withdraw', 'go2_patrol@7') == {'withdrawn': 'go2_patrol@7', 'robot_types': ['go2'], 'refreshed': True}
     team.publish('go2/go2_patrol/8')
-    begun = told('rotate', '--root-secret', people / 'alice.key')
+    begun = told('rotate', '--key', people / 'alice.key')
     assert (begun['root_version'], begun['missing_signatures'], begun['listed']) == (2, 1, ['go2/go2_patrol/8'])
-    ended = told('rotate', *(part for name in ('alice', 'bob') for part in ('--root-secret', people / f'{name}.key')))
+    ended = told('rotate', *(part for name in ('alice', 'bob') for part in ('--key', people / f'{name}.key')))
     assert (ended['missing_signatures'], ended['listed'], ended['no_longer_listed']) == (0, ['go2/go2_patrol/8'], [])
 
 

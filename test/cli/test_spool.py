@@ -237,7 +237,7 @@ def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv('AWS_ENDPOINT_URL', 'http://127.0.0.1:9')
     monkeypatch.setenv('AWS_ACCESS_KEY_ID', 'KEYID')
     monkeypatch.setenv('AWS_SECRET_ACCESS_KEY', 'SECRET')
-    answer = run('drain', '--patience', '1')
+    answer = run('drain', '--idle-timeout', '1')
     assert answer.return_value == 1
     assert '3 objects still waiting: Tower at http://127.0.0.1:9 refused the connection' in ' '.join(answer.stdout.split())
     assert 'SECRET' not in answer.output
@@ -247,7 +247,7 @@ def test_a_store_that_is_away_is_told(home: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_node_delivers_already(home: Path) -> None:
     """Then it says who does, and changes nothing."""
     with flock(home / 'spool/drain.lock'):
-        answer = run('drain', '--patience', '1')
+        answer = run('drain', '--idle-timeout', '1')
     assert answer.return_value == 1
     assert 'another process delivers from this spool' in answer.stdout
     assert states(home)['a.jpg'] == 'pending'

@@ -152,8 +152,8 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     root = run('policy', 'keys', '--json')['root']
     sample = str(tmp_path / 'trained.npz')
     pack = ('policy', 'pack', str(tmp_path / 'trained'), '--name', policy, '--smoke', sample, '--dataset', digest)
-    made = run(*pack, '--fps', '10', '--p99-ms', '10000', '-o', packed, '--json')['policy']
-    run('policy', 'publish', packed, '--alias', 'canary', '--robots', robot)
+    made = run(*pack, '--fps', '10', '--max-p99-ms', '10000', '--to', packed, '--json')['policy']
+    run('policy', 'publish', packed, '--alias', 'canary', '--canary', robot)
     # The canary takes it; another robot does not.
     thor = (
         tower.environment('thor')

@@ -40,7 +40,7 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
     """Rates, sizes and what is left out are in comments; a node with the file receives and stores what is published then."""
     path = tmp_path / 'robot.yaml'
     with ThreadPoolExecutor(1) as pool:
-        asking = pool.submit(init, shared, '--namespace', NS, '--seconds', '1', '--output', str(path))
+        asking = pool.submit(init, shared, '--namespace', NS, '--duration', '1', '--to', str(path))
         while not asking.done():
             publish(publishers)
         ran = asking.result()
@@ -54,7 +54,7 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
     assert topics == {f'{NS}/{name}' for name in SENT if name != 'led'}
     assert {'imu', 'odom', 'joints'} <= set(given['sensors']), 'the names of the default sensors'
     assert 'MB per hour' in next(line for line in text.splitlines() if f'{NS}/scan' in line)
-    assert init(shared, '--output', str(path)).returncode == 2, 'it does not overwrite'
+    assert init(shared, '--to', str(path)).returncode == 2, 'it does not overwrite'
 
     node = shared.node(seaweed.environment(), None, '--params-file', str(path), '-r', f'__ns:={NS}', robot='')
     for name in SENT:
@@ -74,9 +74,9 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
 
 def test_nothing_is_found(shared: Processes) -> None:
     """It says so, and that is a finding; for programs as well."""
-    ran = init(shared, '--namespace', '/nobody', '--seconds', '1')
+    ran = init(shared, '--namespace', '/nobody', '--duration', '1')
     assert ran.returncode == 1
     assert 'No topic has a publisher' in ran.stderr
     assert 'sensors: []' in ran.stdout
-    ran = init(shared, '--namespace', '/nobody', '--seconds', '1', '--json')
+    ran = init(shared, '--namespace', '/nobody', '--duration', '1', '--json')
     assert (ran.returncode, json.loads(ran.stdout)) == (1, {'robot': 'nobody', 'topics': []})

@@ -88,7 +88,7 @@ def test_ingest_leaves_it_alone(home: Path) -> None:
     key = bad_parts.put(folder_store(home), BAD['a text for a number'](), of=GAPS)
     source = Bucket(folder_store(home), schema.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source, findings=Findings(lambda _: None))
-    found = run(lake_command, home, 'ingest', '--expire', '0')
+    found = run(lake_command, home, 'ingest', '--delete-after', '0s')
     assert (found.return_value, f'{key} is left out: ' in found.stderr) == (1, True)
     assert key in [entry.key for entry in source.list('thor/_gaps/')]
     assert known('thor', '/imu', NOON_NS, END_NS, source=source, findings=Findings(lambda _: None)) == before
@@ -115,7 +115,7 @@ def test_texts_of_robots_are_shown_harmless(home: Path, tmp_path: Path) -> None:
     ]
     bad_parts.put(folder_store(home), parts.encode(rows, GAPS), of=GAPS)
     times = '--since', '2026-10-28T12:00', '--until', '2026-10-28T13:00'
-    found = run(lake_command, home, 'coverage', *times, '--map', str(tmp_path / 'coverage.png'))
+    found = run(lake_command, home, 'coverage', *times, '--chart', str(tmp_path / 'coverage.png'))
     assert '\x1b' not in found.stdout
     assert (tmp_path / 'coverage.png').stat().st_size > 1000
 

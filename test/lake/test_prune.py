@@ -389,13 +389,6 @@ def test_rules_that_are_none_are_refused(text: str) -> None:
         prune.keep_rules(text, NOW_NS)
 
 
-def test_sizes_are_read() -> None:
-    """In decimal and binary units."""
-    assert [prune.size_of(text) for text in ('2TB', '500 GB', '1TiB', '1.5kB', '7')] == [2 * 10**12, 5 * 10**11, 1 << 40, 1500, 7]
-    with pytest.raises(SettingError, match='--max-bytes'):
-        prune.size_of('much')
-
-
 def test_any_label_protects_what_it_reaches_into() -> None:
     """As looking at each span does."""
     rng = random.Random(7)

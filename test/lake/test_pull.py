@@ -119,7 +119,7 @@ def test_a_pull_from_asking_to_arrival(field: Field) -> None:
     field.records(*range(6))
     assert field.kept() == [0, 1, 2, 3, 4, 5]
     assert run('query', '--sensor', 'camera') == []
-    said = run('pull', '--sensor', 'camera', '--near', '3,0,1', '--by', 'ada')
+    said = run('pull', '--sensor', 'camera', '--near', '3,0,1', '--user', 'ada')
     assert (said['robot'], said['objects'], said['bytes'], said['answer']) == ('thor', 3, 3000, None)
     assert [one['state'] for one in run('pull', '--list')] == ['asked']
     field.passes()
@@ -217,7 +217,7 @@ def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: P
 
 @pytest.mark.parametrize('arguments', [
     (), ('--where', 'nonsense('), ('--bag', '../x'), ('--sensor', 'camera', '--expires', '100d'), ('--cancel', 'x'),
-    ('--failed',), ('--policy', 'p'), ('--sensor', 'camera', '--by', '../x'),
+    ('--failed',), ('--policy', 'p'), ('--sensor', 'camera', '--user', '../x'),
 ])  # fmt: skip
 def test_what_cannot_be_asked_for_is_said(field: Field, arguments: tuple[str, ...]) -> None:
     """Before anything is written."""

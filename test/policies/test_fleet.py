@@ -116,14 +116,14 @@ def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
         of_spark.verb('publish', str(spark.folder / f'packed_{version}'), '--alias', *arguments)
 
     publish(1, 'champion')
-    command = ['-m', 'shadowhound_data_logger.cli.main', 'policy', 'run', '--every', '0.3']
+    command = ['-m', 'shadowhound_data_logger.cli.main', 'policy', 'run', '--interval', '0.3']
     environ = {**os.environ, **tachi.environ, 'ROS_DOMAIN_ID': str(domain)}
     service = Process('policy run', command, tmp_path / 'run.log', environ)
     try:
         until(lambda: tachi.folder.current() == ids[1], lambda: f'the canary begins as all do: {service.log}')
         assert {robot.synced() for robot in others} == {('activated', ids[1])}
 
-        publish(2, 'canary', '--robots', 'tachi')
+        publish(2, 'canary', '--canary', 'tachi')
         until(lambda: tachi.folder.current() == ids[2], lambda: f'the canary goes first: {service.log}')
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
 
@@ -141,7 +141,7 @@ def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
         assert [robot.folder.state().bad for robot in others] == [{}, {}]
         assert [*tachi.folder.state().bad] == [ids[2]]
 
-        publish(3, 'canary', '--robots', 'tachi')
+        publish(3, 'canary', '--canary', 'tachi')
         until(lambda: tachi.folder.current() == ids[3], lambda: f'the next one: {service.log}')
         say(json.dumps({'policy': ids[3], 'failures': 3, 'p99_ms': 1.0}))
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}

@@ -38,8 +38,8 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     def packed(folder: str, gain: float, *arguments: str) -> str:
         """The id of what is in the folder then."""
         of_training = trained(tmp_path / f'trained_{folder}', linear(gain))
-        made = run(spark, 'pack', str(of_training), '--name', name, '--smoke', f'{of_training}.npz', '--p99-ms', '5000',
-                   '-o', str(tmp_path / folder), '--json', *arguments)  # fmt: skip
+        made = run(spark, 'pack', str(of_training), '--name', name, '--smoke', f'{of_training}.npz', '--max-p99-ms', '5000',
+                   '--to', str(tmp_path / folder), '--json', *arguments)  # fmt: skip
         return str(made['policy'])
 
     def publish(version: int) -> str:
