@@ -33,12 +33,12 @@ def test_the_page_has_its_tables(scale: Any) -> None:
 
 
 def test_the_rates_are_those_of_the_other_pages(scale: Any) -> None:
-    """36 and 384 GB a day, 6 and 8 objects a second, as docs/thor.md says."""
+    """36 and 384 GB per day, 6 and 8 objects per second, as in docs/thor.md."""
     thor = (PROGRAM.parents[1] / 'docs' / 'thor.md').read_text(encoding='utf-8')
     default, _, full = scale.PROFILES
-    assert f'**{default.bytes_s * 86_400 / 1e9:.0f} GB a day**' in thor
-    assert f'**{full.bytes_s * 86_400 / 1e9:.0f} GB a day**' in thor
-    assert f'| objects | {default.objects_s} a second | {full.objects_s} a second |' in thor
+    assert f'**{default.bytes_s * 86_400 / 1e9:.0f} GB per day**' in thor
+    assert f'**{full.bytes_s * 86_400 / 1e9:.0f} GB per day**' in thor
+    assert f'| objects | {default.objects_s} per second | {full.objects_s} per second |' in thor
 
 
 def test_it_is_arithmetic(scale: Any) -> None:

@@ -130,7 +130,7 @@ SECTIONS: Final = (
     Section(
         'Limit uploads',
         'By bandwidth, or by a rule such as `lowstate:bms_state.soc > 30 and wifi.ssid == "lab"` '
-        '([how](thor.md#upload-when-it-suits)).',
+        '([how](operation.md#upload-when-it-suits)).',
         ('upload.max_mbps', 'upload.when', 'events.when', 'keep.when'),
     ),
     Section(
@@ -253,7 +253,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     (
         'AWS_SHARED_CREDENTIALS_FILE',
         '`~/.aws/credentials`',
-        'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#5-credentials)).',
+        'The keys, if the two variables are not set; read again when the server rejects them ([how](thor.md#rotate-keys)).',
     ),
     ('AWS_PROFILE', '`default`', 'The section of that file.'),
     ('HTTP_PROXY', '', 'The proxy for `http://` servers, as for `curl`; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
