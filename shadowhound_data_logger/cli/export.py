@@ -26,8 +26,8 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.output import counted, number, plain, print_json, print_lines, volume
 from shadowhound_data_logger.cli.progress import progress
-from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, by_option, quietly, report_skipped
-from shadowhound_data_logger.core.errors import TrackingError
+from shadowhound_data_logger.cli.question import FLAGS, NAMES, asking, quietly, report_skipped
+from shadowhound_data_logger.core.errors import SettingError, TrackingError
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.stores import open_reader
@@ -35,6 +35,7 @@ from shadowhound_data_logger.stores import open_reader
 if TYPE_CHECKING:
     from shadowhound_data_logger.datasets.cluster import Cluster
     from shadowhound_data_logger.datasets.export import Exported
+    from shadowhound_data_logger.datasets.export_file import ExportFile
     from shadowhound_data_logger.datasets.features import ExportOptions
     from shadowhound_data_logger.datasets.imports import Demonstration
     from shadowhound_data_logger.datasets.transfer import DatasetPlace
@@ -76,81 +77,51 @@ def _missions(command: _Command) -> _Command:
     epilog=examples(
         'export lerobot go2_patrol --mission-type patrol --since 30d',
         'export lerobot go2_patrol --mission-type patrol --to s3://lerobot/datasets/go2/go2_patrol --wait',
-        'export lerobot go2_patrol --since yesterday --state pose,joints --dry-run',
-        'export lerobot go2_patrol --mission-type patrol --runner ray --address ray://HEAD:10001',
-        'export lerobot fetch_task --mission-type fetch --arm soarm --state velocity --task',
+        'export lerobot base --since yesterday --config examples/export_base.yaml --dry-run',
+        'export lerobot go2_patrol --mission-type patrol --ray ray://HEAD:10001',
     ),
 )
 @click.argument('name')
 @_missions
 @click.option('--to', metavar='DIR|s3://...', help='Where to write it  [default: the folder NAME]')
-@click.option('--task', is_flag=True,
-              help='Make NAME/synchronized/lerobot, and beside it what robot and arm recorded: go2, soarm.')  # fmt: skip
-@click.option('--fps', default='auto', show_default=True, metavar='N', help='Frames per second.')
-@click.option('--state', default='pose', show_default=True, metavar='WORDS',
-              help='What observation.state is made of: pose, twist, velocity, imu, joints, battery.')  # fmt: skip
-@click.option('--action', type=click.Choice(['auto', 'cmd_vel', 'odometry']), default='auto', show_default=True,
-              help='The logged commands, or velocities derived from odometry.')  # fmt: skip
-@click.option(
-    '--camera', 'cameras', default='camera', show_default=True, metavar='NAMES', help='Sensors whose pictures are used.'
-)
-@click.option('--codec', type=click.Choice(['av1', 'h264']), default='av1', show_default=True, help='Codec of the videos.')
-@click.option('--lossless', is_flag=True, help='Keep the pictures as they were published, instead of videos.')
-@click.option('--layout', type=click.Choice(['episode', 'shared']), default='episode', show_default=True,
-              help='Videos: a file for each episode, or one for each camera, which can also be streamed.')  # fmt: skip
-@click.option('--resample', multiple=True, metavar='SENSOR=HOW', help='hold (default) or linear: between the last two messages.')
-@click.option('--max-age', multiple=True, metavar='SENSOR=S', help='Older messages are stale  [default: 1.5 periods]')
-@by_option
-@click.option('--max-gap', type=click.FloatRange(0.0), default=5.0, show_default=True, metavar='S',
-              help='Refuse missions in which a stream is silent for longer.')  # fmt: skip
-@click.option('--max-stale', type=click.FloatRange(0.0, 1.0), default=0.05, show_default=True, metavar='SHARE',
-              help='Refuse missions in which more of the frames are stale for a stream.')  # fmt: skip
-@click.option('--allow-gaps', is_flag=True, help='Also take such missions, and those of which it is not known what is missing.')
-@click.option('--validation', type=click.FloatRange(0.0, 0.9), default=0.0, show_default=True, metavar='SHARE',
-              help='Share of the missions that are marked as validation.')  # fmt: skip
-@click.option(
-    '--validation-label', default='', metavar='NAME', help='Mark missions with this label in a frame as validation, too.'
-)
-@click.option('--labels', is_flag=True, help='Add a column with the labels.')
-@click.option('--arm', default='', metavar='NAME', help='Name of the arm.')
-@click.option('--clock', type=click.Path(path_type=Path), metavar='FILE',
-              help='Events that both robot and arm timed, in addition to those recorded: CSV with robot_ns,arm_ns.')  # fmt: skip
+@click.option('--config', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
+              help='YAML file with the features of the dataset and how they are made: docs/datasets.md.')  # fmt: skip
+@click.option('--allow-gaps', is_flag=True,
+              help='Also take missions with large gaps, and those of which it is not known what is missing.')  # fmt: skip
 @click.option('--wait', is_flag=True, help='Wait until the data have arrived.')
 @click.option('--pull', is_flag=True, help='Ask robots for what they keep of these missions, and wait until it has come.')
 @click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--workers', type=click.IntRange(1, 1024), metavar='N',
               help='Episodes at a time  [default: 1; with Ray the cores of the cluster]')  # fmt: skip
-@click.option('--runner', type=click.Choice(['native', 'ray']), default='native', show_default=True,
-              help='Make episodes in processes of this machine, or on a Ray cluster.')  # fmt: skip
-@click.option('--address', metavar='ray://HEAD:10001',
-              help='Of the Ray cluster  [default: RAY_ADDRESS, else Ray on this machine]')  # fmt: skip
+@click.option('--ray', metavar='ADDRESS',
+              help='Make episodes on this Ray cluster; auto: that of RAY_ADDRESS, or a Ray on this machine.')  # fmt: skip
 @as_json
-def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task: bool, wait: bool, pull: bool,  # noqa: PLR0913
-                   dry_run: bool, workers: int | None, runner: str, address: str | None, as_json: bool,
-                   **how: Any) -> ExitCode:  # fmt: skip
+def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, config: Path | None, allow_gaps: bool,  # noqa: PLR0913
+                   wait: bool, pull: bool, dry_run: bool, workers: int | None, ray: str | None,
+                   as_json: bool) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot dataset NAME (v3.0).
 
     Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
     """
     with _exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415
+        from shadowhound_data_logger.datasets import export_file  # noqa: PLC0415
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, catch_up, upload  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
         from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
 
         check_name(name, 'the name of the dataset')
-        options = _options(how)
-        cluster = _cluster(address) if runner == 'ray' else None
-        if address and cluster is None:
-            raise BadUsage(f'--address {address} is refused', 'it is of a Ray cluster: --runner ray')
+        file = export_file.read(config) if config else export_file.ExportFile()
+        options = _options(file, config, allow_gaps=allow_gaps)
+        cluster = _cluster(ray) if ray else None
         place = DatasetPlace.of(to) if to and to.startswith(SCHEME) else None
-        if task and options.by != BY_STAMP:
-            raise BadUsage(f'--task with --by {options.by} is refused', 'the recordings of a task are by stamps')
-        if task and place is not None:
-            raise BadUsage(f'--task with --to {to} is refused', 'the folder of a task is made on this machine: --to DIR')
+        if file.task and options.by != BY_STAMP:
+            raise BadUsage(f'task with by: {options.by} is refused', 'the recordings of a task are by stamps')
+        if file.task and place is not None:
+            raise BadUsage(f'a task with --to {to} is refused', 'the folder of a task is made on this machine: --to DIR')
     folder = _copy_of(to) if place and to else Path(to or name)
-    folder = folder / TASK_SET if task else folder
+    folder = folder / TASK_SET if file.task else folder
     left_out, moved = quietly(), None
     with progress('looking at what there is') as bar:
         if place is not None and not dry_run:
@@ -183,7 +154,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, task:
     return exit_code(finding=result.refused or result.waiting or len(left_out))
 
 
-def _cluster(address: str | None) -> Cluster:
+def _cluster(address: str) -> Cluster:
     """Raises BadUsage on a machine without Ray."""
     from shadowhound_data_logger.datasets.cluster import Cluster  # noqa: PLC0415
 
@@ -191,39 +162,20 @@ def _cluster(address: str | None) -> Cluster:
         import ray  # noqa: F401, PLC0415
     except ModuleNotFoundError as error:
         raise BadUsage('ray is not installed', "pip install 'daft[ray]', the same version on the whole cluster") from error
-    return Cluster(address)
+    return Cluster(None if address == 'auto' else address)
 
 
-def _options(how: Mapping[str, Any]) -> ExportOptions:
-    from shadowhound_data_logger.datasets.clocks import pairs_of  # noqa: PLC0415
-    from shadowhound_data_logger.datasets.features import ExportOptions  # noqa: PLC0415
+def _options(file: ExportFile, config: Path | None, *, allow_gaps: bool) -> ExportOptions:
+    from shadowhound_data_logger.datasets.export_file import REMEDY  # noqa: PLC0415
 
-    if how['arm']:
-        check_name(how['arm'], '--arm')
-    pairs = tuple((int(robot), int(arm)) for robot, arm in pairs_of(how['clock'])) if how['clock'] else ()
-    fps = how['fps']
-    if fps != 'auto' and not fps.isdecimal():
-        raise BadUsage(f'--fps {fps} is refused', 'allowed is auto, or a whole number of frames a second')
-    return ExportOptions(
-        fps=None if fps == 'auto' else int(fps), state=_words(how['state']), action=how['action'], cameras=_words(how['cameras']),
-        codec=how['codec'], is_lossless=how['lossless'], layout=how['layout'],
-        resample=_pairs('--resample', how['resample'], str), max_age_s=_pairs('--max-age', how['max_age'], float),
-        max_gap_s=how['max_gap'], max_stale=how['max_stale'],
-        allow_gaps=how['allow_gaps'], validation=how['validation'],
-        labels=how['labels'], validation_label=how['validation_label'],
-        arm=how['arm'], clock_pairs=pairs, by=how['by'],
-    )  # fmt: skip
+    try:
+        return file.options(config.parent if config else Path(), allow_gaps=allow_gaps)
+    except (ValueError, SettingError) as error:
+        raise BadUsage(f'{config}: {error}', REMEDY) from error
 
 
 def _words(text: str) -> tuple[str, ...]:
     return tuple(filter(None, (word.strip() for word in text.split(','))))
-
-
-def _pairs(name: str, given: tuple[str, ...], kind: Callable[[str], Any]) -> dict[str, Any]:
-    try:
-        return {sensor: kind(value) for sensor, value in (pair.split('=') for pair in given)}
-    except ValueError:
-        raise BadUsage(f'{name} {" ".join(given)} is refused', f'allowed is {name} SENSOR=VALUE') from None
 
 
 def _copy_of(url: str) -> Path:

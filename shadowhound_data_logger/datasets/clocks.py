@@ -95,11 +95,11 @@ def pairs_of(path: Path) -> NDArray[np.int64]:
     try:
         found = [tuple(int(row[name]) for name in COLUMNS) for row in csv_rows(path.read_bytes())]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise SettingError('--clock', path, f'a CSV file with the columns {",".join(COLUMNS)} ({error})') from error
+        raise SettingError('arm_clock', path, f'a CSV file with the columns {",".join(COLUMNS)} ({error})') from error
     return _sane(found, path)
 
 
 def _sane(found: Sequence[tuple[int, ...]], path: Path) -> NDArray[np.int64]:
     if any(not EARLIEST_SANE_NS <= value < 1 << 62 for pair in found for value in pair):
-        raise SettingError('--clock', path, 'times in ns since 1970')
+        raise SettingError('arm_clock', path, 'times in ns since 1970')
     return np.array(found, np.int64).reshape(-1, 2)

@@ -135,7 +135,7 @@ def _reach(address: str) -> None:
 
 
 def _no_cluster(place: str, error: Exception) -> LakeError:
-    return LakeError(f'there is no Ray cluster at {place}: {error}', remedy='name its head: --address ray://HEAD:10001')
+    return LakeError(f'there is no Ray cluster at {place}: {error}', remedy='name its head: --ray ray://HEAD:10001')
 
 
 def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], None]) -> None:

@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.errors import BagDamaged, LakeError, ObjectRef
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.stamps import SAME_NS
 from shadowhound_data_logger.datasets.clocks import ClockOffset
-from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions
+from shadowhound_data_logger.datasets.features import ARM_ACTION, ARM_TOPICS, LABEL_FEATURE, LINEAR, ExportOptions, StatePart
 from shadowhound_data_logger.datasets.plan import BEFORE_NS, ArmPlan, EpisodePlan, StreamPlan, refusal
 from shadowhound_data_logger.datasets.series import Recordings, Series
 from shadowhound_data_logger.datasets.ticks import (
@@ -217,12 +217,12 @@ def _ticks(plan: EpisodePlan, series: Sequence[Series], fps: int) -> NDArray[np.
 
 def _sampled(plan: StreamPlan, series: Series, ticks: NDArray[np.int64], fps: int, options: ExportOptions) -> _Stream:
     sensor = plan.recording.sensor
-    given = (options.max_age_s or {}).get(sensor)
+    given = options.max_age_s.get(sensor)
     most = round(given * SECOND) if given is not None else int(LATE * max(series.period_ns, SECOND // fps))
     found = sample(series.stamps, ticks, most)
     if plan.part is None:
         return _Stream(plan, series, found, np.empty((len(ticks), 0)))
-    if (options.resample or {}).get(sensor) != LINEAR or plan.part.is_derived:
+    if options.resample.get(sensor) != LINEAR or plan.part.is_derived:
         return _Stream(plan, series, found, series.values[found.message])
     values, earlier = interpolated(series.stamps, series.values, ticks, round(options.max_gap_s * SECOND), plan.part.turns)
     return _Stream(plan, series, Sampled(found.message, earlier, found.age_s, found.stale), values)
@@ -293,9 +293,24 @@ def _names(stream: _Stream) -> tuple[str, ...]:
         return ()
     if len(part.names) == width:
         return part.names
+    if part.sensor.startswith('/'):
+        return _names_of_fields(part, stream.series.names, width)
     named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{place}' for place in range(width))
     prefix = 'arm_' if _is_of_arm(stream.plan) else ''
     return tuple(f'{prefix}{name}.pos' for name in named)
+
+
+def _names_of_fields(part: StatePart, joints: Sequence[str], width: int) -> tuple[str, ...]:
+    """Of the numbers of a topic. Raises LakeError where the file names another number of them."""
+    if part.names:
+        text = f'{part.sensor} has {width} numbers in {", ".join(part.fields)}, and {len(part.names)} names are given'
+        raise LakeError(text, remedy='correct names in the file of --config')
+    if len(part.fields) == width:
+        return part.fields
+    last = 'pos' if part.fields == ('position',) else part.fields[0]
+    if len(joints) == width:
+        return tuple(f'{name}.{last}' for name in joints)
+    return tuple(f'{part.fields[0]}.{number}' for number in range(width))
 
 
 def _refusal(episode: Mapping[str, Any], options: ExportOptions) -> str:
@@ -303,9 +318,9 @@ def _refusal(episode: Mapping[str, Any], options: ExportOptions) -> str:
         share, longest_s = each['stale_share'], each['longest_gap_s']
         if share > options.max_stale:
             why = ', '.join(f'{cause} {count}' for cause, count in each['causes'].items())
-            return f'{name} is stale in {share:.1%} of the frames ({why}), more than --max-stale {options.max_stale:g}'
+            return f'{name} is stale in {share:.1%} of the frames ({why}), more than max_stale {options.max_stale:g}'
         if longest_s > options.max_gap_s:
-            return f'{name} was last heard {longest_s:.1f} s before a frame, more than --max-gap {options.max_gap_s:g}'
+            return f'{name} was last heard {longest_s:.1f} s before a frame, more than max_gap_s {options.max_gap_s:g}'
     return ''
 
 

@@ -26,7 +26,7 @@ from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.datasets import plan as planning
 from shadowhound_data_logger.datasets.episodes import EPISODE_JSON, build
-from shadowhound_data_logger.datasets.features import ExportOptions
+from shadowhound_data_logger.datasets.features import ACTIONS, AUTO, ExportOptions
 from shadowhound_data_logger.datasets.lerobot import REPORT, Lerobot
 from shadowhound_data_logger.datasets.mobile import forget, synchronize, task_of, write_recordings
 from shadowhound_data_logger.datasets.plan import ChosenMission, EpisodePlan
@@ -199,9 +199,9 @@ def _drop(made: Lerobot, mission_id: str) -> str:
 def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
     """The first settings of a dataset apply to all of it. Raises LakeError for others."""
     if made.settings is None:
-        return options, options.fps, options.action
+        return options, options.fps, options.action_word
     now = {**options.as_json(), 'fps': options.fps or made.settings['fps'],
-           'action': made.settings['action'] if options.action == 'auto' else options.action}  # fmt: skip
+           'action': made.settings['action'] if options.action == AUTO else options.action_word}  # fmt: skip
     if other := [name for name in {**made.settings, **now} if now.get(name) != made.settings.get(name)]:
         said = ', '.join(f'{name} {made.settings.get(name, "none")}' for name in other)
         raise LakeError(f'{made.folder} was started with {said}', remedy='export to another folder, or with the same settings')
@@ -221,7 +221,11 @@ def hashed(mission_id: str) -> str:
 
 def _only(plan: EpisodePlan, action: str) -> EpisodePlan:
     """With ``auto``, a mission may have an action that the dataset does not use."""
-    wrong = [each for each in plan.streams if each.name == 'action' and each.part is not None and each.part.name != action]
+    wrong = [
+        each
+        for each in plan.streams
+        if each.name == 'action' and each.part is not None and action in ACTIONS and each.part.name != action
+    ]
     if not wrong:
         return plan
     return replace(plan, streams=tuple(each for each in plan.streams if each not in wrong), missing=(*plan.missing, action))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from shadowhound_data_logger.core.errors import SettingError
@@ -20,6 +21,7 @@ class StatePart:
 
     name: str
     sensor: str
+    """Or a topic, which begins with a slash."""
     fields: tuple[str, ...]
     """Paths in a message; empty: the lake's defaults for the type."""
     names: tuple[str, ...]
@@ -29,6 +31,10 @@ class StatePart:
     """Quaternions x y z w among them."""
     is_derived: bool = False
     """Derived from two poses of odometry instead of read from a message."""
+
+    def as_json(self) -> dict[str, Any]:
+        """How a file names it."""
+        return {'topic': self.sensor, 'fields': list(self.fields), 'names': list(self.names), 'units': list(self.units)}
 
 
 STATE_PARTS: Final[Mapping[str, StatePart]] = {
@@ -45,13 +51,16 @@ STATE_PARTS: Final[Mapping[str, StatePart]] = {
         StatePart('battery', 'lowstate', ('bms_state.soc',), ('battery_pct',), ('%',)),
     )
 }  # fmt: skip
-"""By the word that ``--state`` takes."""
+"""By the word that ``state`` takes."""
 COMMAND: Final = StatePart(
     'cmd_vel', 'cmd_vel', ('linear.x', 'linear.y', 'angular.z'), ('x.vel', 'y.vel', 'theta.vel'), ('m/s', 'm/s', 'rad/s')
 )
 DERIVED: Final = StatePart('odometry', 'odom', _POSE, COMMAND.names, COMMAND.units, is_derived=True)
-ACTIONS: Final = {'auto': None, 'cmd_vel': COMMAND, 'odometry': DERIVED}
-"""By the word that ``--action`` takes; with ``auto``, the command topic in a dataset whose first mission has it."""
+ACTIONS: Final[Mapping[str, StatePart]] = {part.name: part for part in (COMMAND, DERIVED)}
+AUTO: Final = 'auto'
+"""In place of one of ``ACTIONS``: the commands if the first mission of a dataset has them, otherwise what odometry measured."""
+MAPPED: Final = 'fields'
+"""The action of a dataset that takes it from fields of a topic."""
 ARM_JOINTS, ARM_COMMANDS, ARM_CLOCK = 'arm_joints', 'arm_commands', 'arm_clock'
 """The names of an arm's sensors here, regardless of their names in the recording: they are found by topic."""
 ARM_TOPICS: Final = {ARM_JOINTS: 'joint_states', ARM_COMMANDS: 'joint_commands', ARM_CLOCK: 'clock'}
@@ -76,17 +85,20 @@ class ExportOptions:
 
     fps: int | None = None
     """None: the rate of the slowest camera."""
-    state: tuple[str, ...] = ('pose',)
-    action: str = 'auto'
-    cameras: tuple[str, ...] = ('camera',)
+    state: tuple[str | StatePart, ...] = ('pose',)
+    """Of ``STATE_PARTS``, or fields of a topic."""
+    action: str | StatePart = AUTO
+    """Of ``ACTIONS``, or fields of a topic."""
+    images: Mapping[str, str] = field(default_factory=lambda: {'front': 'camera'})
+    """Name of a feature -> sensor or topic with its images."""
     codec: str = AV1
     is_lossless: bool = False
     layout: str = OWN_FILES
     """``episode``: separate video files for each episode; ``shared``: those of all episodes in one file for each camera."""
-    resample: Mapping[str, str] | None = None
-    """Sensor -> ``hold`` or ``linear``; default: hold."""
-    max_age_s: Mapping[str, float] | None = None
-    """Sensor -> seconds; default: ``ticks.LATE`` periods of the stream or of the ticks."""
+    resample: Mapping[str, str] = field(default_factory=dict)
+    """Sensor or topic -> ``hold`` or ``linear``; default: hold."""
+    max_age_s: Mapping[str, float] = field(default_factory=dict)
+    """Sensor or topic -> seconds; default: ``ticks.LATE`` periods of the stream or of the ticks."""
     by: str = BY_STAMP
     """Which of the two times of messages places them at the ticks."""
     max_gap_s: float = 5.0
@@ -104,34 +116,62 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Raises SettingError."""
+        self._check_features()
+        self._check_values()
+
+    def _check_features(self) -> None:
         for word in self.state:
-            if word not in STATE_PARTS:
-                raise SettingError('--state', word, ', '.join(STATE_PARTS))
-        if not self.state or len(set(self.state)) != len(self.state):
-            raise SettingError('--state', ','.join(self.state), 'one or more different words')
-        if not self.cameras:
-            raise SettingError('--camera', '', 'the name of a sensor with pictures')
-        for sensor, how in (self.resample or {}).items():
+            if isinstance(word, str) and word not in STATE_PARTS:
+                raise SettingError('state', word, f'{", ".join(STATE_PARTS)}, or fields of a topic')
+        names = [part.name for part in self.state_parts]
+        if not names or len(set(names)) != len(names):
+            raise SettingError('state', ', '.join(names), 'one or more different words or topics')
+        if isinstance(self.action, str) and self.action not in {AUTO, *ACTIONS}:
+            raise SettingError('action', self.action, f'{", ".join((AUTO, *ACTIONS))}, or fields of a topic')
+        if not self.images:
+            raise SettingError('images', '', 'at least one sensor or topic with images')
+
+    def _check_values(self) -> None:
+        for name, value, allowed in (('codec', self.codec, (AV1, H264)), ('layout', self.layout, (OWN_FILES, SHARED)),
+                                     ('by', self.by, CLOCKS)):  # fmt: skip
+            if value not in allowed:
+                raise SettingError(name, value, ' or '.join(allowed))
+        for sensor, how in self.resample.items():
             if how not in {HOLD, LINEAR}:
-                raise SettingError(f'--resample {sensor}', how, f'{HOLD} or {LINEAR}')
-        if self.by not in CLOCKS:
-            raise SettingError('--by', self.by, ' or '.join(CLOCKS))
+                raise SettingError(f'resample of {sensor}', how, f'{HOLD} or {LINEAR}')
         if self.by == BY_RECEIVED and self.arm:
-            raise SettingError('--by', self.by, f'{BY_STAMP}: with --arm, times are converted between two clocks')
+            raise SettingError('by', self.by, f'{BY_STAMP}: with arm, times are converted between two clocks')
+        for name, number, most in (('max_stale', self.max_stale, 1.0), ('validation', self.validation, 0.9),
+                                   ('max_gap_s', self.max_gap_s, math.inf)):  # fmt: skip
+            if not 0 <= number <= most:
+                raise SettingError(name, number, f'0 to {most:g}')
         if self.fps is not None and self.fps < 1:
-            raise SettingError('--fps', self.fps, 'auto, or a whole number of frames a second')
+            raise SettingError('fps', self.fps, 'auto, or a whole number of frames per second')
+
+    @property
+    def state_parts(self) -> tuple[StatePart, ...]:
+        """In the order of ``observation.state``."""
+        return tuple(STATE_PARTS[each] if isinstance(each, str) else each for each in self.state)
+
+    @property
+    def action_word(self) -> str:
+        """``auto``, one of ``ACTIONS``, or ``fields``."""
+        return self.action if isinstance(self.action, str) else MAPPED
+
+    def actions(self, word: str) -> list[StatePart]:
+        """Where the action can come from, best first; ``word`` as in ``action_word``."""
+        if not isinstance(self.action, str):
+            return [self.action]
+        return [COMMAND, DERIVED] if word == AUTO else [ACTIONS[word]]
 
     def as_json(self) -> dict[str, Any]:
         """The options that determine the bytes of an episode; frames per second and action are chosen later."""
         return {
-            'state': list(self.state), 'cameras': list(self.cameras), 'codec': self.codec, 'lossless': self.is_lossless,
-            'resample': dict(sorted((self.resample or {}).items())), 'max_age_s': dict(sorted((self.max_age_s or {}).items())),
+            'state': [each if isinstance(each, str) else each.as_json() for each in self.state],
+            **({} if isinstance(self.action, str) else {'action_from': self.action.as_json()}),
+            'images': dict(self.images), 'codec': self.codec, 'lossless': self.is_lossless,
+            'resample': dict(sorted(self.resample.items())), 'max_age_s': dict(sorted(self.max_age_s.items())),
             'max_gap_s': self.max_gap_s, **({'arm': self.arm} if self.arm else {}),
             'layout': self.layout, **({'labels': True} if self.labels else {}),
             **({'by': self.by} if self.by != BY_STAMP else {}),
         }  # fmt: skip
-
-
-def camera_name(sensor: str) -> str:
-    """The name of a camera's feature: ``front`` for the default camera, otherwise its sensor's name."""
-    return 'front' if sensor == 'camera' else sensor

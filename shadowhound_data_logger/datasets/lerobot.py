@@ -41,7 +41,6 @@ from shadowhound_data_logger.datasets.features import (
     JOINT_STATE,
     LABEL_FEATURE,
     SHARED,
-    STATE_PARTS,
     ExportOptions,
     StatePart,
 )
@@ -380,13 +379,13 @@ def features_of(episode: Mapping[str, Any], options: ExportOptions) -> dict[str,
     units: list[str] = []
     origins: list[str] = []
     arm = {ARM_STATE.name: ARM_STATE} if options.arm else {}
-    for word, part in {**arm, **{word: STATE_PARTS[word] for word in options.state}}.items():
+    for word, part in {**arm, **{part.name: part for part in options.state_parts}}.items():
         names = streams[f'state.{word}']['names']
         state += names
         units += _units(part, names, streams[f'state.{word}'])
         origins += [f'{part.sensor}, derived' if part.is_derived else part.sensor] * len(names)
     features['observation.state'] = _vector(state, units=units, source=origins)
-    features['action'] = _action_feature(streams)
+    features['action'] = _action_feature(streams, options)
     features['shadowhound.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
     features['shadowhound.age_s'] = _vector(list(streams), about='seconds since the newest message')
     features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
@@ -396,11 +395,15 @@ def features_of(episode: Mapping[str, Any], options: ExportOptions) -> dict[str,
     return features
 
 
-def _action_feature(streams: Mapping[str, Any]) -> dict[str, Any]:
+def _action_feature(streams: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
     """The arm's numbers first; ``derived`` where one of them was not commanded."""
     base = streams['action']['sensor'] == COMMAND.sensor
     names, units = list(COMMAND.names), list(COMMAND.units)
     sources, is_derived = [COMMAND.sensor if base else f'{DERIVED.sensor}, derived'], not base
+    if not isinstance(options.action, str):
+        names = list(streams['action']['names'])
+        units = list(_units(options.action, names, streams['action']))
+        sources, is_derived = [options.action.sensor], False
     if ARM_ACTION in streams:
         of_arm = streams[ARM_ACTION]
         commanded = of_arm['sensor'] == ARM_COMMANDS

@@ -19,7 +19,6 @@ from shadowhound_data_logger.core.stamps import BY_RECEIVED
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.datasets.clocks import NEAR_NS, ClockOffset, measured
 from shadowhound_data_logger.datasets.features import (
-    ACTIONS,
     ARM_ACTION,
     ARM_CLOCK,
     ARM_COMMAND,
@@ -27,12 +26,10 @@ from shadowhound_data_logger.datasets.features import (
     ARM_JOINTS,
     ARM_STATE,
     ARM_TOPICS,
+    AUTO,
     COMMAND,
-    DERIVED,
-    STATE_PARTS,
     ExportOptions,
     StatePart,
-    camera_name,
 )
 from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, bags_of, manifests_of
 from shadowhound_data_logger.datasets.ticks import whole_fps
@@ -229,7 +226,7 @@ def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
 
 def settled_action(plans: Sequence[EpisodePlan], action: str) -> str:
     """``cmd_vel`` or ``odometry``: with ``auto`` the command topic if a mission has one."""
-    if action != 'auto':
+    if action != AUTO:
         return action
     return 'cmd_vel' if any(stream.part == COMMAND for plan in plans for stream in plan.streams) else 'odometry'
 
@@ -241,10 +238,11 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         return EpisodePlan(mission, (), {}, {}, (), stated.slice(0, 0))
     arm = None
     since, until = mission.begin_ns - BEFORE_NS, mission.end_ns
-    parts = [STATE_PARTS[word] for word in options.state]
-    actions = [COMMAND, DERIVED] if action == 'auto' else [ACTIONS[action]]
-    sensors = [*options.cameras, *(part.sensor for part in parts), *(part.sensor for part in actions if part)]
-    used = f'{among("sensor", sorted({*sensors, *RECORDED}))} OR {among("type", sorted(DETECTIONS))}'
+    parts, actions = options.state_parts, options.actions(action)
+    sensors = [*options.images.values(), *(part.sensor for part in (*parts, *actions))]
+    named = {each for each in sensors if each.startswith('/')}
+    used = f'{among("sensor", sorted({*sensors, *RECORDED} - named))} OR {among("type", sorted(DETECTIONS))}'
+    used += f' OR {among("topic", sorted(named))}' if named else ''
     span: dict[str, Any] = {'since': utc(since - LONGEST_BATCH_NS), 'until': utc(until + 1000)}
     if options.by == BY_RECEIVED:  # stamps can be anywhere then, and so the dates of rows
         arrival = 'coalesce(received_start_ns, t_start_ns)'
@@ -253,7 +251,12 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         source, findings=findings, columns=(*NEEDED, *RECEIVED, 'topic'), where=used, robot=mission.robot, **span
     ).to_pylist()
     seen = _tracks([row for row in found if row['type'] in DETECTIONS], mission)[0]
-    tracks, topics = _tracks([row for row in found if row['type'] not in DETECTIONS], mission)
+    rows = [row for row in found if row['type'] not in DETECTIONS]
+    tracks, topics = _tracks(rows, mission)
+    for topic in sorted(named):
+        mine = [{**row, 'sensor': topic} for row in rows if row['topic'] == topic]
+        tracks |= _tracks(mine, mission)[0]
+        topics[topic] = topic
     if options.by == BY_RECEIVED:
         tracks = {sensor: track.by_arrival() for sensor, track in tracks.items()}
     bags = tuple(bags_of(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
@@ -262,14 +265,14 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
     streams, missing = [], []
     wanted: list[tuple[str, StatePart | None, str]] = [
-        (f'images.{camera_name(sensor)}', None, sensor) for sensor in options.cameras
+        (f'images.{name}', None, sensor) for name, sensor in options.images.items()
     ]
     wanted += [(f'state.{part.name}', part, part.sensor) for part in parts]
-    commands = [part for part in actions if part is not None and best[part.sensor] is not None]
+    commands = [part for part in actions if best[part.sensor] is not None]
     if commands:
         wanted.append(('action', commands[0], commands[0].sensor))
     else:
-        missing.append('odom' if action != 'cmd_vel' else 'cmd_vel')
+        missing.append(actions[-1].sensor)
     for name, part, sensor in wanted:
         recording = best[sensor]
         if recording is None:

@@ -44,7 +44,10 @@ class VideoWriter:
     def __init__(self, path: Path, fps: int, size: tuple[int, int], codec: str) -> None:
         """``size`` is (height, width), both even. Raises LakeError otherwise."""
         if size[0] % 2 or size[1] % 2:
-            raise LakeError(f'pictures of {size[1]} x {size[0]} cannot be {PIXELS} video', remedy='export them with --lossless')
+            raise LakeError(
+                f'pictures of {size[1]} x {size[0]} cannot be {PIXELS} video',
+                remedy='export them with lossless: true in the file of --config',
+            )
         self._path, self._fps, self._size = path, fps, size
         self._encoder, self._options = CODECS[codec]
         self._count = 0

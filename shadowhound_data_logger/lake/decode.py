@@ -51,6 +51,7 @@ _WHOLE_ODOMETRY: Final = (
     *(f'twist.twist.{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
 )
 _WHOLE: Final = dict(zip(ODOMETRY, _WHOLE_ODOMETRY, strict=True))
+_SHORT: Final = {whole: short for short, whole in _WHOLE.items()}
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     'go2_interfaces/msg/IMU': ('gyroscope', 'accelerometer', 'quaternion'),
     'sensor_msgs/msg/Imu': (
@@ -292,6 +293,8 @@ def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str]
         asked = asked or _of_type(samples, kind)
         if kind == 'nav_msgs/msg/Odometry' and samples and 'pose' in samples[0]:
             asked = whole_odometry(asked)
+        elif kind == 'nav_msgs/msg/Odometry':
+            asked = tuple(_SHORT.get(name, name) for name in asked)
         columns = [_column(samples, name, marker_of(kind, name)) for name in asked]
         values = np.hstack(columns) if columns else np.empty((len(samples), 0))
     except (LookupError, TypeError, ValueError, RecursionError, ArithmeticError, MemoryError) as error:

@@ -76,9 +76,10 @@ def parsed(arguments: Sequence[str]) -> tuple[click.Command, click.Context]:
 def test_every_verb_has_examples_that_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each is of this verb, or of one of its own; no option in it is unknown, without its value, or missing."""
     monkeypatch.chdir(tmp_path)
-    for folder in ('packed', 'outputs/go2_patrol', 'clip-vit-base-patch32', 'usb'):  # which some examples read
+    for folder in ('packed', 'outputs/go2_patrol', 'clip-vit-base-patch32', 'usb', 'examples'):  # which some examples read
         (tmp_path / folder).mkdir(parents=True)
-    for file in ('bumps.json', 'sample.npz', 'door.jpg', 'root.json', 'alice.key', 'alice.pub', 'bob.pub', 'usb/root.key'):
+    for file in ('bumps.json', 'sample.npz', 'door.jpg', 'root.json', 'alice.key', 'alice.pub', 'bob.pub', 'usb/root.key',
+                     'examples/export_base.yaml'):  # fmt: skip
         (tmp_path / file).write_text('[]')
     found = examples_of(name)
     assert found

@@ -15,7 +15,6 @@ TWO_MEANINGS = {
     '--robot': 'the robot that a verb is about, which has a default, or a filter of results',
     '--robot-type': 'a version may be for several types, a robot is of one',
     '--topic': 'a filter of results, or several topics of one bag',
-    '--state': 'moves into a file',
     '--key': 'keys of the root sign together, other keys alone',
 }
 """Options with two help texts -> why: each has been looked at."""

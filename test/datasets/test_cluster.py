@@ -23,7 +23,7 @@ ROOT: Final = Path(__file__).parents[2]
 PYTHON: Final = Path(os.environ.get('SHADOWHOUND_RAY', '~/.cache/shadowhound/ray/bin/python')).expanduser()
 MAIN: Final = [str(PYTHON), '-m', 'shadowhound_data_logger.cli.main']
 PATROLS: Final = ['export', 'lerobot', 'patrols', '--mission-type', 'patrol']
-ON_RAY: Final = ['--runner', 'ray', '--workers', '2']
+ON_RAY: Final = ['--ray', 'auto', '--workers', '2']
 SHORT: Final = TemporaryDirectory(prefix='ray', ignore_cleanup_errors=True)
 """Ray's sockets need a short path."""
 BUILDS: Final = b'ray::Builder.build'

@@ -275,18 +275,20 @@ def test_a_dry_run_counts_what_would_be_exported(mixed: Yard) -> None:
 
 def asked(yard: Yard, home: Path, *more: str) -> tuple[int, str]:
     home.mkdir(exist_ok=True)
+    (home / 'export.yaml').write_text('fps: 2')
     (home / 'store').symlink_to(yard.settings.directory) if not (home / 'store').exists() else None
     runner = CliRunner(env={'SHADOWHOUND_HOME': str(home), 'AWS_ENDPOINT_URL': None, 'COLUMNS': '200'})
-    arguments = ['lerobot', 'totals', '--to', str(home / 'totals'), '--mission-type', 'patrol', *more]
+    arguments = ['lerobot', 'totals', '--to', str(home / 'totals'), '--mission-type', 'patrol',
+                 '--config', str(home / 'export.yaml'), *more]  # fmt: skip
     ran = runner.invoke(verb.export, arguments, standalone_mode=False, catch_exceptions=False)
     return ran.return_value, ran.stdout
 
 
 @pytest.mark.parametrize(('more', 'total'), [
-    (('--fps', '2', '--dry-run'), '1 mission would be exported to'),
-    (('--fps', '2'), '1 episode added to'),
-    (('--fps', '2', '--mission', 'slow', '--dry-run'), '0 missions would be exported to'),
-    (('--fps', '2', '--mission', 'slow'), 'No mission was exported, 1 refused.'),
+    (('--dry-run',), '1 mission would be exported to'),
+    ((), '1 episode added to'),
+    (('--mission', 'slow', '--dry-run'), '0 missions would be exported to'),
+    (('--mission', 'slow'), 'No mission was exported, 1 refused.'),
 ])  # fmt: skip
 def test_the_totals_of_the_command(mixed: Yard, tmp_path: Path, more: Sequence[str], total: str) -> None:
     """Refused ones are counted as such, and the exit code is 1, in a dry run and in a real one."""
@@ -299,7 +301,7 @@ def test_the_totals_of_the_command(mixed: Yard, tmp_path: Path, more: Sequence[s
 
 
 def test_a_refused_mission_does_not_settle_the_rate(mixed: Yard) -> None:
-    """``--fps auto`` is the rate of the slowest camera of those that are exported."""
+    """``fps: auto`` is the rate of the slowest camera of those that are exported."""
     mixed.record(Mission('poor', begin_s=500, seconds=4, camera_hz=1, odom_hz=4, sensors=('camera', 'odom'), uncounted=('odom',)))
     flags = {'where': "mission_id in ('good', 'poor')"}
     found = export(mixed.folder / 'rate', mixed.source, flags, ExportOptions())

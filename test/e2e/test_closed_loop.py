@@ -144,8 +144,9 @@ def test_record_export_fit_sign_publish_and_drive(  # noqa: PLR0915 - one story
     asked = ('query', "SELECT count(*) AS rows FROM objects WHERE sensor = 'cmd_vel'", '--mission', taught, '--json')
     until(lambda: sum(row['rows'] for row in run(*asked)), 'the catalog has arrived')
     exported = tmp_path / policy
-    said = run('export', 'lerobot', policy, '--robot', robot, '--mission', taught, '--wait', '--max-stale', '1', '--allow-gaps',
-        '--codec', 'h264')  # fmt: skip
+    (tmp_path / 'export.yaml').write_text('max_stale: 1\ncodec: h264\n')
+    said = run('export', 'lerobot', policy, '--robot', robot, '--mission', taught, '--wait', '--allow-gaps',
+        '--config', str(tmp_path / 'export.yaml'))  # fmt: skip
     assert (exported / 'meta/info.json').is_file(), said
     digest = fitted(exported, tmp_path / 'trained')
     packed = str(tmp_path / 'packed')
