@@ -46,7 +46,7 @@ SHOWN: Final = 30
 COPIES: Final = 'exports'
 """In SHADOWHOUND_HOME: copies of what is exported to a store."""
 TASK_SET: Final = 'synchronized/lerobot'
-NOT_ASKED: Final = {'sensor', 'topic', 'near'}
+NOT_ASKED: Final = {'sensor', 'topic', 'near', 'near_gps'}
 _Command = TypeVar('_Command', bound=Callable[..., Any])
 _place = click.argument('place', metavar='DIR|s3://...')
 

@@ -199,7 +199,7 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
     asked = labels.labelled(source, asked, left_out)
     want = KeptFilter(
         sensor=sensor, topic=asked.topic, since_ns=asked.since_ns, until_ns=asked.until_ns, near=asked.near,
-        mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,
+        near_gps=asked.near_gps, mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,
     )  # fmt: skip
     if not want.to_json() and asked.where is None:
         raise BadUsage('nothing is requested', "name a --sensor, a --bag or a time; --bag '*' is all bags")

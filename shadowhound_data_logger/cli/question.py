@@ -36,7 +36,8 @@ FLAGS: Final = {
     'topic': click.option('--topic', metavar='NAME', help='Only of this topic.'),
     'since': click.option('--since', metavar='TIME', help='From TIME on: yesterday, 2h, 2026-11-20, 2026-11-20T12:30 (UTC).'),
     'until': click.option('--until', metavar='TIME', help='Before TIME.'),
-    'near': click.option('--near', metavar='X,Y,R', help='Within R meters of X,Y in the odometry frame.'),
+    'near': click.option('--near', metavar='X,Y,R', help='Within R meters of X,Y in the frame of the pose.'),
+    'near_gps': click.option('--near-gps', metavar='LAT,LON,R', help='Within R meters of this latitude and longitude.'),
     'mission': click.option('--mission', metavar='ID', help='Only of missions whose id, or whose run id, begins with ID.'),
     'mission_type': click.option('--mission-type', metavar='TYPE', help='Only of missions of this type.'),
     'failed': click.option(
@@ -58,6 +59,7 @@ NAMES: Final = (
     'since',
     'until',
     'near',
+    'near_gps',
     'mission',
     'mission_type',
     'success',

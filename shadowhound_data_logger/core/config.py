@@ -69,6 +69,7 @@ MAX_INT: Final = (1 << 63) - 1
 """Of a ROS parameter."""
 _FIELD: Final = re.compile(r'[^:\s]+:[A-Za-z]\w*(\.\w+)*', re.ASCII)
 """A part of the field that is a number counts in an array: lowstate:motor_state.0.temperature."""
+_TYPE: Final = re.compile(r'[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*', re.ASCII)
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
 ENDPOINTS: Final = ('AWS_ENDPOINT_URL_S3', 'AWS_ENDPOINT_URL')
@@ -265,8 +266,13 @@ def _check_fields(mission: MissionSettings) -> None:
             raise SettingError(f'mission.{name}', given, "empty, or 'topic:field' such as lowstate:bms_state.soc")
 
 
+def is_type(source: str) -> bool:
+    """Whether an alternative of a mission's setting is a message type, which stands for every topic of it."""
+    return _TYPE.fullmatch(source) is not None
+
+
 def fields_of(given: str) -> list[tuple[str, list[str]]]:
-    """(topic, path of the field) of each alternative of a mission's setting, the preferred one first."""
+    """(topic or type, path of the field) of each alternative of a mission's setting, the preferred one first."""
     pairs = (each.partition(':') for each in given.split('|') if each)
     return [(topic, field.split('.')) for topic, _, field in pairs]
 

@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from shadowhound_data_logger.core import earth
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.keys import is_name
@@ -68,7 +69,9 @@ class KeptFilter:
     until_ns: int | None = None
     """Exclusive."""
     near: tuple[float, float, float] | None = None
-    """x, y and radius in meters, in the odometry's frame."""
+    """x, y and radius in meters, in the frame of the pose."""
+    near_gps: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees, and radius in meters."""
     mission: str | None = None
     """How the id of a mission or of its run begins."""
     mission_type: str | None = None
@@ -81,8 +84,9 @@ class KeptFilter:
         """What is given, in the form that the id is the hash of."""
         said: dict[str, Any] = {name: value for name in _WORDS if (value := getattr(self, name)) is not None}
         said |= {name: value for name in ('since_ns', 'until_ns') if (value := getattr(self, name)) is not None}
-        if self.near is not None:
-            said['near'] = [float(value) for value in self.near]
+        for name, circle in (('near', self.near), ('near_gps', self.near_gps)):
+            if circle is not None:
+                said[name] = [float(value) for value in circle]
         if self.keys or self.patterns:
             said['keys'] = sorted(self.keys.union(self.patterns))
         return said
@@ -112,7 +116,8 @@ class KeptFilter:
             names = (metadata.get(words.MISSION_ID, ''), metadata.get(words.RUN_ID, ''))
             if not any(name.startswith(self.mission) for name in names):
                 return False
-        if self.near is not None and not _is_near(metadata.get(words.POSE, ''), *self.near):
+        is_near = self.near is None or _is_near(metadata.get(words.POSE, ''), *self.near)
+        if not is_near or not (self.near_gps is None or _is_near_on_earth(metadata.get(words.GPS, ''), self.near_gps)):
             return False
         if not self.keys and not self.patterns:
             return True
@@ -327,7 +332,7 @@ def read_entry(robot: str, entry: Any) -> PullRequest | PullCancel:
 
 
 def _read_want(said: Any) -> KeptFilter:
-    if not isinstance(said, dict) or not set(said) <= {*_WORDS, 'since_ns', 'until_ns', 'near', 'keys'} or not said:
+    if not isinstance(said, dict) or not set(said) <= {*_WORDS, 'since_ns', 'until_ns', 'near', 'near_gps', 'keys'} or not said:
         raise RequestRefused('fields', 'want is not an object of known fields')
     for name in _WORDS:
         if name in said and not (isinstance(said[name], str) and 0 < len(said[name]) <= _MAX_WORD and said[name].isprintable()):
@@ -343,13 +348,14 @@ def _read_want(said: Any) -> KeptFilter:
         or sum(map(_is_wild, keys)) > MAX_WILD
     ):
         raise RequestRefused('keys', f'keys are not at most {MAX_KEYS} keys, {MAX_WILD} of them patterns')
-    near = said.get('near')
+    near, on_earth = said.get('near'), said.get('near_gps')
     if near is not None and not _is_circle(near):
         raise RequestRefused('near', 'near is not x, y and a radius in meters')
+    if on_earth is not None and not (_is_circle(on_earth) and earth.is_place(*on_earth[:2])):
+        raise RequestRefused('near_gps', 'near_gps is not latitude, longitude and a radius in meters')
     given = {name: said[name] for name in (*_WORDS, 'since_ns', 'until_ns') if name in said}
-    circle = None if near is None else (near[0], near[1], near[2])
     return KeptFilter(
-        **given, near=circle, keys=frozenset(key for key in keys if not _is_wild(key)),
+        **given, near=_triple(near), near_gps=_triple(on_earth), keys=frozenset(key for key in keys if not _is_wild(key)),
         patterns=tuple(key for key in keys if _is_wild(key)),
     )  # fmt: skip
 
@@ -357,6 +363,10 @@ def _read_want(said: Any) -> KeptFilter:
 def _is_circle(near: Any) -> bool:
     numbers = isinstance(near, list) and len(near) == 3 and all(type(one) in {int, float} for one in near)
     return numbers and all(abs(one) < 1e9 and math.isfinite(one) for one in near) and near[2] > 0
+
+
+def _triple(circle: Any) -> tuple[float, float, float] | None:
+    return None if circle is None else (circle[0], circle[1], circle[2])
 
 
 def _is_pattern(pattern: Any) -> bool:
@@ -392,6 +402,15 @@ def _is_near(pose: str, x: float, y: float, radius: float) -> bool:
     except ValueError:
         return False
     return math.hypot(east - x, north - y) <= radius
+
+
+def _is_near_on_earth(fix: str, circle: tuple[float, float, float]) -> bool:
+    latitude, longitude, radius = circle
+    try:
+        north, east = (float(part) for part in fix.split(' ')[:2])
+    except ValueError:
+        return False
+    return earth.is_within(north, east, latitude, longitude, radius)
 
 
 def _check_time(name: str, stamp_ns: Any) -> None:

@@ -22,6 +22,8 @@ RUN_ID: Final = 'run_id'
 FRAME_ID: Final = 'frame_id'
 POSE: Final = 'pose'
 """``x y yaw frame``, as in ``3.214 -1.502 0.7854 odom``."""
+GPS: Final = 'gps'
+"""``latitude longitude altitude``, as in ``48.1351000 11.5820000 519.00``: degrees and meters (WGS 84)."""
 BATTERY: Final = 'battery_pct'
 
 # Its time, by both clocks, and how well it is known.

@@ -197,11 +197,18 @@ class MissionSettings:
     join: bool = _setting(True, "Log the robot's state to the mission's run in addition to what the agent logs.")
     period_s: float = _setting(1.0, 'Seconds between two points of a metric.', low=0.01, high=3600.0)
     battery: str = _setting(
-        'lowstate:bms_state.soc|battery_state:percentage',
-        'Topic and field of battery_pct, alternatives separated by | (the first that is published); empty for none.',
+        'lowstate:bms_state.soc|battery_state:percentage|sensor_msgs/msg/BatteryState:percentage|unitree_hg/msg/BmsState:soc',
+        'Topic or message type, and field, of battery_pct; alternatives separated by | (the first that is published); empty for '
+        'none.',
     )
-    temperature: str = _setting('imu:temperature', 'Topic and field of temperature_c; empty for none.')
-    odometry: str = _setting('odom', 'Topic (nav_msgs/Odometry) of pose, trajectory and distance; empty for none.')
+    temperature: str = _setting(
+        'go2_interfaces/msg/IMU:temperature|unitree_go/msg/LowState:imu_state.temperature|sensor_msgs/msg/Temperature:temperature',
+        'The same of temperature_c.',
+    )
+    odometry: str = _setting(
+        'odom|nav_msgs/msg/Odometry',
+        'Topic or message type of pose, trajectory and distance; alternatives separated by |; empty for none.',
+    )
     frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')
     frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
 

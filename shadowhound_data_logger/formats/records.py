@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc
 
 ODOMETRY: Final = 'nav_msgs/msg/Odometry'
+TRANSFORMS: Final = 'tf2_msgs/msg/TFMessage'
+FIX: Final = 'sensor_msgs/msg/NavSatFix'
 NON_FINITE: Final = 'non_finite'
 _TAKEN: Final = frozenset({'stamp_ns', NON_FINITE})
 _TAKEN_ALONE: Final = _TAKEN | {'robot', 'sensor', 'topic', 'type', 'timestamp'}

@@ -35,7 +35,7 @@ from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES
 from shadowhound_data_logger.formats.rows import gaps as journal
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row
+from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row, place_of
 from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.lake import labels, pull
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
@@ -69,7 +69,7 @@ DAY_NS: Final = 24 * HOUR_NS
 _RULE: Final = re.compile(r'([A-Za-z0-9][\w-]*)\s+(\S+)', re.ASCII)
 _DATE: Final = re.compile(r'(?<!\d)20\d{6}(?!\d)', re.ASCII)
 _COLUMNS: Final = ('robot', 'sensor', 'topic', 'bucket', 'key', 'bytes', 't_start', 't_start_ns', 't_end_ns', 'count',
-                   'mission_id', 'run_id', 'mission_type', 'x', 'y')  # fmt: skip
+                   'mission_id', 'run_id', 'mission_type', 'x', 'y', 'latitude', 'longitude')  # fmt: skip
 
 
 class RetentionRule(NamedTuple):
@@ -147,8 +147,7 @@ class Protection:
         if (label := self._keys.get(name) or self._label_of(row)) is not None:
             return LABEL, label
         metadata = {word: row[word] for word in (words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if row[word] is not None}
-        if row['x'] is not None and row['y'] is not None:
-            metadata[words.POSE] = f'{row["x"]} {row["y"]} 0 odom'
+        metadata |= place_of(row)
         begin_ns, end_ns = row['t_start_ns'], _end_ns(row)
         for request, want in self._requests.get(row['robot'], ()):
             if want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, end_ns, metadata):

@@ -45,7 +45,7 @@ from shadowhound_data_logger.core.model import ON_ROBOT, SpooledObject
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.core.untrusted import from_json, visible
-from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS
+from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS, place_of
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import robots
@@ -69,7 +69,7 @@ MOST_ANSWER_BYTES: Final = 1 << 20
 LOOK_S: Final = 2.0
 LOOKS: Final = 90
 """For the rows of what the robot sent."""
-_OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'mission', 'mission_type')
+_OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'near_gps', 'mission', 'mission_type')
 """Flags that a request can have; the others select among what the robot sent."""
 _DAY_NS: Final = 24 * 3600 * 10**9
 
@@ -112,8 +112,7 @@ def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> p
 def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:
     """Whether a filter selects an object, by its row."""
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
-    if row['x'] is not None and row['y'] is not None:
-        metadata['pose'] = f'{row["x"]} {row["y"]} 0 odom'
+    metadata |= place_of(row)
     begin_ns = row['t_start_ns'] or 0
     return want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, row['t_end_ns'] or begin_ns, metadata)
 
@@ -224,7 +223,8 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
           say: Callable[[str], None] = lambda _: None, findings: Findings | None = None) -> int:  # fmt: skip
     """Request what every robot keeps of these sensors (None: all but bags), and wait until the store has it.
 
-    ``flags`` are those of a query; ``near`` applies only to the first of the sensors, because few others have a place. Returns
+    ``flags`` are those of a query; ``near`` and ``near_gps`` apply only to the first of the sensors, because few others
+    have a place. Returns
     the number of requested objects. Raises LakeError if a robot refuses or a request expires, SettingError, StoreError.
     """
     asked = wanted(time.time_ns(), **{name: flags[name] for name in _OF_ROBOT if flags.get(name) is not None})
@@ -239,8 +239,9 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
             there = {row['sensor'] for row in rows}
             for sensor in sorted(there) if sensors is None else sensors:
                 if sensor in there and sensor != BAG_SENSOR:
-                    near = asked.near if sensors is not None and sensor == next(iter(sensors)) else None
-                    of_it = replace(want, sensor=sensor, near=near)
+                    is_first = sensors is not None and sensor == next(iter(sensors))
+                    near, near_gps = (asked.near, asked.near_gps) if is_first else (None, None)
+                    of_it = replace(want, sensor=sensor, near=near, near_gps=near_gps)
                     found = [row for row in rows if takes(of_it, row)]
                     requests.append((ask(store, source, robot, of_it, by=requester()), found))
                     total += len(found)

@@ -5,6 +5,7 @@ The engine is that of the tables (lake/tables.py): only the selected rows and co
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake import QueryBuilder
 
+from shadowhound_data_logger.core import earth
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError, PolicyRefused, StoreError
 from shadowhound_data_logger.core.keys import is_name
@@ -66,7 +68,7 @@ _MISSIONS: Final = re.compile(r'\bmissions\b', re.IGNORECASE)
 _LABELS: Final = re.compile(r'\blabels\b', re.IGNORECASE)
 _FORGOTTEN: Final = re.compile(r'\bforgotten\b', re.IGNORECASE)
 _GAPS: Final = re.compile(r'\b(gaps|watermarks)\b', re.IGNORECASE)
-_OF_OBJECTS: Final = ('near', 'mission_type', 'success', 'policy', 'where', 'label')
+_OF_OBJECTS: Final = ('near', 'near_gps', 'mission_type', 'success', 'policy', 'where', 'label')
 """Flags that do not apply to gaps."""
 _UNSEEN: Final = {'what', 'id', 'revision', 'received', 'skipped', 'format_version'}
 _GAP_COLUMNS: Final = [name for name in GAPS.columns if name not in _UNSEEN]
@@ -139,8 +141,9 @@ def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLU
         distinct: without repeated rows.
         as_of: answer from the tables as they were at that time.
         findings: receives invalid rows and files, which are skipped; by default they are logged.
-        flags: what to select, as in ``shadowhound-data query``: ``sensor topic robot since until near mission mission_type
-            success policy label where by``, such as ``since='2h'``, ``near=(3.2, 1.5, 2)``, ``where='battery_pct < 30'``.
+        flags: what to select, as in ``shadowhound-data query``: ``sensor topic robot since until near near_gps mission
+            mission_type success policy label where by``, such as ``since='2h'``, ``near=(3.2, 1.5, 2)``, or
+            ``where='battery_pct < 30'``.
 
     Returns:
         An Arrow table; ``.to_pandas()`` makes a DataFrame of it.
@@ -328,8 +331,22 @@ def _conditions(asked: Wanted) -> Iterator[str]:
             yield f'{name} BETWEEN {middle - radius!r} AND {middle + radius!r}'
         east, north = f'(x - {x!r})', f'(y - {y!r})'
         yield f'{east} * {east} + {north} * {north} <= {radius * radius!r}'
+    if asked.near_gps is not None:
+        yield from _on_earth(*asked.near_gps)
     if asked.where is not None:
         yield f'({asked.where}\n)'  # a comment at its end must not hide the parenthesis
+
+
+def _on_earth(latitude: float, longitude: float, radius: float) -> Iterator[str]:
+    """``earth.is_within`` in SQL."""
+    around = min(radius / earth.RADIUS_M, math.pi)
+    degrees = math.degrees(around) + 1e-6
+    yield f'latitude BETWEEN {latitude - degrees!r} AND {latitude + degrees!r}'  # first: by statistics, files can be skipped
+    north, east = (
+        f'sin(radians({name} - {middle!r}) / 2)' for name, middle in (('latitude', latitude), ('longitude', longitude))
+    )
+    parallel = f'{math.cos(math.radians(latitude))!r} * cos(radians(latitude))'
+    yield f'{north} * {north} + {parallel} * {east} * {east} <= {earth.haversine(around) + earth.TOLERANCE!r}'
 
 
 def _missions(lake: _Asked, asked: Wanted) -> pa.Table:

@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
+from shadowhound_data_logger.core.earth import is_place
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS
 from shadowhound_data_logger.core.times import moment
@@ -53,7 +54,9 @@ class Wanted:
     until_ns: int | None = None
     """Exclusive."""
     near: tuple[float, float, float] | None = None
-    """x, y and radius in meters, in the odometry frame."""
+    """x, y and radius in meters, in the frame of the pose."""
+    near_gps: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees (WGS 84), and radius in meters."""
     mission: str | None = None
     """The start of the id of a mission or of its run."""
     mission_type: str | None = None
@@ -99,6 +102,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
     topic: str | None = None, mission: str | None = None, mission_type: str | None = None, success: bool | None = None,
     where: str | None = None, ranges: Sequence[Mapping[str, Any]] | None = None,
     label: str | None = None, policy: str | None = None, by: str = BY_STAMP,
+    near_gps: tuple[float, float, float] | str | None = None,
 ) -> Wanted:  # fmt: skip
     """The query with these flags. Raises SettingError for an invalid flag.
 
@@ -110,7 +114,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
         robot=robot, sensor=sensor, topic=topic, mission=mission, mission_type=mission_type, success=success, where=where,
         label=label, policy=policy, since_ns=None if since is None else moment('since', since, now_ns),
         until_ns=None if until is None else moment('until', until, now_ns),
-        near=None if near is None else _circle(near), by=by,
+        near=None if near is None else _circle(near), near_gps=None if near_gps is None else _circle_on_earth(near_gps), by=by,
     )  # fmt: skip
     return asked if ranges is None else within(asked, spans_of(ranges))
 
@@ -150,15 +154,23 @@ def within(asked: Wanted, spans: Iterable[TimeSpan], keys: Iterable[tuple[str, s
     )  # fmt: skip
 
 
-def _circle(given: tuple[float, float, float] | str) -> tuple[float, float, float]:
-    allowed = 'x, y and a radius in metres, such as 3.2,1.5,2'
+def _circle(given: tuple[float, float, float] | str, name: str = 'near',
+            allowed: str = 'x, y and a radius in meters, such as 3.2,1.5,2') -> tuple[float, float, float]:  # fmt: skip
     try:
         x, y, radius = (float(part) for part in (given.split(',') if isinstance(given, str) else given))
     except (ValueError, TypeError):
-        raise SettingError('near', given, allowed) from None
+        raise SettingError(name, given, allowed) from None
     if not all(map(math.isfinite, (x, y, radius))) or radius <= 0:
-        raise SettingError('near', given, allowed)
+        raise SettingError(name, given, allowed)
     return x, y, radius
+
+
+def _circle_on_earth(given: tuple[float, float, float] | str) -> tuple[float, float, float]:
+    allowed = 'latitude, longitude and a radius in meters, such as 48.1351,11.5820,50'
+    latitude, longitude, radius = _circle(given, 'near_gps', allowed)
+    if not is_place(latitude, longitude):
+        raise SettingError('near_gps', given, f'{allowed}: at most 90 and 180 degrees')
+    return latitude, longitude, radius
 
 
 def date_of(stamp_ns: int) -> str:

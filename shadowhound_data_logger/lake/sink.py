@@ -80,12 +80,14 @@ _OF_TYPE: Final = (
     (_DATE, 'time t_start t_end t_from t_to since until made started ended forgotten'),
     ({'type': 'long'}, 'bytes t_start_ns t_end_ns count clock_offset_ns revision session from_ns to_ns merged received skipped'),
     ({'type': 'long'}, 'received_from_ns received_to_ns since_ns until_ns made_ns received_start_ns received_end_ns by_arrival'),
-    ({'type': 'double'}, 'x y yaw battery_pct width height distance_m duration_s battery_consumed_pct'),
+    ({'type': 'double'}, 'x y yaw latitude longitude altitude battery_pct width height distance_m duration_s'),
+    ({'type': 'double'}, 'battery_consumed_pct'),
+    ({'type': 'geo_point'}, 'location'),
     (_WORDS, 'command title text note'),
     ({'type': 'boolean'}, 'success'),
 )  # fmt: skip
 _FIELDS: Final = {name: mapping for mapping, names in _OF_TYPE for name in names.split()}
-"""Field -> its mapping. ``x y`` are meters in the odometry frame, not a place on Earth."""
+"""Field -> its mapping. ``x y`` are meters in the frame of the pose; the place on Earth is ``location``."""
 _SUMMARY: Final = ('mission_type', 'result', 'success', 'distance_m', 'duration_s', 'battery_consumed_pct', 'policy')
 ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS = 'objects', 'gaps', 'missions', 'events', 'labels'
 INDEXES: Final = (ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS)
@@ -270,13 +272,16 @@ def of_object(row: Mapping[str, Any]) -> SinkDocument:
         found |= {'time': _iso(row['t_start_ns']), 't_start': _iso(row['t_start_ns']), 't_end': _iso(row['t_end_ns'])}
     if row['x'] is not None and row['y'] is not None:
         found['position'] = {'x': row['x'], 'y': row['y']}
+    if row['latitude'] is not None and row['longitude'] is not None:
+        found['location'] = {'lat': row['latitude'], 'lon': row['longitude']}
     return SinkDocument(ROWS, _digest(row['bucket'], row['key'], row['t_start_ns']), found)
 
 
 def of_forgotten(row: Mapping[str, Any]) -> SinkDocument:
     """Of an object that ``lake prune`` deleted: its document is kept, with the time and the rule."""
-    document = of_object({**row, 'x': None, 'y': None})
-    fields = {name: value for name, value in document.fields.items() if name not in {'x', 'y', 'forgotten_ns'}}
+    document = of_object({**row, 'x': None, 'y': None, 'latitude': None, 'longitude': None})
+    unknown = {'x', 'y', 'latitude', 'longitude', 'forgotten_ns'}
+    fields = {name: value for name, value in document.fields.items() if name not in unknown}
     return document._replace(fields={**fields, 'forgotten': _iso(row['forgotten_ns'])}, is_update=True)
 
 

@@ -70,7 +70,7 @@ _SEEN: Final = ('sensor', 'topic', 't_start_ns', 't_end_ns')
 """The columns that decide which objects are examined."""
 _OBJECT: Final = (*_SEEN, 'count', 'bucket', 'key')
 _STATISTIC: Final = ('t_start_ns', 'field', *NUMBERS)
-_BY_QUERY: Final = ('near', 'mission', 'mission_type', 'success', 'policy', 'where')
+_BY_QUERY: Final = ('near', 'near_gps', 'mission', 'mission_type', 'success', 'policy', 'where')
 """Flags of `query`."""
 MAX_NAMED_TIMES: Final = 5000
 """In a query in SQL; of more, all rows between the first and the last are read."""

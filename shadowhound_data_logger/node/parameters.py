@@ -12,7 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from shadowhound_data_logger.core.config import NOT_SETTINGS, Settings, fields_of
+from shadowhound_data_logger.core.config import NOT_SETTINGS, Settings, fields_of, is_type
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import GROUPS
@@ -173,7 +173,7 @@ def _check_topics(node: Node, settings: Settings) -> None:
     owners: dict[str, str] = {}
     mission = settings.mission
     for name, given in (('odometry', mission.odometry), ('battery', mission.battery), ('temperature', mission.temperature)):
-        for topic, _ in fields_of(given):
+        for topic in (source for source, _ in fields_of(given) if not is_type(source)):
             _resolve(node, f'mission.{name}', topic, given)
     for topic in settings.events.topics:
         if topic:

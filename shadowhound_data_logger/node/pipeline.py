@@ -147,7 +147,7 @@ class Pipeline:
         bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         stamps = StampRule(self._clock, round(settings.clock.max_offset_s * SECOND))
-        track = RobotTrack(settings.mission, types, node.resolve_topic_name)
+        track = RobotTrack(settings.mission, types, node.resolve_topic_name, node.get_namespace().rpartition('/')[2])
         self._rules = UploadRules(node, settings, types, self._clock, self._active_mission)
         self.uploader.wait_for(self._rules.closed)
         self._make_request_server(track)
@@ -160,9 +160,10 @@ class Pipeline:
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
         named = [node.resolve_topic_name(topic) for sensor in settings.sensors for topic in sensor.topics]
         found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
-        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=[track.odometry], found=found)
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.is_place, found=found)
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
-        observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks)
+        observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks,
+                                   track.place)  # fmt: skip
         self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
         keeping = Keeping(settings.keep, sensors, settings.robot)
         marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark

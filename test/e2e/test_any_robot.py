@@ -87,6 +87,8 @@ def test_everything_is_stored_by_its_type(node: Node, stored: Callable[..., Obje
     }  # fmt: skip
     charges = {info.metadata.get('battery_pct') for key, info in objects.infos.items() if key.split('/')[1] == 'tb4_scan'}
     assert '50' in charges, 'BatteryState says 0.5'
+    places = {info.metadata.get('gps') for key, info in objects.infos.items() if key.split('/')[1] == 'tb4_scan'}
+    assert '48.0000000 11.0000000 0.00' in places
     assert len(objects.samples('imu')) == 50 * SECONDS
     assert len(objects.samples('tb4_scan')) == 10 * SECONDS
     assert {key.rpartition('.')[2] for key in objects.sensor('tb4_front_image_raw')} == {'jpg'}

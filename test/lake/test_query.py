@@ -17,6 +17,7 @@ from lake.making import DAY_NS, FAILED, FINISHED, NOON_NS, Watched, add, add_par
 from policies.models import Spark
 
 from shadowhound_data_logger import lake
+from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import CredentialsRejected, LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
@@ -73,6 +74,32 @@ def test_flags_mean_what_they_say(
     expected = keys([row for row in rows if holds(row)])
     assert found(Bucket(settings, schema.BUCKET), **flags) == expected
     assert bool(expected) != (flags == {'robot': 'tachi'}), 'a question that nothing answers proves nothing'
+
+
+@pytest.mark.parametrize(
+    ('near', 'numbers'),
+    [
+        ('48.1351,11.582,30', [0, 1]), ((48.1351, 11.582, 120.0), [0, 1, 2]), ((0.0, 180.0, 100.0), [3, 4]),
+        ((0.0, -180.0, 100.0), [3, 4]), ((0.0, -179.9995, 60.0), [4]), ((90.0, 77.0, 100.0), [5, 6]),
+        ((89.9995, 0.0, 120.0), [5, 6]),        ((-90.0, 0.0, 2.1e7), [0, 1, 2, 3, 4, 5, 6]),
+    ],
+)  # fmt: skip
+def test_near_a_place_on_earth(tmp_path: Path, near: Any, numbers: list[int]) -> None:
+    """Around a town, across the antimeridian and around the pole; what has no place is nowhere."""
+    places = ['48.1351 11.582 500', '48.1352 11.582 500', '48.1361 11.582 500', '0 179.9995 0', '0 -179.9995 nan', '89.9995 0 0',
+              '89.9995 180 0', None]  # fmt: skip
+    settings = folder_store(tmp_path)
+    rows = [row('camera', NOON_NS + number * SECOND, **({'gps': gps} if gps else {})) for number, gps in enumerate(places)]
+    with closing(open_store(settings, UploadSettings())) as store:
+        add_part(store, rows, '20261028T120000_boot', tmp_path / 'tmp')
+    assert found(Bucket(settings, schema.BUCKET), near_gps=near) == keys([rows[number] for number in numbers])
+
+
+@pytest.mark.parametrize('near', ['1,2', '91,0,5', '0,181,5', '0,0,0', '0,0,nan', 'a,b,c', (0.0, 0.0)])
+def test_what_is_no_place_on_earth(world: tuple[StoreSettings, list[schema.Row]], near: Any) -> None:
+    """It is refused, with what would be one."""
+    with pytest.raises(SettingError, match='near_gps'):
+        found(Bucket(world[0], schema.BUCKET), near_gps=near)
 
 
 def test_by_received_a_time_is_that_of_the_arrival(tmp_path: Path) -> None:

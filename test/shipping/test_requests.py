@@ -65,13 +65,15 @@ def test_asking_twice_is_asking_once(desk: Desk) -> None:
 
 
 @pytest.mark.parametrize(('want', 'numbers'), [
-    ({'near': (3.0, 0.5, 1.2)}, [3, 4]), ({'near': (3.0, 0.0, 1.0)}, [2, 3, 4]), ({'topic': '/lidar'}, []),
+    ({'near': (3.0, 0.5, 1.2)}, [3, 4]), ({'near': (3.0, 0.0, 1.0)}, [2, 3, 4]),
+    ({'near_gps': (0.0, 180.0, 150.0)}, [1, 2]), ({'topic': '/lidar'}, []),
     ({'mission': 'patrol'}, [7]), ({'mission_type': 'patrol'}, [7]), ({'patterns': ('thor/camera/*/00000?_*',)}, list(range(8))),
     ({'keys': frozenset({'thor/camera/20251018/000005_front.jpg'})}, [5]),
 ])  # fmt: skip
 def test_a_request_chooses(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
     """All that is given must hold."""
-    desk.keeps(*(frame(number, metadata={words.MISSION_ID: 'patrol_1', words.MISSION_TYPE: 'patrol'} if number == 7 else {})
+    desk.keeps(*(frame(number, metadata={words.MISSION_ID: 'patrol_1', words.MISSION_TYPE: 'patrol'} if number == 7 else
+                       {words.GPS: f'0 {179.999 if number == 1 else -179.999} 0'} if number in {1, 2} else {})
                  for number in range(8)))  # fmt: skip
     if want == {'near': (3.0, 0.5, 1.2)}:
         numbers = [2, 3, 4]
@@ -203,6 +205,7 @@ def test_a_hostile_mailbox_is_refused(desk: Desk) -> None:
         ('keys', {**good, 'want': {'keys': ['[a-z]']}}),
         ('keys', {**good, 'want': {'keys': ['a*'] * 17}}), ('near', {**good, 'want': {'near': [float('nan'), 0, 1]}}),
         ('want', {**good, 'want': {'sensor': 'x' * 257}}), ('near', {**good, 'want': {'near': [1, 2]}}),
+        ('near_gps', {**good, 'want': {'near_gps': [91, 0, 1]}}), ('near_gps', {**good, 'want': {'near_gps': 'here'}}),
     ]  # fmt: skip
     for _, entry in bad:
         desk.write(json.dumps({'format': 1, 'entries': [entry]}).encode())

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
+from shadowhound_data_logger.core.earth import is_place
 
 STRING, INT32, INT64, DOUBLE, TIME = 'string', 'int32', 'int64', 'double', 'time'
 """Kinds of columns. ``TIME`` is whole microseconds since 1970, UTC."""
@@ -54,14 +55,18 @@ COLUMNS: Final[Mapping[str, str]] = {
     'received_start_ns': INT64,
     'received_end_ns': INT64,
     'by_arrival': INT64,
+    'latitude': DOUBLE,
+    'longitude': DOUBLE,
+    'altitude': DOUBLE,
 }
 """Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are never null; others are null if unknown.
 
 Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact times are also there as int64.
-``x y yaw`` are meters and radians (REP-103) in the odometry's frame ``pose_frame``, at the object's time: ``t_start`` of a single
-message, the middle of a batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date:
-``t_start`` and ``t_end`` are null, the ns count from the robot's boot, and the file is below ``date=1970-01-01``. With
-``set_later``, ``clock_offset_ns`` must be added to the times in the content. ``received_*`` is when its messages arrived;
+``x y yaw`` are meters and radians (REP-103) in the frame ``pose_frame``, the map or that of the odometry, and ``latitude
+longitude altitude`` are degrees and meters (WGS 84), at the object's time: ``t_start`` of a single message, the middle of a
+batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date: ``t_start`` and ``t_end``
+are null, the ns count from the robot's boot, and the file is below ``date=1970-01-01``. With ``set_later``, ``clock_offset_ns``
+must be added to the times in the content. ``received_*`` is when its messages arrived;
 ``by_arrival`` of them are dated by that, because their stamps were not trusted.
 """
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
@@ -160,6 +165,9 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
     pose = metadata.get(words.POSE, '').split(' ')
     x, y, yaw = (_number(value) for value in (pose[:3] if len(pose) == 4 else ('', '', '')))
     known = None not in (x, y, yaw)
+    fix = metadata.get(words.GPS, '').split(' ')
+    latitude, longitude, altitude = (_number(value) for value in (fix if len(fix) == 3 else ('', '', '')))
+    on_earth = latitude is not None and longitude is not None and is_place(latitude, longitude)
     return {
         'robot': (parts[0] if len(parts) > 1 else metadata.get(words.ROBOT)) or None,
         'sensor': metadata.get(words.SENSOR) or (parts[1] if len(parts) > 2 else None),
@@ -189,7 +197,20 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
         'received_start_ns': _int(metadata, words.RECEIVED_START_NS),
         'received_end_ns': _int(metadata, words.RECEIVED_END_NS),
         'by_arrival': _int(metadata, words.BY_ARRIVAL),
+        'latitude': latitude if on_earth else None,
+        'longitude': longitude if on_earth else None,
+        'altitude': altitude if on_earth else None,
     }
+
+
+def place_of(row: Mapping[str, Any]) -> dict[str, str]:
+    """Where the robot was, as the metadata of the object have it; without what is unknown."""
+    found = {}
+    if row['x'] is not None and row['y'] is not None:
+        found[words.POSE] = f'{row["x"]} {row["y"]} 0 odom'
+    if row['latitude'] is not None and row['longitude'] is not None:
+        found[words.GPS] = f'{row["latitude"]} {row["longitude"]} 0'
+    return found
 
 
 def _micros(stamp_ns: int | None) -> int | None:

@@ -1,53 +1,50 @@
 """Where the robot was, and how full its battery was, at the time of an object: read from the messages of the last minute.
 
-Some messages of the two topics are kept as they came; only those around an object's time are ever deserialized, by the encoder
-that asks.
+Some messages of odometry, tf, GPS and batteries are kept verbatim; only those around an object's time are ever deserialized, by
+the encoder that asks.
 """
 
 from __future__ import annotations
 
 import math
 import re
-import threading
-from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import MissionSettings, fields_of
+from shadowhound_data_logger.core.config import MissionSettings, SensorSettings
 from shadowhound_data_logger.core.errors import Rejected
-from shadowhound_data_logger.core.metadata_words import BATTERY, POSE
+from shadowhound_data_logger.core.metadata_words import BATTERY, GPS, POSE
 from shadowhound_data_logger.core.model import DataObject
-from shadowhound_data_logger.formats.records import ODOMETRY
+from shadowhound_data_logger.formats.records import FIX, ODOMETRY, TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.missions.odometer import Pose
+from shadowhound_data_logger.node.encoding.kept_messages import KeptMessages
+from shadowhound_data_logger.node.encoding.transforms import TransformTrack
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
-from shadowhound_data_logger.node.recording.mission_observer import battery_pct, yaw_of
+from shadowhound_data_logger.node.recording.mission_observer import Source, Sources, battery_pct, yaw_of
 
-SPAN_NS: Final = 60 * SECOND
-"""How far back is remembered: batches, queues and slow encoders ask late."""
 POSE_EVERY_NS: Final = SECOND // 10
 """Between two poses that are kept: a straight line instead of the tightest bend that a Go2 trots is then 2 mm off."""
 BATTERY_EVERY_NS: Final = 5 * SECOND
 BATTERY_AGE_NS: Final = 30 * SECOND
 """A charge of that age is still the robot's."""
+FIX_EVERY_NS: Final = SECOND // 10
+FIX_AGE_NS: Final = 2 * SECOND
+"""A fix of that age is still the robot's place: many receivers have one per second."""
+NO_FIX: Final = -1
+"""NavSatStatus.STATUS_NO_FIX; -2, the default since Jazzy, says nothing."""
 GAP_NS: Final = 3 * SECOND // 2
 """Over a longer silence nothing is interpolated."""
 AHEAD_NS: Final = SECOND // 4
 """For so long the robot is taken to go on as it did: objects are encoded before the next odometry has come."""
 AT_ONCE_NS: Final = SECOND // 20
 """For so long one pose alone holds, and the robot is taken to have gone as it does before the first of several."""
+MAX_TOPICS: Final = 16
+"""Of batteries, of odometry, of GPS: who publishes decides how many there are."""
 _NO_WORD: Final = re.compile(r'[^!-~]')
-
-
-@dataclass(slots=True)
-class _Kept:
-    """A message and, once somebody asked for it, what it says."""
-
-    stamp_ns: int
-    cdr: bytes
-    value: Any = None
 
 
 class _Pose(NamedTuple):
@@ -57,50 +54,10 @@ class _Pose(NamedTuple):
     frame: str
 
 
-class KeptMessages:
-    """Some messages of one topic and type: one each ``every_ns`` and the newest. One thread adds, any asks; ``_lock`` guards."""
-
-    def __init__(self, every_ns: int, type_name: str, read: Callable[[str, bytes], Any]) -> None:
-        """``read`` makes a value of a message; None where it says nothing."""
-        self._every_ns = every_ns
-        self.type = type_name
-        self._read = read
-        self._lock = threading.Lock()
-        self._stamps: list[int] = []
-        self._kept: list[_Kept] = []
-
-    def add(self, stamp_ns: int, cdr: bytes) -> None:
-        """A message, in the order of their times; after a step of the clock back the track starts again."""
-        with self._lock:
-            stamps, kept = self._stamps, self._kept
-            if stamps and stamp_ns <= stamps[-1]:
-                if stamps[-1] - stamp_ns < SECOND:
-                    return
-                stamps.clear()
-                kept.clear()
-            if len(stamps) > 1 and stamps[-1] - stamps[-2] < self._every_ns:
-                stamps[-1], kept[-1] = stamp_ns, _Kept(stamp_ns, cdr)
-                return
-            stamps.append(stamp_ns)
-            kept.append(_Kept(stamp_ns, cdr))
-            if stamp_ns - stamps[0] > 2 * SPAN_NS:
-                old = bisect_left(stamps, stamp_ns - SPAN_NS)
-                del stamps[:old], kept[:old]
-
-    def around(self, stamp_ns: int) -> list[tuple[int, Any]]:
-        """(time, value) of the two messages about a time; at an end of the track the last two, or the only one."""
-        with self._lock:
-            after = bisect_left(self._stamps, stamp_ns)
-            first = max(0, min(after - 1, len(self._stamps) - 2))
-            found = self._kept[first : first + 2]
-            if after == len(self._stamps) > 2 and self._stamps[-1] - self._stamps[-2] < self._every_ns // 2:
-                found[0] = self._kept[-3]  # too near one another to tell a speed
-        return [(kept.stamp_ns, value) for kept in found if (value := self._value(kept)) is not None]
-
-    def _value(self, kept: _Kept) -> Any:
-        if kept.value is None:
-            kept.value = self._read(self.type, kept.cdr)
-        return kept.value
+class _Fix(NamedTuple):
+    latitude: float
+    longitude: float
+    altitude: float
 
 
 class RobotTrack(Consumer):
@@ -109,34 +66,43 @@ class RobotTrack(Consumer):
     New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread.
     """
 
-    def __init__(self, settings: MissionSettings, types: MessageTypes, resolve: Callable[[str], str]) -> None:
-        """The topics are those of missions; ``resolve`` makes their full names."""
+    def __init__(self, settings: MissionSettings, types: MessageTypes, resolve: Callable[[str], str], robot: str = '') -> None:
+        """Odometry and batteries are those of missions; ``resolve`` makes full names, ``robot`` is the end of the namespace."""
         self._types = types
-        self.odometry = resolve(settings.odometry) if settings.odometry else ''
-        self._batteries = {resolve(topic): path for topic, path in fields_of(settings.battery)}
-        self._poses: KeptMessages | None = None
-        self._charges: dict[str, KeptMessages] = {}
-        """Topic of a battery -> its messages."""
+        self._odometry = Sources(settings.odometry, resolve)
+        self._battery = Sources(settings.battery, resolve)
+        self._transforms = TransformTrack(types, robot)
+        self._poses: list[tuple[Source, KeptMessages]] = []
+        self._charges: list[tuple[Source, KeptMessages]] = []
+        self._fixes: list[tuple[Source, KeptMessages]] = []
+        """The preferred source first. Replaced as a whole."""
+
+    def is_place(self, sensor: SensorSettings) -> bool:
+        """Whether its topics tell where the robot is: they are drained before those whose objects are marked with that."""
+        return any(name in {ODOMETRY, TRANSFORMS, FIX} for name in sensor.types)
 
     def take(self, drained: Drained) -> None:
+        if drained.type == TRANSFORMS:
+            for message in drained.messages:
+                self._transforms.add(drained.topic, message)
+            return
         kept = self.of(drained.topic, drained.type)
         if kept is not None:
             for message in drained.messages:
                 kept.add(message.stamp_ns, message.cdr)
 
     def of(self, topic: str, type_name: str) -> KeptMessages | None:
-        """Where messages of a topic are kept; None where nobody needs them."""
-        if topic == self.odometry and type_name == ODOMETRY:
-            if self._poses is None:
-                self._poses = KeptMessages(POSE_EVERY_NS, type_name, self._pose)
-            return self._poses
-        path = self._batteries.get(topic)
-        if path is None:
+        """Where messages of a topic are kept; None where they are not needed."""
+        if type_name == ODOMETRY and (source := self._odometry.find(topic, type_name)) is not None:
+            self._poses, kept = _added(self._poses, source, POSE_EVERY_NS, type_name, self._pose)
+        elif type_name == FIX:
+            self._fixes, kept = _added(self._fixes, Source(0, topic, []), FIX_EVERY_NS, type_name, self._fix)
+        elif (source := self._battery.find(topic, type_name)) is not None:
+            read = partial(self._charge, source.path)
+            self._charges, kept = _added(self._charges, source, BATTERY_EVERY_NS, type_name, read)
+        else:
             return None
-        charges = self._charges.get(topic)
-        if charges is None or charges.type != type_name:
-            charges = self._charges[topic] = KeptMessages(BATTERY_EVERY_NS, type_name, partial(self._charge, path))
-        return charges
+        return kept
 
     def mark(self, item: DataObject) -> DataObject:
         """The object with what is known of the middle of its time."""
@@ -144,17 +110,37 @@ class RobotTrack(Consumer):
         return replace(item, metadata={**item.metadata, **marks}) if marks else item
 
     def marks(self, stamp_ns: int) -> dict[str, str]:
-        """Pose and battery at a time, as metadata; without what is not known."""
+        """Pose, place on Earth and battery at a time, as metadata; without what is unknown."""
         marks: dict[str, str] = {}
-        found = self._poses.around(stamp_ns) if self._poses is not None else []
-        if found and (pose := _between(found, stamp_ns)) is not None:
+        if (pose := self._pose_at(stamp_ns)) is not None:
             marks[POSE] = f'{_plain(pose.x, 3)} {_plain(pose.y, 3)} {_plain(pose.yaw, 4)} {pose.frame}'
-        for charges in filter(None, map(self._charges.get, self._batteries)):
+        for _, fixes in self._fixes:
+            if (fix := _fix_at(fixes.around(stamp_ns), stamp_ns)) is not None:
+                marks[GPS] = f'{_plain(fix.latitude, 7)} {_plain(fix.longitude, 7)} {_plain(fix.altitude, 2)}'
+                break
+        for _, charges in self._charges:
             near = min(charges.around(stamp_ns), key=lambda found: abs(found[0] - stamp_ns), default=None)
             if near is not None and abs(near[0] - stamp_ns) <= BATTERY_AGE_NS:
                 marks[BATTERY] = f'{near[1]:g}'
                 break
         return marks
+
+    def place(self, stamp_ns: int) -> Pose | None:
+        """Where tf has the robot at a time, for missions of robots without odometry."""
+        placed = self._transforms.at(stamp_ns)
+        return None if placed is None else Pose(stamp_ns, placed.x, placed.y, placed.yaw, placed.z, placed.frame)
+
+    def _pose_at(self, stamp_ns: int) -> _Pose | None:
+        """In the map, else by the odometry, else by tf without a map."""
+        placed = self._transforms.at(stamp_ns)
+        of_tf = None if placed is None else _Pose(placed.x, placed.y, placed.yaw, _word(placed.frame))
+        if placed is not None and placed.is_map:
+            return of_tf
+        for _, poses in self._poses:
+            found = poses.around(stamp_ns)
+            if found and (pose := _between(found, stamp_ns)) is not None:
+                return pose
+        return of_tf
 
     def _pose(self, type_name: str, cdr: bytes) -> _Pose | None:
         try:
@@ -164,13 +150,37 @@ class RobotTrack(Consumer):
         at, yaw = message.pose.pose.position, yaw_of(message.pose.pose.orientation)
         if not all(map(math.isfinite, (at.x, at.y, yaw))):
             return None
-        return _Pose(at.x, at.y, yaw, _NO_WORD.sub('_', message.header.frame_id)[:64] or '_')
+        return _Pose(at.x, at.y, yaw, _word(message.header.frame_id))
+
+    def _fix(self, type_name: str, cdr: bytes) -> _Fix | None:
+        """None without a fix, and for what is no place on Earth."""
+        try:
+            message = self._types.deserialize(type_name, cdr)
+        except Rejected:
+            return None
+        latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
+        if message.status.status == NO_FIX or not (abs(latitude) <= 90 and abs(longitude) <= 180):
+            return None
+        return _Fix(latitude, longitude, altitude if math.isfinite(altitude) else math.nan)
 
     def _charge(self, path: list[str], type_name: str, cdr: bytes) -> float | None:
         try:
             return battery_pct(self._types.deserialize(type_name, cdr), path)
         except Rejected:
             return None
+
+
+def _added(known: list[tuple[Source, KeptMessages]], source: Source, every_ns: int, type_name: str,
+           read: Callable[[str, bytes], object]) -> tuple[list[tuple[Source, KeptMessages]], KeptMessages | None]:  # fmt: skip
+    """With the messages of a source, which are those of the topic while it has one type; None where there are too many topics."""
+    for of, kept in known:
+        if of.topic == source.topic and kept.type == type_name:
+            return known, kept
+    others = [each for each in known if each[0].topic != source.topic]
+    if len(others) >= MAX_TOPICS:
+        return known, None
+    made = KeptMessages(every_ns, type_name, read)
+    return sorted([*others, (source, made)], key=lambda each: each[0][:2]), made
 
 
 def _between(found: list[tuple[int, _Pose]], stamp_ns: int) -> _Pose | None:
@@ -187,3 +197,21 @@ def _between(found: list[tuple[int, _Pose]], stamp_ns: int) -> _Pose | None:
 
 def _plain(value: float, digits: int) -> str:
     return f'{round(value, digits) + 0.0:.{digits}f}'  # no -0.000
+
+
+def _fix_at(found: list[tuple[int, _Fix]], stamp_ns: int) -> _Fix | None:
+    """The place at a time between two fixes, straight on; otherwise that of the nearest one. Longitude takes the shorter way."""
+    if not found:
+        return None
+    (start_ns, a), (end_ns, b) = found[0], found[-1]
+    if not (0 < end_ns - start_ns <= 2 * FIX_AGE_NS and start_ns <= stamp_ns <= end_ns):
+        near_ns, near = min(found, key=lambda fix: abs(fix[0] - stamp_ns))
+        return near if abs(near_ns - stamp_ns) <= FIX_AGE_NS else None
+    part = (stamp_ns - start_ns) / (end_ns - start_ns)
+    turn = (b.longitude - a.longitude + 180) % 360 - 180
+    longitude = (a.longitude + part * turn + 180) % 360 - 180
+    return _Fix(a.latitude + part * (b.latitude - a.latitude), longitude, a.altitude + part * (b.altitude - a.altitude))
+
+
+def _word(frame: str) -> str:
+    return _NO_WORD.sub('_', frame)[:64] or '_'

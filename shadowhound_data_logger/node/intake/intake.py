@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Final
@@ -43,11 +43,11 @@ class Intake:
     """
 
     def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,  # noqa: PLR0913 - its neighbors
-                 stamps: StampRule, consumers: Sequence[Consumer], *, first: Collection[str] = (),
+                 stamps: StampRule, consumers: Sequence[Consumer], *, first: Callable[[SensorSettings], bool] = lambda _: False,
                  found: FoundTopics | None = None) -> None:  # fmt: skip
         """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
 
-        ``first`` are topics to be drained before all others; ``found`` finds sensors in the graph.
+        ``first`` selects sensors that are drained before all others; ``found`` finds sensors in the graph.
         """
         self._sensors = sensors
         self._consumers = consumers
@@ -55,7 +55,8 @@ class Intake:
         self._around = around = Surroundings(node, PolledGroup(), accounts, types, stamps)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
-        self._by_turn = sorted(self._subscribers, key=lambda subscriber: subscriber.topic not in first)
+        self._is_first = first
+        self._by_turn = self._in_turn()
         pairs = [pair for sensor in sensors.values() for pair in zip(sensor.topics, sensor.types, strict=False)]
         named = {node.resolve_topic_name(topic): name for topic, name in pairs if name and len(alternatives(name)) == 1}
         self._extra = [ExtraTopics(around, consumers[place:], named)
@@ -167,7 +168,10 @@ class Intake:
             subscriber = Subscriber(self._around, sensor, self._consumers, self._others)
             subscriber.paused = self.paused
             self._subscribers = (*self._subscribers, subscriber)
-            self._by_turn = [*self._by_turn, subscriber]
+            self._by_turn = self._in_turn()
+
+    def _in_turn(self) -> list[Subscriber]:
+        return sorted(self._subscribers, key=lambda subscriber: not self._is_first(subscriber.sensor))
 
     def _drain(self, now_s: float) -> None:
         _each([partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)])

@@ -9,17 +9,17 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.config import MissionSettings, SensorSettings, fields_of
+from shadowhound_data_logger.core.config import MissionSettings, SensorSettings, fields_of, is_type
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.core.options import POINT_CLOUD
 from shadowhound_data_logger.formats.image import encode_jpeg
 from shadowhound_data_logger.formats.payload import Job
 from shadowhound_data_logger.formats.pointcloud import xyz_of
-from shadowhound_data_logger.formats.records import ODOMETRY
+from shadowhound_data_logger.formats.records import ODOMETRY, TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions.node_log import Cloud, Frame, MissionFact, Reading
 from shadowhound_data_logger.missions.odometer import Pose
@@ -27,10 +27,39 @@ from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE
 
 log = logging.getLogger(__name__)
 
+POSE: Final = 'pose'
 JPEG: Final = 'image/jpeg'
 BATTERY_STATE: Final = 'sensor_msgs/msg/BatteryState'
 _ROUNDING: Final = 1e-6
 """Of a full battery in float32."""
+
+
+class Source(NamedTuple):
+    """A topic that gives a value."""
+
+    rank: int
+    """0 for the preferred one."""
+    topic: str
+    path: list[str]
+    """Of the field."""
+
+
+class Sources:
+    """Where a value comes from, by a mission's setting: alternatives that are topics, or message types for any topic of them."""
+
+    def __init__(self, given: str, resolve: Callable[[str], str]) -> None:
+        self._by_topic: dict[str, tuple[int, list[str]]] = {}
+        self._by_type: dict[str, tuple[int, list[str]]] = {}
+        for rank, (name, path) in enumerate(fields_of(given)):
+            if is_type(name):
+                self._by_type.setdefault(name, (rank, path))
+            else:
+                self._by_topic.setdefault(resolve(name), (rank, path))
+
+    def find(self, topic: str, type_name: str) -> Source | None:
+        """Of a topic (full name) with messages of a type; None where it gives no value."""
+        found = self._by_topic.get(topic) or self._by_type.get(type_name)
+        return None if found is None else Source(found[0], topic, found[1])
 
 
 class MissionObserver:
@@ -42,35 +71,36 @@ class MissionObserver:
     """
 
     def __init__(self, settings: MissionSettings, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
-                 resolve: Callable[[str], str], marks: Callable[[int], Mapping[str, str]] = lambda _: {}) -> None:  # fmt: skip
-        """``resolve`` makes a topic's full name, as the node's namespace and remappings want it."""
+                 resolve: Callable[[str], str], marks: Callable[[int], Mapping[str, str]] = lambda _: {},
+                 place: Callable[[int], Pose | None] = lambda _: None) -> None:  # fmt: skip
+        """``resolve`` makes a topic's full name, as the node's namespace and remappings want it.
+
+        ``marks`` and ``place`` are those of ``RobotTrack``.
+        """
         self._sensors = sensors
         self._robot = robot
         self._types = types
         self._period_ns = max(1, round(settings.period_s * SECOND))
         self._marks = marks
+        self._place = place
         self._frames = settings.frames
         self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
-        self._odometry = resolve(settings.odometry) if settings.odometry else ''
-        self._fields: dict[str, dict[str, list[str]]] = {}
-        self._choices: dict[str, list[str]] = {}
-        """Metric -> its topics, the preferred one first; without those after one that was heard."""
-        for key, given in ((BATTERY, settings.battery), (TEMPERATURE, settings.temperature)):
-            for topic, path in fields_of(given):
-                self._fields.setdefault(resolve(topic), {})[key] = path
-                self._choices.setdefault(key, []).append(resolve(topic))
+        self._odometry = Sources(settings.odometry, resolve)
+        self._fields = {BATTERY: Sources(settings.battery, resolve), TEMPERATURE: Sources(settings.temperature, resolve)}
+        self._chosen: dict[str, Source] = {}
+        """Metric -> the most preferred of its sources that was heard."""
         self._periods: dict[tuple[str, int], int] = {}
         self._told: set[str] = set()
 
     def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[MissionFact]:
         """What there is to log of a batch; ``item`` is the object that was made of it, None where there is none."""
         try:
-            if batch.topic == self._odometry and batch.type == ODOMETRY:
+            if batch.type == ODOMETRY and self._choose(POSE, self._odometry, batch):
                 yield from (self._pose(sample) for sample in batch.samples)
-            fields = {key: path for key, path in self._fields.get(batch.topic, {}).items() if batch.topic in self._choices[key]}
-            if fields:
-                for key in fields:
-                    self._choices[key] = self._choices[key][: self._choices[key].index(batch.topic) + 1]
+            elif batch.type == TRANSFORMS and POSE not in self._chosen:
+                yield from filter(None, (self._place(sample.stamp_ns) for sample in self._some(batch, SECOND // 10)))
+            chosen = {key: self._choose(key, sources, batch) for key, sources in self._fields.items()}
+            if fields := {key: source.path for key, source in chosen.items() if source is not None}:
                 for sample in self._some(batch, self._period_ns):
                     yield from self._readings(batch.type, sample, fields)
             if batch.type == POINT_CLOUD:
@@ -82,6 +112,14 @@ class MissionObserver:
                         yield Frame(sample.stamp_ns, picture, self._marks(sample.stamp_ns))
         except Rejected as error:
             self._tell(batch.topic, str(error))
+
+    def _choose(self, key: str, sources: Sources, batch: Batch) -> Source | None:
+        """The source that a batch is of, unless a preferred one was heard, or another topic of the same type."""
+        found, before = sources.find(batch.topic, batch.type), self._chosen.get(key)
+        if found is None or (before is not None and before.topic != found.topic and before.rank <= found.rank):
+            return None
+        self._chosen[key] = found
+        return found
 
     def _jpeg(self, batch: Batch, sample: Sample, item: DataObject | None) -> bytes | None:
         """The one that was just made of the message for the sensor's own object, else one of its own; None for no JPEG."""

@@ -18,7 +18,7 @@ TOLD = {
     'robot': 'thor', 'sensor': 'camera', 'topic': '/camera/compressed', 'type': 'sensor_msgs/msg/CompressedImage', 'count': '1',
     't_start_ns': str(NOON_NS + 7), 't_end_ns': str(NOON_NS + SECOND), 'sha256': 'ab' * 32, 'mission_id': 'patrol_1',
     'run_id': 'r1', 'mission_type': 'patrol', 'pose': '1.500 -2.000 0.7854 odom', 'battery_pct': '78', 'clock': 'set_later',
-    'clock_offset_ns': '-5',
+    'clock_offset_ns': '-5', 'gps': '-33.8568000 151.2153000 5.00',
 }  # fmt: skip
 
 
@@ -37,6 +37,7 @@ def test_a_row_has_all_that_the_object_says() -> None:
         'mission_id': 'patrol_1', 'run_id': 'r1', 'mission_type': 'patrol', 'x': 1.5, 'y': -2.0, 'yaw': 0.7854,
         'pose_frame': 'odom', 'battery_pct': 78.0, 'clock': 'set_later', 'clock_offset_ns': -5, 'content_type': 'image/jpeg',
         'format_version': 1, 'received_start_ns': None, 'received_end_ns': None, 'by_arrival': None,
+        'latitude': -33.8568, 'longitude': 151.2153, 'altitude': 5.0,
     }  # fmt: skip
 
 
@@ -53,6 +54,15 @@ def test_half_a_pose_is_none(pose: str) -> None:
     """Where any of it is missing or no number, all of it is null."""
     found = row({**TOLD, 'pose': pose})
     assert [found[name] for name in ('x', 'y', 'yaw', 'pose_frame')] == [None] * 4
+
+
+@pytest.mark.parametrize('gps', ['', '1 2', '91 2 3', '1 181 3', '1 nan 3', 'inf 2 3', '1 2 3 4', 'x 2 3'])
+def test_what_is_no_place_on_earth_is_none(gps: str) -> None:
+    """Whatever a foreign object says; a place whose altitude is unknown is one."""
+    found = row({**TOLD, 'gps': gps})
+    assert [found[name] for name in ('latitude', 'longitude', 'altitude')] == [None] * 3
+    found = row({**TOLD, 'gps': '1 2 nan'})
+    assert [found[name] for name in ('latitude', 'longitude', 'altitude')] == [1.0, 2.0, None]
 
 
 def test_a_time_since_boot_is_no_date() -> None:

@@ -16,7 +16,7 @@ from shadowhound_sim.patrol import Patrol
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import MissionSettings
 from shadowhound_data_logger.core.model import DataObject, Taken
-from shadowhound_data_logger.formats.records import ODOMETRY
+from shadowhound_data_logger.formats.records import FIX, ODOMETRY
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
 from shadowhound_data_logger.node.intake.consumers import Drained
@@ -159,8 +159,7 @@ def test_what_is_not_known_is_not_made_up(times: list[float], asked: float, know
 def test_the_track_is_a_minute_long() -> None:
     """What is older is forgotten, so that it does not grow; of fast odometry some messages are kept, of each second."""
     found = walking([(number / 200, odometry(number / 200, 0.0, 0.0)) for number in range(200 * 200)])
-    track = found._poses
-    assert track is not None
+    ((_, track),) = found._poses
     assert len(track._kept) == len(track._stamps) < 1500
     assert pose(found, 100.0) is None
     assert pose(found, 145.03) == pytest.approx((145.03, 0.0, 0.0), abs=1e-3)
@@ -199,6 +198,60 @@ def test_the_battery_is_the_nearest_one_known() -> None:
     assert told == [None, '80', '80', '79.5', '79.5', None]
 
 
+def test_any_battery_state_is_one_by_default() -> None:
+    """Whatever its topic; one of a preferred topic counts before it."""
+    found = robot(MissionSettings())
+    take(found, '/power/main', BATTERY_STATE, (0.0, battery_state(0.25)))
+    assert marked(found, 0.0)['battery_pct'] == '25'
+    take(found, '/battery_state', BATTERY_STATE, (0.0, battery_state(0.75)))
+    assert marked(found, 0.0)['battery_pct'] == '75'
+
+
+def test_any_odometry_is_one_by_default() -> None:
+    """Whatever its topic; ``odom`` counts before it."""
+    found = robot(MissionSettings())
+    take(found, '/wheels/odometry', ODOMETRY, (0.0, odometry(1, 2, 0)))
+    assert pose(found, 0.0) == (1.0, 2.0, 0.0)
+    take(found, '/odom', ODOMETRY, (0.0, odometry(3, 4, 0)))
+    assert pose(found, 0.0) == (3.0, 4.0, 0.0)
+
+
+def fix(latitude: float, longitude: float, altitude: float = 500.0, status: int = 0) -> bytes:
+    of = STORE.types
+    header = of['std_msgs/msg/Header'](of['builtin_interfaces/msg/Time'](0, 0), 'gps')
+    message = of[FIX](header, of['sensor_msgs/msg/NavSatStatus'](status, 1), latitude, longitude, altitude, np.zeros(9), 0)
+    return bytes(STORE.serialize_cdr(message, FIX))
+
+
+@pytest.mark.parametrize(
+    ('t', 'gps'),
+    [
+        (0.0, '10.0000000 20.0000000 500.00'), (0.25, '10.0000250 20.0000250 500.00'), (1.0, '10.0001000 20.0001000 500.00'),
+        (2.9, '10.0001000 20.0001000 500.00'), (3.1, None), (-2.1, None),
+    ],
+)  # fmt: skip
+def test_the_place_on_earth(t: float, gps: str | None) -> None:
+    """That of the fixes around it, or of one at most two seconds away."""
+    found = robot()
+    take(found, '/fix', FIX, (0.0, fix(10.0, 20.0)), (1.0, fix(10.0001, 20.0001, status=-2)))
+    assert marked(found, t).get('gps') == gps
+
+
+def test_across_the_antimeridian_is_no_way_around_earth() -> None:
+    """Between 179.9999 and -179.9999 lies 180."""
+    found = robot()
+    take(found, '/fix', FIX, (0.0, fix(0.0, 179.9999)), (1.0, fix(0.0, -179.9999)))
+    assert marked(found, 0.5)['gps'] == '0.0000000 -180.0000000 500.00'
+
+
+@pytest.mark.parametrize('cdr', [b'', fix(1.0, 1.0, status=-1), fix(math.nan, math.nan), fix(95.0, 0.0), fix(0.0, 200.0)])
+def test_what_is_no_fix_is_no_place(cdr: bytes) -> None:
+    """Without a fix, and for what is no place on Earth."""
+    found = robot()
+    take(found, '/fix', FIX, (0.0, cdr))
+    assert 'gps' not in marked(found, 0.0)
+
+
 @pytest.mark.parametrize(
     ('published', 'known'),
     [(0.73, '73'), (0.0, '0'), (1.0, '100'), (math.nan, None), (-1.0, None), (73.0, None)],
@@ -225,8 +278,6 @@ def test_only_what_is_asked_for_is_kept() -> None:
     nothing = robot(MissionSettings(battery='', odometry=''))
     assert nothing.of('/', ODOMETRY) is None
     assert marked(nothing, 0.0) == {}
-    assert not nothing.odometry
-    assert found.odometry == '/odom'
 
 
 def test_encoders_ask_while_the_intake_adds() -> None:
