@@ -138,7 +138,7 @@ def _statistics(store: ObjectStore, folder: Path, numbers: np.ndarray[Any, Any])
             collected.add(orjson.loads(body)['samples'])
             if field:
                 for name, value in zip(
-                    ('first', 'last', 'min', 'max', 'mean'), numbers_of(collected.told()[field]), strict=False
+                    ('first', 'last', 'min', 'max', 'mean'), numbers_of(collected.result()[field]), strict=False
                 ):
                     columns[name][place] = value
             else:

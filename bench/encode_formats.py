@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.core.config import SensorSettings, Settings
 from shadowhound_data_logger.core.model import Batch, Sample
-from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.types import MessageTypes
 
 INTERFACES = Path(__file__).parents[1] / 'interfaces' / 'go2_interfaces' / 'msg'

@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SensorSettings, Settings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample, SpooledObject
 from shadowhound_data_logger.core.stamps import StampRule
-from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.types import MessageTypes, header_stamp_ns
 from shadowhound_data_logger.node.intake.intake import until_poll
 from shadowhound_data_logger.node.intake.sampling import Batcher, KeepRule, rule_for

@@ -161,7 +161,7 @@ def _sensor(one: Heard, named: Mapping[str, tuple[SensorSettings, str, str]], gr
 
 
 def _stored_bytes(one: Heard, sensor: SensorSettings, robot: str, types: Any) -> float | None:
-    from shadowhound_data_logger.formats.registry import encode  # noqa: PLC0415 - numpy and encoders
+    from shadowhound_data_logger.formats.encoders import encode  # noqa: PLC0415 - numpy and encoders
 
     if not one.newest:
         return None

@@ -121,7 +121,7 @@ class DataObject:
     key_pattern: str | None = None
     """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
     statistics: bytes = b''
-    """Of the numbers in it, as ``encode.statistics.packed``; for the catalog."""
+    """Statistics of the numbers in it, for the catalog, as ``formats.statistics.pack_statistics`` returns them."""
     catalogs: tuple[int, ...] = ()
     """A part of the catalog: the ids of the objects that it has rows of. It is left out where another part has one of them."""
     tells: tuple[tuple[int, str], ...] = ()

@@ -1,1 +1,1 @@
-"""From samples to finished objects: one registry of formats, one file a format. Needs no ROS: definitions come as text."""
+"""Turns samples into objects: one file per format. Needs no ROS: message definitions are text."""

@@ -1,10 +1,10 @@
-"""All messages of a batch in one zip or tar: a file for each message, and beside it a JSON with what is known of it.
+"""All messages of a batch in one zip or tar: one file per message, and next to it a JSON that describes it.
 
-With ``dedup`` a file equal to the one before it is left out: its JSON stays, and ``repeat_of`` in it names the file.
+With ``dedup``, a file equal to the previous one is omitted: its JSON remains and names that file in ``repeat_of``.
 
-The names are WebDataset's: files of one sample share their name up to the first dot and follow each other
-(https://github.com/webdataset/webdataset). Here that name is the message's time in ns since 1970: samples are in the order of
-time, and unlike those of other objects, unless two publishers share a stamp. The same batch gives the same bytes.
+The layout is WebDataset's: files of one sample share their name up to the first dot and are adjacent
+(https://github.com/webdataset/webdataset). Here that name is the message's time in ns since 1970, so samples are sorted by time,
+and names differ between objects unless two publishers share a stamp. The same batch always gives the same bytes.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from shadowhound_data_logger.formats.pointcloud import encode_cloud
 from shadowhound_data_logger.formats.types import header_frame_id
 
 _ENCODE: Final[Mapping[str, OneMessage]] = {COMPRESSED_IMAGE: encode_jpeg, IMAGE: encode_jpeg, POINT_CLOUD: encode_cloud}
-"""Type -> what makes its file; every other type is stored as CDR."""
+"""Type -> encoder of its file; all other types are stored as CDR."""
 _MODE: Final = 0o644
 _DOS_YEARS: Final = (315_532_800, 4_354_819_198)
-"""Seconds since 1970 that a zip can express: 1980 to 2107."""
+"""First and last time that a zip can represent, in seconds since 1970: 1980 to 2107."""
 _USTAR_SECONDS: Final = 8**11 - 1
 """Eleven octal digits."""
 
@@ -55,7 +55,7 @@ class ArchiveFile(NamedTuple):
 
 
 def archive(pack: Callable[[Iterable[ArchiveFile]], bytes], ext: str, content_type: str) -> Encoder:
-    """An encoder that packs all messages of a batch; those that cannot be encoded are rejected, the rest goes on."""
+    """An encoder that packs all messages of a batch except those that cannot be encoded, which are rejected."""
 
     def encoder(job: Job, rejections: Rejections) -> Payload | None:
         encode = _ENCODE.get(job.batch.type, encode_cdr)
@@ -76,15 +76,15 @@ def archive(pack: Callable[[Iterable[ArchiveFile]], bytes], ext: str, content_ty
 
 
 def _members(job: Job, files: Sequence[Payload]) -> Iterator[ArchiveFile]:
-    """Each file and its JSON, in the order of time; a second message of the same time is numbered."""
-    same: Counter[int] = Counter()
+    """Each file and its JSON, sorted by time; further messages with the same time get a number."""
+    seen: Counter[int] = Counter()
     has_header = job.types.has_header(job.batch.type)
     last, last_name = b'', ''
     for file in _in_order(files):
         sample = file.kept[0]
         stamp_ns = sample.stamp_ns
-        name = f'{stamp_ns:019d}' + (f'_{same[stamp_ns]}' if same[stamp_ns] else '')
-        same[stamp_ns] += 1
+        name = f'{stamp_ns:019d}' + (f'_{seen[stamp_ns]}' if seen[stamp_ns] else '')
+        seen[stamp_ns] += 1
         described = _description(job, sample, file, has_header=has_header)
         if job.sensor.dedup and last_name and file.body == last:
             described |= {'repeat_of': last_name}
@@ -99,7 +99,7 @@ def _in_order(files: Sequence[Payload]) -> list[Payload]:
 
 
 def _repeats(files: Sequence[Payload]) -> int:
-    """How many files are equal to the one before."""
+    """The number of files that equal the previous one."""
     return sum(one.body == next_one.body for one, next_one in pairwise(_in_order(files)))
 
 
@@ -109,7 +109,7 @@ def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -
 
 
 def pack_tar(members: Iterable[ArchiveFile]) -> bytes:
-    """An uncompressed POSIX tar (ustar), which every reader knows; a file's time is its message's."""
+    """An uncompressed POSIX tar (ustar), which every reader supports; a file's time is its message's."""
     parts: list[bytes] = []
     for member in members:
         seconds = min(max(member.stamp_ns // SECOND, 0), _USTAR_SECONDS)
@@ -118,7 +118,7 @@ def pack_tar(members: Iterable[ArchiveFile]) -> bytes:
 
 
 def _header(name: str, size: int, seconds: int) -> bytes:
-    """As ``tarfile`` makes it, in a quarter of the time: name, size, time and checksum are written into one that is known."""
+    """The header that ``tarfile`` would write, in a quarter of the time: fills name, size, time and checksum into a template."""
     block = bytearray(_EMPTY_HEADER)
     block[: len(name)] = name.encode('ascii')
     block[124:148] = b'%011o\0%011o\0' % (size, seconds)
@@ -127,7 +127,7 @@ def _header(name: str, size: int, seconds: int) -> bytes:
 
 
 def pack_zip(members: Iterable[ArchiveFile]) -> bytes:
-    """A zip without compression, which images and clouds would hardly gain by; a file's time is its message's, in UTC."""
+    """A zip without compression, which would hardly shrink images and clouds; a file's time is its message's, in UTC."""
     file = BytesIO()
     with ZipFile(file, 'w', ZIP_STORED, allowZip64=True) as packed:
         for member in members:

@@ -1,15 +1,15 @@
-"""Where definitions of messages are found, and the text that describes a type to readers without ROS, in rosbag2's form.
+"""Finds message definitions, and builds the text that describes a type to readers without ROS, in rosbag2's format.
 
-They come from the ``share/`` folders of the sourced workspaces, where rosbag2 takes them from (rosbag2_cpp,
-local_message_definition_source.cpp): the ``.msg`` text, then that of every type it uses, or the same of the ``.idl``
-if one of them has no ``.msg``, without its ``#include`` lines: every section follows anyway, and ``rosbags`` cannot open a bag
-that has such a line. The hash (REP-2016) is in the ``.json`` that rosidl installs since Iron; Humble has none.
-If nothing is sourced, the type store of ``rosbags`` knows the common types.
+The definitions are read from the ``share/`` folders of the sourced workspaces, as rosbag2 does (rosbag2_cpp,
+local_message_definition_source.cpp): the ``.msg`` of the type and of every type it uses. If one of them has no ``.msg``, all are
+read from ``.idl``, without ``#include`` lines: every included section follows anyway, and ``rosbags`` cannot open a bag with such
+a line. The hash (REP-2016) is in the ``.json`` that rosidl installs since Iron; Humble has none. If no workspace is sourced, the
+type store of ``rosbags`` has the common types.
 
 The messages of a service's event topic and of an action's topics have types too, such as ``std_srvs/srv/Trigger_Event`` and
-``nav2_msgs/action/NavigateToPose_FeedbackMessage``. They have no file of their own: rosidl derives them from the service or
-action (rosidl_parser/definition.py), and so does this module, from its ``.idl``. rosbag2 stores the ``.srv`` text instead, from
-which readers cannot decode an event (ros2/rosbag2, issue 2365).
+``nav2_msgs/action/NavigateToPose_FeedbackMessage``, but no files: rosidl derives them from the service or action
+(rosidl_parser/definition.py). This module derives them from its ``.idl``. rosbag2 stores the ``.srv`` text instead, from which
+readers cannot decode an event (ros2/rosbag2, issue 2365).
 """
 
 from __future__ import annotations
@@ -36,43 +36,43 @@ _PRIMITIVES: Final = frozenset({
 })  # fmt: skip
 
 
-_UUID: Final = 'unique_identifier_msgs/msg/UUID', 'goal_id'
+_GOAL_ID: Final = 'unique_identifier_msgs/msg/UUID', 'goal_id'
 _Fields = tuple[tuple[str, str], ...]
 
 
-def _event(of: str) -> _Fields:
-    """The fields of the events of a service."""
+def _event_fields(of: str) -> _Fields:
+    """The fields of a service's event message."""
     info = 'service_msgs/msg/ServiceEventInfo', 'info'
     return info, (f'sequence<{of}_Request, 1>', 'request'), (f'sequence<{of}_Response, 1>', 'response')
 
 
 _DERIVED: Final[Mapping[str, Mapping[str, _Fields]]] = {
     'msg': {},
-    'srv': {'Event': _event('{0}')},
+    'srv': {'Event': _event_fields('{0}')},
     'action': {
-        'FeedbackMessage': (_UUID, ('{0}_Feedback', 'feedback')),
-        'SendGoal_Request': (_UUID, ('{0}_Goal', 'goal')),
+        'FeedbackMessage': (_GOAL_ID, ('{0}_Feedback', 'feedback')),
+        'SendGoal_Request': (_GOAL_ID, ('{0}_Goal', 'goal')),
         'SendGoal_Response': (('boolean', 'accepted'), ('builtin_interfaces/msg/Time', 'stamp')),
-        'SendGoal_Event': _event('{0}_SendGoal'),
-        'GetResult_Request': (_UUID,),
+        'SendGoal_Event': _event_fields('{0}_SendGoal'),
+        'GetResult_Request': (_GOAL_ID,),
         'GetResult_Response': (('int8', 'status'), ('{0}_Result', 'result')),
-        'GetResult_Event': _event('{0}_GetResult'),
+        'GetResult_Event': _event_fields('{0}_GetResult'),
     },
 }
-"""Kind of interface -> end of a type's name -> its fields, with ``{0}`` for the service or action."""
+"""Kind of interface -> suffix of a type's name -> its fields, with ``{0}`` for the service or action."""
 
 
 def read_definition(prefixes: Iterable[str | Path], type_name: str, extension: str) -> str:
     """The text that defines a type, from the first workspace that has it. Raises FileNotFoundError.
 
-    ``prefixes`` are the entries of AMENT_PREFIX_PATH, in their order; empty ones are ignored. ``extension`` is ``msg``, or
-    ``idl``, which also defines the parts of services and actions: theirs is the text of the whole service or action, and of what
-    rosidl derives from it.
+    ``prefixes`` are the entries of AMENT_PREFIX_PATH, in their order; empty ones are ignored. ``extension`` is ``msg`` or
+    ``idl``. Only ``idl`` defines the messages of services and actions: the text is that of the whole service or action,
+    followed by the types that rosidl derives from it.
     """
-    package, kind, name, part = _split(type_name)
+    package, kind, name, part = _split_name(type_name)
     if kind != 'msg' and extension == 'msg':
         raise FileNotFoundError(f'{type_name} is part of a service or an action')
-    text = _find(prefixes, type_name, extension).read_text(encoding='utf-8', errors='replace')
+    text = _find_file(prefixes, type_name, extension).read_text(encoding='utf-8', errors='replace')
     derived = _DERIVED[kind]
     if part not in derived:
         return text
@@ -88,8 +88,8 @@ def read_definition(prefixes: Iterable[str | Path], type_name: str, extension: s
     return f'{head}{text}\nmodule {package} {{\n  module {kind} {{\n{"".join(structs)}  }};\n}};\n'
 
 
-def _split(type_name: str) -> tuple[str, str, str, str]:
-    """Package, kind, name and part of a type: ``std_srvs/srv/Trigger_Event`` is Event of Trigger. Raises FileNotFoundError."""
+def _split_name(type_name: str) -> tuple[str, str, str, str]:
+    """Package, kind, name and part of a type: ``std_srvs``, ``srv``, ``Trigger``, ``Event``. Raises FileNotFoundError."""
     named = _TYPE.fullmatch(type_name)
     if named is None:
         raise FileNotFoundError(f'{type_name!r} is not a type')
@@ -99,8 +99,8 @@ def _split(type_name: str) -> tuple[str, str, str, str]:
     return package, kind, *name.partition('_')[::2]
 
 
-def _find(prefixes: Iterable[str | Path], type_name: str, extension: str) -> Path:
-    package, kind, name, _ = _split(type_name)
+def _find_file(prefixes: Iterable[str | Path], type_name: str, extension: str) -> Path:
+    package, kind, name, _ = _split_name(type_name)
     for prefix in prefixes:
         path = Path(prefix, 'share', package, kind, f'{name}.{extension}')
         if str(prefix) and path.is_file():
@@ -109,9 +109,9 @@ def _find(prefixes: Iterable[str | Path], type_name: str, extension: str) -> Pat
 
 
 def describe(type_name: str) -> tuple[str, str, str]:
-    """(encoding, definition, type hash) of the type of a topic such as ``sensor_msgs/msg/Imu``.
+    """(encoding, definition, type hash) of a type such as ``sensor_msgs/msg/Imu``.
 
-    The encoding is ``ros2msg`` or ``ros2idl``; all three are empty if the type is unknown. Reads files, once for each type.
+    The encoding is ``ros2msg`` or ``ros2idl``; all three are empty if the type is unknown. Reads files once per type.
     """
     return _describe(type_name, os.environ.get('AMENT_PREFIX_PATH', ''))
 
@@ -124,41 +124,41 @@ def _describe(type_name: str, prefixes: str) -> tuple[str, str, str]:
     places = prefixes.split(os.pathsep)
     for extension, encoding in (('msg', 'ros2msg'), ('idl', 'ros2idl')):
         try:
-            definition = _collected(places, type_name, extension)
+            definition = _collect_text(places, type_name, extension)
         except FileNotFoundError:
             continue
         return encoding, definition, _hash(places, type_name)
-    return _from_rosbags(f'{named[1]}/msg/{named[3]}') if named[2] in (None, 'msg') else ('', '', '')
+    return _describe_from_rosbags(f'{named[1]}/msg/{named[3]}') if named[2] in (None, 'msg') else ('', '', '')
 
 
-def _collected(prefixes: Sequence[str], type_name: str, extension: str) -> str:
-    """The text of a type and of all that it uses. Raises FileNotFoundError if one of them has none."""
+def _collect_text(prefixes: Sequence[str], type_name: str, extension: str) -> str:
+    """The text of a type and of all types it uses. Raises FileNotFoundError if one of them has none."""
     seen: set[str] = set()
 
     def collect(name: str) -> str:
         text = read_definition(prefixes, name, extension)
-        used = _used(text, name.partition('/')[0], extension) - seen
+        used = _referenced_types(text, name.partition('/')[0], extension) - seen
         if extension == 'idl':
             text = without_includes(text)
         for each in sorted(used):
-            if each not in seen:  # added by one before it in this loop
+            if each not in seen:  # a type before it in this loop may have added it
                 seen.add(each)
-                text += f'\n{_title(each, extension)}{collect(each)}'
+                text += f'\n{_section_title(each, extension)}{collect(each)}'
         return text
 
-    return (_title(type_name, extension) if extension == 'idl' else '') + collect(type_name)
+    return (_section_title(type_name, extension) if extension == 'idl' else '') + collect(type_name)
 
 
 def without_includes(idl: str) -> str:
-    """The text of an ``.idl`` as ``rosbags`` parses it."""
+    """The text of an ``.idl`` in the form that ``rosbags`` can parse."""
     return _IDL_LINE.sub('', idl)
 
 
-def _title(name: str, extension: str) -> str:
+def _section_title(name: str, extension: str) -> str:
     return f'{SEPARATOR}\n{extension.upper()}: {name}\n'
 
 
-def _used(text: str, package: str, extension: str) -> set[str]:
+def _referenced_types(text: str, package: str, extension: str) -> set[str]:
     if extension == 'idl':
         return set(_IDL_INCLUDE.findall(text))
     names = set(_MSG_FIELD.findall(text)) - _PRIMITIVES
@@ -167,7 +167,7 @@ def _used(text: str, package: str, extension: str) -> set[str]:
 
 def _hash(prefixes: Sequence[str], type_name: str) -> str:
     try:
-        content = json.loads(_find(prefixes, type_name, 'json').read_bytes())
+        content = json.loads(_find_file(prefixes, type_name, 'json').read_bytes())
         hashes = {one['type_name']: str(one['hash_string']) for one in content['type_hashes']}
     except (OSError, ValueError, LookupError, TypeError) as error:
         log.debug('%s has no type hash: %s', type_name, error)
@@ -175,8 +175,8 @@ def _hash(prefixes: Sequence[str], type_name: str) -> str:
     return hashes.get(type_name, '')
 
 
-def _from_rosbags(type_name: str) -> tuple[str, str, str]:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - half a second, for machines without ROS alone
+def _describe_from_rosbags(type_name: str) -> tuple[str, str, str]:
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - half a second, needed only on machines without ROS
 
     store = get_typestore(Stores.LATEST)
     if type_name not in store.fielddefs:

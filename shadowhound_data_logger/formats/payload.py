@@ -1,4 +1,4 @@
-"""What the registry hands to an encoder and gets back from it."""
+"""What an encoder receives (``Job``) and returns (``Payload``, ``Rejections``)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Fact = str | int | float
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One batch to encode, and all that may be known about it."""
+    """One batch to encode, with its sensor's settings."""
 
     batch: Batch
     sensor: SensorSettings
@@ -27,19 +27,19 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """The content of an object; ``kept`` are the samples that are in it, in their order, at least one."""
+    """The content of an object. ``kept`` has its samples in their order, at least one."""
 
     body: bytes
     kept: tuple[Sample, ...]
     ext: str
     content_type: str
     facts: Mapping[str, Fact] = field(default_factory=dict)
-    """What is known of the content: lower-case names, numbers or printable ASCII. It becomes the object's S3 user metadata,
-    or in an archive the JSON beside the file."""
+    """Properties of the content: lower-case names; values are numbers or printable ASCII. They become the object's S3 user
+    metadata, or in an archive the JSON next to the file."""
     statistics: bytes = b''
-    """Of the numbers in it, as ``statistics.packed``; empty where nobody looked."""
+    """Statistics of the numbers in it, as ``pack_statistics`` returns them; empty if they were not computed."""
     corrected: str = ''
-    """What was wrong with the message, by a short word, if it was stored all the same because it has only one reading."""
+    """A word for what was wrong with the message, if it was corrected and stored because only one reading is possible."""
 
 
 @dataclass(slots=True)
@@ -48,22 +48,22 @@ class Rejection:
 
     reason: str
     publisher: str
-    """Its gid, '' if that is unknown."""
+    """Its gid; '' if unknown."""
     text: str
-    """What was wrong with the first one, a sentence."""
+    """A sentence: what was wrong with the first one."""
     count: int = 0
     remedy: str = ''
-    """What to do about it, if that is not what helps against the reason in general."""
+    """What to do about it, if that differs from the remedy for the reason in general."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rejections:
-    """The samples of a batch that are not in its object, and those that are there corrected."""
+    """The samples of a batch that are not in its object, and counts of those that were corrected."""
 
     found: dict[tuple[str, str], Rejection] = field(default_factory=dict)
     """By reason and publisher."""
     corrected: Counter[str] = field(default_factory=Counter)
-    """Of the samples in the object, those that had to be corrected, by what was wrong with them."""
+    """What was wrong -> number of samples in the object that were corrected."""
 
     def add(self, error: Rejected, *samples: Sample) -> None:
         for sample in samples:
@@ -72,21 +72,22 @@ class Rejections:
             known.count += 1
 
     def add_corrected(self, payload: Payload) -> None:
-        """Count what was wrong with a message that is stored all the same."""
+        """Count a message that is stored, if it was corrected."""
         if payload.corrected:
             self.corrected[payload.corrected] += 1
 
 
 Encoder = Callable[[Job, Rejections], 'Payload | None']
-"""Makes one payload of a job and adds what it could not use to the rejections; None when nothing is left."""
+"""Makes one payload from a job and adds the unusable samples to the rejections; returns None if no sample is usable."""
 OneMessage = Callable[[Job, Sample], Payload]
-"""Makes a payload of one message, or raises Rejected."""
+"""Makes a payload from one message, or raises Rejected."""
 
 
 def one_message(encode: OneMessage) -> Encoder:
     """An encoder for a format that holds a single message.
 
-    Settings refuse to batch such a format; should a batch come all the same, its later samples count as ``surplus``.
+    The settings reject batching for such a format. If a batch arrives anyway, samples after the first usable one count as
+    ``surplus``.
     """
 
     def encoder(job: Job, rejections: Rejections) -> Payload | None:
@@ -105,13 +106,13 @@ def one_message(encode: OneMessage) -> Encoder:
     return encoder
 
 
-def encode_cdr(job: Job, sample: Sample) -> Payload:  # noqa: ARG001 - as every encoder of one message
-    """The bytes of one message; its definition is not needed. Raises Rejected ``malformed`` where there are too few for CDR."""
+def encode_cdr(job: Job, sample: Sample) -> Payload:  # noqa: ARG001 - the signature of OneMessage
+    """The bytes of one message; needs no definition. Raises Rejected ``malformed`` if they are too short for CDR."""
     if len(sample.cdr) < ENCAPSULATION_BYTES:
         raise Rejected('malformed', f'{len(sample.cdr)} bytes are not CDR')
     return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream')
 
 
 def verbatim(sample: Sample, why: str, facts: Mapping[str, Fact], corrected: str = '') -> Payload:
-    """The bytes of a message that its format cannot hold: not converted, and not lost. ``why`` is a short word."""
+    """The unconverted bytes of a message that the sensor's format cannot represent. ``why`` is one word."""
     return Payload(sample.cdr, (sample,), 'cdr', 'application/octet-stream', {**facts, 'verbatim': why}, corrected=corrected)

@@ -1,9 +1,9 @@
-"""PointCloud2 to binary PCD v0.7 with every field, bit for bit.
+"""Converts PointCloud2 to binary PCD v0.7 with every field, bit for bit.
 
-Source of the format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. Fields keep the cloud's order,
-names and types. Padding between them is left out (a PCD has no place for bytes without a name; fields called ``_`` are padding by
-PCL's convention and are left out too), big-endian values are swapped, NaN points stay, organized clouds stay organized. A cloud
-with fields that a PCD header cannot describe is stored as it was serialized.
+Source of the format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. Fields keep the cloud's order, names
+and types. Padding is omitted: a PCD has no place for bytes without a name, and PCL treats fields named ``_`` as padding.
+Big-endian values are swapped, NaN points are kept, organized clouds stay organized. A cloud with fields that a PCD header cannot
+describe is stored as CDR.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Sample
 from shadowhound_data_logger.core.options import ARCHIVES, POINT_CLOUD
 from shadowhound_data_logger.formats.payload import Fact, Job, Payload, verbatim
-from shadowhound_data_logger.formats.statistics import ALL, MOST_FIELDS, NONE, Statistic, of_number, of_whole, packed
+from shadowhound_data_logger.formats.statistics import ALL, MAX_FIELDS, NONE, Statistic, object_row, pack_statistics, single_value
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,27 +28,27 @@ if TYPE_CHECKING:
 _DATATYPES: Final = {1: ('I', 1), 2: ('U', 1), 3: ('I', 2), 4: ('U', 2), 5: ('I', 4), 6: ('U', 4), 7: ('F', 4), 8: ('F', 8)}
 """sensor_msgs/msg/PointField.datatype -> PCD TYPE and SIZE (bytes)."""
 _NAME = re.compile(r'[!-~]{1,64}')
-"""PCD separates names by white space; everything that is printable ASCII is safe in a header."""
+"""PCD separates names by white space; other printable ASCII is safe in a header."""
 _PADDING: Final = '_'
 _FLOAT32: Final = 7
 _MAX_OVERLAP: Final = 4
-"""Fields may overlap (``rgb``, and its bytes ``r`` ``g`` ``b``): each is stored in full, up to so many times a point's bytes."""
+"""Fields may overlap (``rgb`` and its bytes ``r`` ``g`` ``b``), each stored in full, up to this many times the point's size."""
 
 
 class CloudShape(NamedTuple):
-    """Where the points of a cloud are in its data."""
+    """The layout of the points in a cloud's data."""
 
     width: int
     height: int
     row_step: int
     """Bytes from one row to the next."""
     corrected: str = ''
-    """Which figure of the message was not used, because only another one agrees with its data; empty if all agree."""
+    """The field of the message that contradicted its data and was corrected; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """One field of every point: ``count`` values of ``size`` bytes each, from byte ``offset`` of the point on."""
+    """One field of every point: ``count`` values of ``size`` bytes each, starting at byte ``offset`` of the point."""
 
     name: str
     kind: str
@@ -69,7 +69,7 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
     """The PCD of one PointCloud2.
 
     Raises Rejected: ``wrong_type``, ``unknown_type``, ``malformed`` (a field ends outside the point), ``size_mismatch`` (width,
-    height, steps and data contradict each other).
+    height, steps and data are inconsistent).
     """
     if job.batch.type != POINT_CLOUD:
         raise Rejected('wrong_type', f'{job.batch.type} is not a point cloud')
@@ -83,34 +83,33 @@ def encode_cloud(job: Job, sample: Sample) -> Payload:
         return verbatim(sample, 'unsupported_fields', facts, shape.corrected)
     points = _points(cloud, fields, shape)
     body = b''.join((_header(cloud, shape, fields, sample.stamp_ns), points.data))
-    is_asked = job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES
+    wants_statistics = job.sensor.statistics != (NONE,) and job.sensor.format not in ARCHIVES
     layout = [(field.name, field.format('<')) for field in fields]
-    found = packed(of_points(points.reshape(-1).view(layout))) if is_asked else b''
+    found = pack_statistics(point_statistics(points.reshape(-1).view(layout))) if wants_statistics else b''
     return Payload(body, (sample,), 'pcd', 'application/octet-stream', facts, found, shape.corrected)
 
 
-def of_points(points: Any) -> dict[str, Statistic]:
-    """Of a structured array of points: their number, and each field of one value a point. There is no mean."""
-    found = {ALL: of_whole(1), 'points': of_number(len(points))}
-    for name in (points.dtype.names or ())[: MOST_FIELDS - 1]:
+def point_statistics(points: Any) -> dict[str, Statistic]:
+    """Statistics, without means, of a structured array of points: their number, and each field with one value per point."""
+    found = {ALL: object_row(1), 'points': single_value(len(points))}
+    for name in (points.dtype.names or ())[: MAX_FIELDS - 1]:
         values = points[name]
         if values.ndim != 1:
             continue
-        with np.errstate(invalid='ignore'):  # a NaN may be of a kind that signals
-            whole = np.asarray(values, np.float64)
-        present = whole[np.isfinite(whole)]
-        missing = len(whole) - len(present)
-        ends = (present[0], present[-1], present.min(), present.max()) if len(present) else (None,) * 4
-        first, last, least, greatest = (None if one is None else float(one) for one in ends)
-        found[name] = Statistic(first, last, least, greatest, None, len(present), missing)
+        with np.errstate(invalid='ignore'):  # a signaling NaN would warn
+            numbers = np.asarray(values, np.float64)
+        finite = numbers[np.isfinite(numbers)]
+        edges = (finite[0], finite[-1], finite.min(), finite.max()) if len(finite) else (None,) * 4
+        first, last, minimum, maximum = (None if one is None else float(one) for one in edges)
+        found[name] = Statistic(first, last, minimum, maximum, None, len(finite), len(numbers) - len(finite))
     return found
 
 
 def shape_of(cloud: Any) -> CloudShape:
-    """Rows, columns and steps of a PointCloud2, corrected where its data allow only one reading.
+    """Rows, columns and step of a PointCloud2, corrected if its data allow only one reading.
 
-    Drivers are known to leave ``row_step`` 0 or that of the flat cloud, ``height`` 0, and out the padding of the last row. Raises
-    Rejected: ``size_mismatch``.
+    Some drivers set ``row_step`` to 0 or to that of the flat cloud, set ``height`` to 0, or omit the padding of the last row.
+    Raises Rejected: ``size_mismatch``.
     """
     width, height, size = int(cloud.width), int(cloud.height), int(cloud.data.size)
     corrected = ''
@@ -130,7 +129,7 @@ def shape_of(cloud: Any) -> CloudShape:
 
 
 def xyz_of(cloud: Any, every: int = 1) -> NDArray[np.float32] | None:
-    """x, y and z of every so many points, a row a point; None if they are not float32, or the cloud is contradictory."""
+    """x, y and z of every ``every``-th point, points x 3; None if they are not float32, or the cloud is inconsistent."""
     offsets = {field.name: field.offset for field in cloud.fields if field.datatype == _FLOAT32}
     names = ['x', 'y', 'z']
     if not offsets.keys() >= {*names} or max(offsets[name] for name in names) + 4 > cloud.point_step:
@@ -151,7 +150,7 @@ def xyz_of(cloud: Any, every: int = 1) -> NDArray[np.float32] | None:
 
 
 def _fields(cloud: Any) -> tuple[_Field, ...]:
-    """The fields of a point as a PCD header has them; () if it cannot. Raises Rejected: ``malformed``."""
+    """The fields of a point for a PCD header; () if it cannot describe them. Raises Rejected: ``malformed``."""
     fields = []
     for given in cloud.fields:
         if given.name == _PADDING:
@@ -170,11 +169,11 @@ def _fields(cloud: Any) -> tuple[_Field, ...]:
 
 
 def _points(cloud: Any, fields: Sequence[_Field], shape: CloudShape) -> NDArray[np.uint8]:
-    """The points as PCD wants them: packed, little-endian, row after row. Untouched where they already are."""
-    packed = list(accumulate((field.bytes for field in fields), initial=0))
-    is_packed = packed == [*(field.offset for field in fields), cloud.point_step]
-    as_is = is_packed and shape.row_step == shape.width * cloud.point_step
-    if as_is and not cloud.is_bigendian:
+    """The points in PCD's layout: packed, little-endian, row by row. Copied only if necessary."""
+    offsets = list(accumulate((field.bytes for field in fields), initial=0))
+    are_fields_packed = offsets == [*(field.offset for field in fields), cloud.point_step]
+    are_rows_packed = shape.row_step == shape.width * cloud.point_step
+    if are_fields_packed and are_rows_packed and not cloud.is_bigendian:
         return cloud.data  # type: ignore[no-any-return]
     keys = [str(index) for index in range(len(fields))]
     order = '>' if cloud.is_bigendian else '<'
@@ -190,7 +189,7 @@ def _points(cloud: Any, fields: Sequence[_Field], shape: CloudShape) -> NDArray[
 
 
 def _header(cloud: Any, shape: CloudShape, fields: Sequence[_Field], stamp_ns: int) -> bytes:
-    """The header, with what PCD has no entry for in a comment: readers skip lines that begin with ``#``."""
+    """The header; a comment has the facts for which PCD has no entry, because readers skip lines that start with ``#``."""
     frame_id = ascii(cloud.header.frame_id[:80])
     lines = (
         '# .PCD v0.7 - Point Cloud Data file format',

@@ -1,12 +1,11 @@
-"""Messages of any type to JSON: a record of one message, or a batch of many. Every finite number reads back bit for bit.
+"""Converts messages of any type to JSON: one message, or a batch. Every finite number reads back bit for bit.
 
-Numbers are written as the shortest decimal that gives the same float32 or float64 again, 64-bit integers exactly, NaN as null,
-infinities as the text ``"Infinity"`` or ``"-Infinity"`` (as the JSON of protobuf has them), the number of all these in
-``non_finite``, byte sequences as base64. A message field whose name the document uses itself gets an underscore behind it.
+Numbers are written as the shortest decimal that reads back as the same float32 or float64, 64-bit integers exactly, NaN as null,
+infinities as the strings ``"Infinity"`` and ``"-Infinity"`` (as in protobuf's JSON), byte sequences as base64. ``non_finite`` is
+the count of NaN and infinities. If a field has the name of one of the document's own keys, an underscore is appended to it.
 
-Decoded messages become plain values that ``orjson`` can write: one compiled expression a type, made from its definition.
-``float32`` scalars become ``numpy.float32``, because then the shortest decimal that reads back as that float32 is written, as
-it is for arrays.
+A compiled expression for each type, made from its definition, converts a decoded message to values that ``orjson`` can write.
+``float32`` scalars become ``numpy.float32``, so that ``orjson`` writes the shortest decimal for a float32, as it does for arrays.
 """
 
 from __future__ import annotations
@@ -25,9 +24,16 @@ from rosbags.typesys.base import normalize_fieldname
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Sample
-from shadowhound_data_logger.formats.columns import BatchStatistics
+from shadowhound_data_logger.formats.cdr_statistics import BatchStatistics
 from shadowhound_data_logger.formats.payload import Job, Payload, Rejections
-from shadowhound_data_logger.formats.statistics import INFINITE, NONE, UNCOUNTED, FieldStatistics, covers, packed
+from shadowhound_data_logger.formats.statistics import (
+    INFINITE,
+    NONE,
+    WITHOUT_STATISTICS,
+    FieldStatistics,
+    covers,
+    pack_statistics,
+)
 from shadowhound_data_logger.formats.types import PLACEHOLDER, MessageTypes, nested_type
 
 if TYPE_CHECKING:
@@ -37,16 +43,16 @@ ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 TRANSFORMS: Final = 'tf2_msgs/msg/TFMessage'
 FIX: Final = 'sensor_msgs/msg/NavSatFix'
 NON_FINITE: Final = 'non_finite'
-_TAKEN: Final = frozenset({'stamp_ns', NON_FINITE})
-_TAKEN_ALONE: Final = _TAKEN | {'robot', 'sensor', 'topic', 'type', 'timestamp'}
-AT_ONCE: Final = 100
-"""Records that are Python objects at a time: they take twenty times the bytes of the message, and ``orjson`` holds the GIL
+_RESERVED: Final = frozenset({'stamp_ns', NON_FINITE})
+_RESERVED_SINGLE: Final = _RESERVED | {'robot', 'sensor', 'topic', 'type', 'timestamp'}
+RECORDS_PER_PART: Final = 100
+"""Records that exist as Python objects at a time: they take twenty times the size of the message, and ``orjson`` holds the GIL
 while it writes them."""
-_AWKWARD: Final = b'7.038531e-26'
-"""The shortest decimal of a float32 that comes out as its neighbor when it is read by way of a float64, as JSON readers
-do; there is no other (and its negative) among all float32."""
+_DOUBLE_ROUNDED: Final = b'7.038531e-26'
+"""JSON readers parse decimals as float64. For this float32 and its negative, and no others, converting that to float32 gives
+its neighbor (double rounding)."""
 ToRecord = Callable[[Job, Sample, Any], dict[str, Any]]
-"""From a decoded message to what is written of it."""
+"""Converts a decoded message to the record that is written."""
 Convert = Callable[[Any], dict[str, Any]]
 _BYTES: Final = frozenset({'uint8', 'byte', 'char', 'octet'})
 
@@ -55,28 +61,28 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     """The JSON of a batch; messages that cannot be decoded are rejected as ``malformed`` or ``unknown_type``."""
     batched = bool(job.sensor.batch_s) or len(job.batch.samples) > 1
     kept: list[Sample] = []
-    records = _records(job, _of_batch if batched else _alone, kept, rejections)
+    records = _records(job, _batch_record if batched else _single_record, kept, rejections)
     parts: list[bytes] = []
     non_finite = 0
     are_widened = False
-    while some := list(islice(records, AT_ONCE)):
+    while some := list(islice(records, RECORDS_PER_PART)):
         part, missing, is_widened = _dump(some)
         are_widened |= is_widened
         parts.append(part[1:-1])
         non_finite += missing
     if not kept:
         return None
-    said = _statistics(job, kept, parts, batched=batched, is_widened=are_widened)
+    statistics = _statistics(job, kept, parts, batched=batched, is_widened=are_widened)
     body = b','.join(parts)
     if batched:
-        body = b'%b,"samples":[%b]}' % (_head(job, kept)[:-1], body)
+        body = b'%b,"samples":[%b]}' % (_batch_header(job, kept)[:-1], body)
     if non_finite:
         body = b'%b,"non_finite":%d}' % (body[:-1], non_finite)
-    return Payload(body, tuple(kept), 'json', 'application/json', statistics=said)
+    return Payload(body, tuple(kept), 'json', 'application/json', statistics=statistics)
 
 
 def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejections) -> Iterator[dict[str, Any]]:
-    """What can be decoded of the batch, in its order; adds each such sample to ``kept``."""
+    """The records of the messages that can be decoded, in the order of the batch; adds their samples to ``kept``."""
     for sample in job.batch.samples:
         try:
             message = job.types.deserialize(job.batch.type, sample.cdr)
@@ -87,22 +93,22 @@ def _records(job: Job, record: ToRecord, kept: list[Sample], rejections: Rejecti
         yield record(job, sample, message)
 
 
-def _alone(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
+def _single_record(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
     """The document of a single message."""
-    special = _RECORDS.get(job.batch.type)
+    special = _SPECIAL_RECORDS.get(job.batch.type)
     if special is not None:
         return special(sample, message)
     own = {**_origin(job), 'timestamp': iso(sample.stamp_ns), 'stamp_ns': sample.stamp_ns}
-    return {**own, **converter(job.types, job.batch.type, _TAKEN_ALONE)(message)}
+    return {**own, **converter(job.types, job.batch.type, _RESERVED_SINGLE)(message)}
 
 
-def _of_batch(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
-    """A message among the samples of a batch."""
-    return {'stamp_ns': sample.stamp_ns, **converter(job.types, job.batch.type, _TAKEN)(message)}
+def _batch_record(job: Job, sample: Sample, message: Any) -> dict[str, Any]:
+    """The record of one message in the document of a batch."""
+    return {'stamp_ns': sample.stamp_ns, **converter(job.types, job.batch.type, _RESERVED)(message)}
 
 
-def _head(job: Job, kept: Sequence[Sample]) -> bytes:
-    """The document of a batch without its samples."""
+def _batch_header(job: Job, kept: Sequence[Sample]) -> bytes:
+    """The document of a batch, without its samples."""
     stamps = [sample.stamp_ns for sample in kept]
     return orjson.dumps({**_origin(job), 'count': len(kept), 't_start_ns': min(stamps), 't_end_ns': max(stamps)})
 
@@ -112,7 +118,7 @@ def _origin(job: Job) -> dict[str, Any]:
 
 
 def _odometry(sample: Sample, message: Any) -> dict[str, Any]:
-    """The record that the trajectory tools read; covariances are left out."""
+    """The record that the trajectory tools read, without covariances."""
     pose, twist = message.pose.pose, message.twist.twist
     return {
         'timestamp': iso(sample.stamp_ns),
@@ -130,62 +136,61 @@ def _vector(vector: Any) -> dict[str, float]:
     return {'x': vector.x, 'y': vector.y, 'z': vector.z}
 
 
-_RECORDS: Final[Mapping[str, Callable[[Sample, Any], dict[str, Any]]]] = {ODOMETRY: _odometry}
-"""Types whose single record has a form of its own."""
-
-
-_PLACES: Final[Mapping[str, Mapping[str, str]]] = {
+_SPECIAL_RECORDS: Final[Mapping[str, Callable[[Sample, Any], dict[str, Any]]]] = {ODOMETRY: _odometry}
+"""Types with a special form for single records."""
+_SPECIAL_FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
     ODOMETRY: {'pose.pose.position': 'position', 'pose.pose.orientation': 'orientation', 'twist.twist.linear': 'linear_velocity',
                'twist.twist.angular': 'angular_velocity'},
 }  # fmt: skip
-"""Where the numbers of the message are in such a record."""
+"""The names in these records of the fields of the message."""
 
 
 def _statistics(job: Job, kept: Sequence[Sample], parts: Sequence[bytes], *, batched: bool, is_widened: bool) -> bytes:
-    """Of the numbers in the JSON: from the messages at once where they are of one layout, else by reading it again."""
+    """Statistics of the numbers in the JSON: from the CDR if all messages have one layout, otherwise by parsing the JSON."""
     if job.sensor.statistics == (NONE,):
         return b''
-    told = None
+    packed = None
     if not is_widened:
-        told = _columns(job.types, job.batch.type, job.sensor.statistics, batched).told([sample.cdr for sample in kept])
-    if told is None:
+        of_batch = _batch_statistics(job.types, job.batch.type, job.sensor.statistics, batched)
+        packed = of_batch.compute([sample.cdr for sample in kept])
+    if packed is None:
         found = FieldStatistics(job.sensor.statistics)
         for part in parts:
             found.add(orjson.loads(b'[%b]' % part))
-        told = packed(found.told())
-    return told
+        packed = pack_statistics(found.result())
+    return packed
 
 
 @lru_cache(maxsize=1024)
-def _columns(types: MessageTypes, type_name: str, chosen: tuple[str, ...], batched: bool) -> BatchStatistics:
-    special = None if batched else _PLACES.get(type_name)
+def _batch_statistics(types: MessageTypes, type_name: str, chosen: tuple[str, ...], batched: bool) -> BatchStatistics:
+    special = None if batched else _SPECIAL_FIELDS.get(type_name)
     names = [name for name, _ in types.fields(type_name)]
-    free = {name: _free(name, _TAKEN if batched else _TAKEN_ALONE, names) for name in names}
+    free = {name: _unused_name(name, _RESERVED if batched else _RESERVED_SINGLE, names) for name in names}
 
     def named(path: str) -> str | None:
         if special is not None:
             return next((new + path[len(old) :] for old, new in special.items() if covers(old, path)), None)
         name, dot, rest = path.partition('.')
-        return None if free[name] in UNCOUNTED else f'{free[name]}{dot}{rest}'
+        return None if free[name] in WITHOUT_STATISTICS else f'{free[name]}{dot}{rest}'
 
     return BatchStatistics(types, type_name, chosen, named)
 
 
 def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int, bool]:
-    """The records as a JSON list, how many numbers are not finite, and whether the others are ``widened``."""
+    """The records as a JSON list, the count of non-finite numbers, and whether ``widen`` was applied."""
     body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
-    if is_awkward := _AWKWARD in body:
-        records = widened(records)
+    if is_widened := _DOUBLE_ROUNDED in body:
+        records = widen(records)
         body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
-    # A message has no nulls of its own, but text may contain the word.
-    non_finite = _nulls(orjson.loads(body)) if b'null' in body else 0
+    # Only NaN and infinities become null, but text may contain the word.
+    non_finite = _count_nulls(orjson.loads(body)) if b'null' in body else 0
     if non_finite:
         body = orjson.dumps(_with_infinities(records), option=orjson.OPT_SERIALIZE_NUMPY)
-    return body, non_finite, is_awkward
+    return body, non_finite, is_widened
 
 
 def _with_infinities(value: Any) -> Any:
-    """The same with the texts of infinities in their places: REP 117 gives them a meaning that NaN does not have."""
+    """The same value with infinities as strings, because REP 117 distinguishes them from NaN."""
     if isinstance(value, dict):
         return {key: _with_infinities(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -198,48 +203,48 @@ def _with_infinities(value: Any) -> Any:
     return INFINITE[int(value < 0)] if isinstance(value, (float, np.floating)) and np.isinf(value) else value
 
 
-def _nulls(value: Any) -> int:
+def _count_nulls(value: Any) -> int:
     if isinstance(value, dict):
-        return sum(map(_nulls, value.values()))
+        return sum(map(_count_nulls, value.values()))
     if isinstance(value, list):
-        return sum(map(_nulls, value))
+        return sum(map(_count_nulls, value))
     return int(value is None)
 
 
 @lru_cache(maxsize=1024)
-def converter(types: MessageTypes, type_name: str, taken: frozenset[str] = frozenset()) -> Convert:
-    """The function from a decoded message of a type to a dict of its fields in order. Raises Rejected: ``unknown_type``.
+def converter(types: MessageTypes, type_name: str, reserved: frozenset[str] = frozenset()) -> Convert:
+    """A function that converts a decoded message to a dict of its fields, in order. Raises Rejected: ``unknown_type``.
 
     Nested messages become dicts, arrays and sequences of numbers stay numpy arrays, sequences of bytes (``uint8[]``, bounded
-    or not, but no fixed arrays) become base64 text. A field whose name is ``taken`` gets an underscore behind it.
+    or not, but not fixed arrays) become base64 text. An underscore is appended to fields whose names are ``reserved``.
     """
-    # One expression, such as ``{'stamp': {'sec': m.stamp.sec}, 'q': float32(m.q)}``: a call for each nested message
-    # costs more than its values. All names in it are identifiers of a definition that was parsed.
-    source = f'lambda m: {_message(types, type_name, "m", taken)}'
+    # One expression, such as ``{'stamp': {'sec': m.stamp.sec}, 'q': float32(m.q)}``, because a call per nested message takes
+    # longer than converting its values. All names in it are identifiers from a parsed definition, so eval is safe.
+    source = f'lambda m: {_message(types, type_name, "m", reserved)}'
     convert: Convert = eval(source, {'float32': np.float32, 'base64': _base64, 'unsigned': _unsigned})  # noqa: S307
     return convert
 
 
-def _message(types: MessageTypes, type_name: str, at: str, taken: frozenset[str] = frozenset()) -> str:
-    """The expression for a message that is the value of the expression ``at``."""
+def _message(types: MessageTypes, type_name: str, at: str, reserved: frozenset[str] = frozenset()) -> str:
+    """The expression that converts the message at the expression ``at``."""
     fields = {name: description for name, description in types.fields(type_name) if name != PLACEHOLDER}
     entries = []
     for name, description in fields.items():
         value = _value(types, description, f'{at}.{normalize_fieldname(name)}')
-        entries.append(f'{_free(name, taken, fields)!r}: {value}')
+        entries.append(f'{_unused_name(name, reserved, fields)!r}: {value}')
     return f'{{{", ".join(entries)}}}'
 
 
-def _free(name: str, taken: Collection[str], fields: Collection[str]) -> str:
-    """The name, or the first one like it that is neither taken nor another field's."""
-    free = name
-    while free in taken or (free != name and free in fields):
-        free += '_'
-    return free
+def _unused_name(name: str, reserved: Collection[str], fields: Collection[str]) -> str:
+    """The name, with underscores appended until it is neither reserved nor another field's."""
+    unused = name
+    while unused in reserved or (unused != name and unused in fields):
+        unused += '_'
+    return unused
 
 
 def _value(types: MessageTypes, description: FieldDesc, at: str) -> str:
-    """The expression for a field; ``at`` itself where orjson writes its value rightly as it is."""
+    """The expression that converts a field; ``at`` itself if orjson writes the value correctly."""
     nested = nested_type(description)
     if nested is not None:
         if description[0] == Nodetype.NAME:
@@ -254,7 +259,7 @@ def _value(types: MessageTypes, description: FieldDesc, at: str) -> str:
 
 
 def _unsigned(values: Any) -> Any:
-    """An array of ``byte`` as ROS 2 means it, 0 to 255; ``rosbags`` reads it signed."""
+    """An array of ``byte`` as ROS 2 defines it, 0 to 255; ``rosbags`` reads it as signed."""
     return values.view(np.uint8)
 
 
@@ -262,12 +267,12 @@ def _base64(data: Any) -> str:
     return b2a_base64(data, newline=False).decode('ascii')
 
 
-def widened(value: Any) -> Any:
-    """The same plain value with every float32 as the float64 that equals it."""
+def widen(value: Any) -> Any:
+    """The same plain value with every float32 converted to float64."""
     if isinstance(value, dict):
-        return {key: widened(item) for key, item in value.items()}
+        return {key: widen(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [widened(item) for item in value]
+        return [widen(item) for item in value]
     if isinstance(value, np.float32):
         return float(value)
     if isinstance(value, np.ndarray) and value.dtype == np.float32:

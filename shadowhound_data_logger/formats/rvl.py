@@ -1,8 +1,8 @@
 """Depth images in RVL, which compressed_depth_image_transport publishes as an alternative to PNG.
 
-Source of the format: A. D. Wilson, "Fast Lossless Depth Image Compression", ISS 2017. Runs of zeros and of other pixels
-alternate. The others are differences to the one before, zigzag. All numbers are groups of 3 bits, the lowest first, each in a
-nibble whose highest bit says that another one follows. Nibbles fill words of 32 bits from the top.
+Source of the format: A. D. Wilson, "Fast Lossless Depth Image Compression", ISS 2017. Runs of zeros and of nonzero pixels
+alternate. Nonzero pixels are zigzag-encoded differences to the previous one. All numbers are groups of 3 bits, lowest first, each
+in a nibble whose highest bit is set if another nibble follows. Nibbles fill 32-bit words from the top.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _SIZE: Final = struct.Struct('<II')
-"""Columns and rows, in front of the words."""
+"""Columns and rows; they precede the words."""
 _MAX_NIBBLES: Final = 10
-"""Of a number: 30 bits."""
+"""Maximum nibbles of a number: 30 bits."""
 _SHIFTS: Final = np.arange(28, -4, -4, dtype=np.uint32)
 _MAX_SMALL: Final = 640 * 480
 _MAX_TIMES: Final = 16
-"""Maximum pixels of an image, whatever its size or, if more, for each byte of it: decoding takes six bytes for each pixel. A
-black image has 16 bytes; most have a byte for one or two pixels."""
+"""An image may have ``_MAX_SMALL`` pixels, or ``_MAX_TIMES`` for each byte if that is more: decoding takes six bytes per pixel.
+A black image takes 16 bytes; most images take a byte for one or two pixels."""
 
 
 def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
-    """The image, rows by columns. Raises ValueError if it is not one, or claims to be absurdly large."""
+    """The image, rows x columns. Raises ValueError if the data is invalid or claims an absurd size."""
     if len(data) < _SIZE.size:
         raise ValueError(f'RVL of {len(data)} bytes')
     width, height = _SIZE.unpack_from(data)
@@ -44,7 +44,7 @@ def decode_rvl(data: bytes | memoryview) -> NDArray[np.uint16]:
 
 
 def _numbers(data: bytes | memoryview) -> NDArray[np.int64]:
-    """All numbers in the words."""
+    """The numbers in the words."""
     words = np.frombuffer(data, '<u4', len(data) // 4)
     nibbles = ((words[:, np.newaxis] >> _SHIFTS) & 0xF).astype(np.uint8).reshape(-1)
     ends = np.flatnonzero(nibbles < 8) + 1
@@ -60,7 +60,7 @@ def _numbers(data: bytes | memoryview) -> NDArray[np.int64]:
 
 
 def _runs(values: NDArray[np.int64], pixels: int) -> NDArray[np.int64]:
-    """The lengths of the runs in turns, zeros first, which have so many pixels together."""
+    """The alternating run lengths, zeros first; their sum is ``pixels``."""
     runs: list[int] = []
     at = done = 0
     while done < pixels:

@@ -1,11 +1,11 @@
-"""Statistics of the numbers in an object: first, last, least, greatest, mean, how many, and how many are not finite.
+"""Statistics of the numbers in an object: first, last, minimum, maximum, mean, their count, and the count of non-finite ones.
 
-They are those of the content as it is stored, so whoever opens the object finds the same: of JSON its numbers as the shortest
-decimals that stand there, of a JPEG its brightness and sharpness, of a PCD the fields of its points.
+They describe the stored content, so a reader of the object computes the same: the decimals in a JSON, the brightness and
+sharpness of a JPEG, the fields of the points in a PCD.
 
-A field has the path of its names, such as ``accelerometer.2`` or ``motor_state.0.q``. Each element of a list of at most
-``MAX_ELEMENTS`` is a field of its own; those of a longer one are one field together, such as ``ranges.*``. ``ALL`` is a row of
-the object as a whole: its messages, and how many of its fields have no statistics.
+A field is named by its path, such as ``accelerometer.2`` or ``motor_state.0.q``. Each element of a list of at most
+``MAX_ELEMENTS`` is a separate field; the elements of a longer list are one field, such as ``ranges.*``. The row ``ALL`` is about
+the object: the number of its messages, and of its fields without statistics.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from typing import Any, Final
 
 import orjson
 
-MOST_FIELDS: Final = 64
-"""Of one object. Those of a type with more are chosen by the sensor's parameter ``statistics``, else these are the first."""
+MAX_FIELDS: Final = 64
+"""Maximum fields of one object: the first ones, unless the sensor's parameter ``statistics`` selects fields."""
 MAX_ELEMENTS: Final = 20
 MAX_DEPTH: Final = 8
-MAX_SAID: Final = 1 << 16
-"""Bytes of the statistics of an object as they are kept."""
+MAX_PACKED_BYTES: Final = 1 << 16
+"""Maximum size of an object's packed statistics."""
 MEAN_ERROR: Final = 2.0**-22
-"""A float32 and its shortest decimal are within 2^-24 of each other, and the mean is kept as a float32."""
+"""A float32 and its shortest decimal differ by at most 2^-24, relative, and the mean is stored as a float32."""
 ALL: Final = ''
 INFINITE: Final = ('Infinity', '-Infinity')
-"""What infinities are in JSON."""
+"""Infinities in JSON."""
 NONE: Final = 'none'
-"""Instead of names of fields: no statistics."""
-UNCOUNTED: Final = frozenset({'stamp_ns', 'timestamp', 'header', 'non_finite'})
-"""Top-level names that tell of the document or its time, not what was measured."""
+"""Setting that disables statistics, in place of the names of fields."""
+WITHOUT_STATISTICS: Final = frozenset({'stamp_ns', 'timestamp', 'header', 'non_finite'})
+"""Top-level names that describe the document or its time, not a measurement."""
 
 
 @dataclass(frozen=True, slots=True)
 class Statistic:
-    """Of the finite numbers of a field in an object; None where it has none. Their mean is None where their sum has no double.
+    """Statistics of the finite numbers of a field in an object; None if it has none. The mean is None if the sum overflows.
 
-    The mean need not be the nearest double: the greatest magnitude among ``min`` and ``max`` times ``MEAN_ERROR`` is as far as
-    it may be from that of the decimals in the JSON, which an encoder does not read again for it.
+    The mean may differ from the mean of the decimals in the JSON, which the encoder does not parse again, by at most
+    ``max(abs(min), abs(max)) * MEAN_ERROR``.
     """
 
     first: float | None
@@ -50,61 +50,61 @@ class Statistic:
     mean: float | None
     count: int
     nan_count: int
-    """Numbers that are not finite: NaN, which JSON has as null, and infinities. Of ``ALL``, the fields that are left out."""
+    """Count of the non-finite numbers: NaN, which is null in JSON, and infinities. In ``ALL``: fields without statistics."""
 
 
 NUMBERS: Final = ('first', 'last', 'min', 'max', 'mean', 'count', 'nan_count')
 numbers_of: Final = attrgetter(*NUMBERS)
-"""The numbers of a statistic, in this order."""
+"""Returns the numbers of a statistic in the order of ``NUMBERS``."""
 
 
 class FieldStatistics:
-    """Collects the statistics of records, which are handed to it some at a time, always the same number in a row."""
+    """Computes the statistics of records, which are added in equal parts."""
 
     def __init__(self, chosen: Sequence[str] = ()) -> None:
-        """``chosen``: fields, or what the names of several begin with up to a dot; none means all."""
+        """``chosen``: names of fields, or name prefixes that end before a dot; empty means all fields."""
         self._chosen = tuple(name for name in chosen if name)
-        self._found: dict[str, _Running] = {}
-        self._left_out: set[str] = set()
+        self._found: dict[str, _FieldSummary] = {}
+        self._omitted: set[str] = set()
         self._records = 0
 
     def add(self, records: Sequence[Mapping[str, Any]]) -> None:
-        """Records as they are in JSON."""
+        """Add records as they are in the JSON."""
         self._records += len(records)
         for name, values in _fields('', records, 0):
-            if name not in self._found and (len(self._found) >= MOST_FIELDS or not self._is_chosen(name)):
-                self._left_out.add(name)
+            if name not in self._found and (len(self._found) >= MAX_FIELDS or not self._is_chosen(name)):
+                self._omitted.add(name)
                 continue
-            self._found.setdefault(name, _Running()).add(values)
+            self._found.setdefault(name, _FieldSummary()).add(values)
 
-    def told(self) -> dict[str, Statistic]:
-        """By field, ``ALL`` first."""
-        return {ALL: of_whole(self._records, len(self._left_out)), **{name: each.told() for name, each in self._found.items()}}
+    def result(self) -> dict[str, Statistic]:
+        """The statistics by field, ``ALL`` first."""
+        return {ALL: object_row(self._records, len(self._omitted)), **{name: each.result() for name, each in self._found.items()}}
 
     def _is_chosen(self, name: str) -> bool:
         return not self._chosen or any(covers(chosen, name) for chosen in self._chosen)
 
 
-def covers(asked: str, field: str) -> bool:
-    """Whether a name means this field: its own, or what it begins with up to a dot."""
-    return field == asked or field.startswith(f'{asked}.')
+def covers(name: str, field: str) -> bool:
+    """Whether a name selects a field: it is the field's name, or a prefix of it that ends before a dot."""
+    return field == name or field.startswith(f'{name}.')
 
 
-def values_of(record: Mapping[str, Any], asked: str) -> list[float]:
-    """The finite numbers of all fields of a record that a name means."""
-    some = {name: value for name, value in record.items() if covers(asked, name) or covers(name, asked)}
-    found = (values for name, values in _fields('', [some], 0) if covers(asked, name))
+def field_values(record: Mapping[str, Any], wanted: str) -> list[float]:
+    """The finite numbers of all fields of a record that the name ``wanted`` selects."""
+    some = {name: value for name, value in record.items() if covers(wanted, name) or covers(name, wanted)}
+    found = (values for name, values in _fields('', [some], 0) if covers(wanted, name))
     return [float(value) for values in found for value in values if value is not None]
 
 
-class _Running:
-    """The statistics of a field so far."""
+class _FieldSummary:
+    """The statistics of one field so far."""
 
     def __init__(self) -> None:
         self.first: float | None = None
         self.last: float | None = None
-        self.least: list[float] = []
-        self.greatest: list[float] = []
+        self.minima: list[float] = []
+        self.maxima: list[float] = []
         self.sums: list[float] = []
         self.count = self.nan_count = 0
 
@@ -116,21 +116,21 @@ class _Running:
         if self.first is None:
             self.first = float(present[0])
         self.last = float(present[-1])
-        self.least.append(float(min(present)))
-        self.greatest.append(float(max(present)))
+        self.minima.append(float(min(present)))
+        self.maxima.append(float(max(present)))
         self.sums.append(_sum(present))
         self.count += len(present)
 
-    def told(self) -> Statistic:
+    def result(self) -> Statistic:
         if not self.count:
             return Statistic(None, None, None, None, None, 0, self.nan_count)
         mean = _sum(self.sums) / self.count
-        return Statistic(self.first, self.last, min(self.least), max(self.greatest), mean if isfinite(mean) else None, self.count,
+        return Statistic(self.first, self.last, min(self.minima), max(self.maxima), mean if isfinite(mean) else None, self.count,
                          self.nan_count)  # fmt: skip
 
 
 def _sum(values: Sequence[float]) -> float:
-    """Rounded once, whatever their order; NaN where it is no double."""
+    """The sum, rounded once regardless of the order; NaN on overflow."""
     try:
         return fsum(values)
     except (OverflowError, ValueError):
@@ -138,7 +138,7 @@ def _sum(values: Sequence[float]) -> float:
 
 
 def _fields(name: str, values: Sequence[Any], depth: int) -> Iterator[tuple[str, Sequence[Any]]]:
-    """(field, its numbers in their order, None for those that are not finite) below the values of one name."""
+    """(field, its numbers in their order, None for non-finite ones) of each field in the values of one name."""
     kinds = set(map(type, values))
     if str in kinds and not {value for value in values if type(value) is str}.isdisjoint(INFINITE):
         values = [None if value in INFINITE else value for value in values]
@@ -149,13 +149,13 @@ def _fields(name: str, values: Sequence[Any], depth: int) -> Iterator[tuple[str,
     elif depth > MAX_DEPTH:
         return
     elif kinds == {dict}:
-        for key in dict.fromkeys(key for value in values for key in value) if _differ(values) else values[0]:
-            if name or key not in UNCOUNTED:
+        for key in dict.fromkeys(key for value in values for key in value) if _have_different_keys(values) else values[0]:
+            if name or key not in WITHOUT_STATISTICS:
                 below = [value[key] for value in values if key in value]
                 yield from _fields(f'{name}.{key}' if name else key, below, depth + 1)
     elif kinds == {list}:
         yield from _elements(name, values, depth)
-    elif len(kinds) > 1:  # not ours: each by its own kind
+    elif len(kinds) > 1:  # not written by us: handle each kind separately
         for kind in (_NUMBERS, {dict}, {list}):
             if some := [value for value in values if type(value) in kind]:
                 yield from _fields(name, some, depth + 1)
@@ -164,7 +164,7 @@ def _fields(name: str, values: Sequence[Any], depth: int) -> Iterator[tuple[str,
 _NUMBERS: Final[set[type]] = {float, int, bool, type(None)}
 
 
-def _differ(values: Sequence[dict[str, Any]]) -> bool:
+def _have_different_keys(values: Sequence[dict[str, Any]]) -> bool:
     names = values[0].keys()
     return any(value.keys() != names for value in values)
 
@@ -182,56 +182,57 @@ def _elements(name: str, values: Sequence[list[Any]], depth: int) -> Iterator[tu
         yield from _fields(f'{name}.*', long, depth + 1)
 
 
-def of_whole(messages: int, left_out: int = 0) -> Statistic:
+def object_row(messages: int, omitted: int = 0) -> Statistic:
     """The row ``ALL``."""
-    return Statistic(None, None, None, None, None, messages, left_out)
+    return Statistic(None, None, None, None, None, messages, omitted)
 
 
-def of_number(value: float) -> Statistic:
-    """Of the only message."""
+def single_value(value: float) -> Statistic:
+    """The statistic of a field with one number."""
     number = float(value)
     return Statistic(number, number, number, number, number, 1, 0)
 
 
-# -- as they are kept ----------------------------------------------------------------------------------------------------------
+# -- packed --------------------------------------------------------------------------------------------------------------------
 
 
-def packed(found: Mapping[str, Statistic]) -> bytes:
-    """The statistics as JSON; empty where there are none, or too much of them."""
+def pack_statistics(found: Mapping[str, Statistic]) -> bytes:
+    """The statistics as JSON; empty if there are none or they exceed ``MAX_PACKED_BYTES``."""
     if ALL not in found:
         return b''
     names = [name for name in found if name != ALL]
-    rows = [[getattr(found[name], each) for name in names] for each in _IN_PART]
-    part = {'fields': names, 'numbers': rows, **{each: [getattr(found[name], each) for name in names] for each in _COUNTS}}
-    return packed_parts(found[ALL].count, found[ALL].nan_count, [part] if names else [])
+    rows = [[getattr(found[name], each) for name in names] for each in _NUMBERS_PACKED]
+    part = {'fields': names, 'numbers': rows, **{each: [getattr(found[name], each) for name in names] for each in _COUNTS_PACKED}}
+    return pack_parts(found[ALL].count, found[ALL].nan_count, [part] if names else [])
 
 
-def packed_parts(messages: int, left_out: int, parts: Sequence[Mapping[str, Any]]) -> bytes:
-    """The same of ``fields`` in parts, each with its ``numbers``, a row for each of first, last, mean, min and max.
+def pack_parts(messages: int, omitted: int, parts: Sequence[Mapping[str, Any]]) -> bytes:
+    """Like ``pack_statistics``, for parts of the ``fields``, each with ``numbers``: rows of first, last, mean, min and max.
 
-    One row stands for all of them, none for fields without finite numbers; ``count`` and ``nan_count`` are of each or of all.
+    A single row applies to all five; without rows, the fields have no finite numbers. ``count`` and ``nan_count`` are one
+    number for all fields of a part, or a list with a number for each.
     """
-    said = orjson.dumps({'messages': messages, 'left_out': left_out, 'parts': parts}, option=orjson.OPT_SERIALIZE_NUMPY)
-    return said if len(said) <= MAX_SAID else b''
+    packed = orjson.dumps({'messages': messages, 'omitted': omitted, 'parts': parts}, option=orjson.OPT_SERIALIZE_NUMPY)
+    return packed if len(packed) <= MAX_PACKED_BYTES else b''
 
 
-def unpacked_statistics(said: bytes) -> dict[str, Statistic]:
-    """What was packed; empty where that is damaged."""
+def unpack_statistics(packed: bytes) -> dict[str, Statistic]:
+    """The statistics that were packed; empty if the bytes are damaged."""
     try:
-        return dict(_unpacked(orjson.loads(said))) if said else {}
+        return dict(_unpack(orjson.loads(packed))) if packed else {}
     except (ValueError, TypeError, LookupError, AttributeError):
         return {}
 
 
-def _unpacked(told: Any) -> Iterator[tuple[str, Statistic]]:
-    yield ALL, of_whole(int(told['messages']), int(told['left_out']))
-    for part in told['parts']:
+def _unpack(document: Any) -> Iterator[tuple[str, Statistic]]:
+    yield ALL, object_row(int(document['messages']), int(document['omitted']))
+    for part in document['parts']:
         names, rows = part['fields'], part['numbers'] or [[None] * len(part['fields'])]
-        rows = rows * len(_IN_PART) if len(rows) == 1 else rows
-        counts = [part[each] if isinstance(part[each], list) else [part[each]] * len(names) for each in _COUNTS]
+        rows = rows * len(_NUMBERS_PACKED) if len(rows) == 1 else rows
+        counts = [part[each] if isinstance(part[each], list) else [part[each]] * len(names) for each in _COUNTS_PACKED]
         for name, *numbers, count, nan_count in zip(names, *rows, *counts, strict=True):
-            yield str(name), Statistic(**dict(zip(_IN_PART, numbers, strict=True)), count=count, nan_count=nan_count)
+            yield str(name), Statistic(**dict(zip(_NUMBERS_PACKED, numbers, strict=True)), count=count, nan_count=nan_count)
 
 
-_IN_PART: Final = ('first', 'last', 'mean', 'min', 'max')
-_COUNTS: Final = ('count', 'nan_count')
+_NUMBERS_PACKED: Final = ('first', 'last', 'mean', 'min', 'max')
+_COUNTS_PACKED: Final = ('count', 'nan_count')

@@ -1,6 +1,6 @@
-"""Message definitions by ROS type name, and what they make of CDR bytes, in pure Python (``rosbags``, then ``cdr``).
+"""Finds message definitions by ROS type name and decodes CDR with them, in pure Python (``rosbags``, then ``cdr``).
 
-Owns the definitions. Whatever the bytes are, only Rejected leaves this module, and no length in them makes it allocate.
+For any input, this module raises only Rejected, and no length in the input makes it allocate memory.
 """
 
 from __future__ import annotations
@@ -29,17 +29,26 @@ if TYPE_CHECKING:
 
 HEADER: Final = 'std_msgs/msg/Header'
 MAX_UNKNOWN: Final = 1000
-"""Names of types that were not found and are remembered, whoever invents how many."""
+"""Limit of the remembered names of unknown types: publishers can invent any number of names."""
 PLACEHOLDER: Final = 'structure_needs_at_least_one_member'
-"""The field that rosidl puts into a message without any; it carries nothing."""
+"""The field that rosidl adds to a message without fields; it has no meaning."""
 
 _TYPE_NAME = re.compile(r'[A-Za-z]\w*/(?:msg|srv|action)/[A-Za-z]\w*', re.ASCII)
-_WHOLE: Final = {'int8': 'b', 'uint8': 'B', 'byte': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I', 'int64': 'q'}
+_INTEGERS: Final = {
+    'int8': 'b',
+    'uint8': 'B',
+    'byte': 'B',
+    'int16': 'h',
+    'uint16': 'H',
+    'int32': 'i',
+    'uint32': 'I',
+    'int64': 'q',
+}
 SIZES: Final = {
-    **{name: struct.calcsize(code) for name, code in _WHOLE.items()}, 'uint64': 8, 'float32': 4, 'float64': 8, 'bool': 1,
+    **{name: struct.calcsize(code) for name, code in _INTEGERS.items()}, 'uint64': 8, 'float32': 4, 'float64': 8, 'bool': 1,
     'char': 1,
 }  # fmt: skip
-"""Bytes of a field of a type in CDR, and what it is aligned to."""
+"""Size, and alignment, of each primitive type in CDR, in bytes."""
 _STAMP_LE: Final = struct.Struct('<iI')
 _STAMP_BE: Final = struct.Struct('>iI')
 _LENGTH_LE: Final = struct.Struct('<I')
@@ -47,7 +56,7 @@ _LENGTH_BE: Final = struct.Struct('>I')
 
 
 def header_stamp_ns(cdr: bytes | memoryview) -> int:
-    """``header.stamp`` in ns of a message whose first field is a std_msgs/msg/Header; 0 where the bytes are too few."""
+    """``header.stamp`` in ns of a message whose first field is a std_msgs/msg/Header; 0 if ``cdr`` is too short."""
     if len(cdr) < ENCAPSULATION_BYTES + _STAMP_LE.size:
         return 0
     sec, nanosec = (_STAMP_LE if cdr[1] & 1 else _STAMP_BE).unpack_from(cdr, ENCAPSULATION_BYTES)
@@ -55,7 +64,7 @@ def header_stamp_ns(cdr: bytes | memoryview) -> int:
 
 
 def header_frame_id(cdr: bytes) -> str:
-    """``header.frame_id`` of such a message; empty where the bytes are too few, U+FFFD where they are not UTF-8."""
+    """``header.frame_id`` of such a message; empty if ``cdr`` is too short; U+FFFD replaces invalid UTF-8."""
     start = ENCAPSULATION_BYTES + _STAMP_LE.size + _LENGTH_LE.size
     if len(cdr) < start:
         return ''
@@ -64,7 +73,7 @@ def header_frame_id(cdr: bytes) -> str:
 
 
 class CounterField(NamedTuple):
-    """Where a whole number is in the CDR of every message of a type."""
+    """The position of an integer in the CDR of every message of a type."""
 
     offset: int
     little: struct.Struct
@@ -72,11 +81,11 @@ class CounterField(NamedTuple):
 
     @property
     def wrap(self) -> int:
-        """It starts again after so many values."""
+        """The number of values after which the counter wraps around."""
         return 1 << 8 * self.little.size
 
     def read(self, cdr: bytes) -> int:
-        """The number; 0 if the bytes are too few, or not aligned as CDR is."""
+        """The number; 0 if ``cdr`` is too short, or its encapsulation is not plain CDR."""
         if len(cdr) < self.offset + self.little.size or cdr[1] > 1:
             return 0
         (value,) = (self.little if cdr[1] else self.big).unpack_from(cdr, self.offset)
@@ -84,12 +93,12 @@ class CounterField(NamedTuple):
 
 
 class MessageTypes:
-    """Finds message definitions by type name (``sensor_msgs/msg/Imu``), read when first asked for, then kept.
+    """Message definitions by type name (``sensor_msgs/msg/Imu``), read on first use and cached.
 
-    Looked for in ``<prefix>/share/<package>/msg/<Name>.msg`` of each prefix (the entries of AMENT_PREFIX_PATH, in their
-    order), then in its ``.idl``, then among the standard messages that ``rosbags`` ships. The messages of services and actions
-    are types too (``std_srvs/srv/Trigger_Event``). What was not found once stays unknown for the life of the object.
-    Thread-safe: ``_lock`` guards every change, readers see only what is complete.
+    Searches ``<prefix>/share/<package>/msg/<Name>.msg`` of each prefix (the entries of AMENT_PREFIX_PATH, in their order), then
+    the ``.idl``, then the standard messages that ``rosbags`` ships. The messages of services and actions are types too
+    (``std_srvs/srv/Trigger_Event``). A type that was not found stays unknown for the lifetime of the object. Thread-safe:
+    ``_lock`` guards every change; readers only see complete definitions.
     """
 
     def __init__(self, prefixes: Iterable[str | Path] = ()) -> None:
@@ -103,14 +112,14 @@ class MessageTypes:
     def deserialize(self, type_name: str, cdr: bytes | memoryview) -> Any:
         """The message as a ``rosbags`` dataclass: numbers, str, lists, numpy arrays that may be views of ``cdr``.
 
-        Text that is not UTF-8 is kept with U+FFFD in place of the bad bytes, as rclpy does.
-        Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, wrong lengths, no CDR at all).
+        U+FFFD replaces invalid UTF-8, as in rclpy.
+        Raises Rejected: ``unknown_type``, or ``malformed`` (truncated, too long, wrong lengths, not CDR).
         """
         self.fields(type_name)
         if type_name not in self._uncompiled:
             try:
                 return self._store.deserialize_cdr(cdr, type_name)
-            except SerdeError:  # of another vendor, or malformed
+            except SerdeError:  # another vendor's CDR, or malformed
                 pass
         return read_message(self._store, type_name, cdr)
 
@@ -120,7 +129,7 @@ class MessageTypes:
         return self._load(type_name) if known is None else known
 
     def has_header(self, type_name: str) -> bool:
-        """Whether the message begins with a std_msgs/msg/Header; False where the type is not known."""
+        """Whether the first field of the message is a std_msgs/msg/Header; False if the type is unknown."""
         try:
             _, description = self.fields(type_name)[0]
         except Rejected:
@@ -128,9 +137,9 @@ class MessageTypes:
         return description == (Nodetype.NAME, HEADER)
 
     def counter(self, type_name: str, field: str) -> CounterField:
-        """How to read a whole number at ``field`` (dotted: bms_state.cycle) from the CDR of a message.
+        """How to read the integer at ``field`` (dotted: bms_state.cycle) from the CDR of a message.
 
-        Raises Rejected: ``unknown_type``, or ``unknown_field`` where there is none, or none at a place that is always the same.
+        Raises Rejected: ``unknown_type``, or ``unknown_field`` if there is no such integer or its offset varies.
         """
         place, kind = 0, ''
         rest: list[str] = field.split('.')
@@ -144,18 +153,20 @@ class MessageTypes:
                 raise Rejected('unknown_field', f'{type_name} has no field {wanted!r}')
             if description[0] == Nodetype.NAME:
                 type_name = description[1]
-            elif description[0] == Nodetype.BASE and description[1][0] in _WHOLE and not rest:
+            elif description[0] == Nodetype.BASE and description[1][0] in _INTEGERS and not rest:
                 kind = description[1][0]
             else:
                 break
         if not kind:
-            raise Rejected('unknown_field', f'{field!r} is not a field of {type_name} with a whole number')
-        size = struct.calcsize(_WHOLE[kind])
+            raise Rejected('unknown_field', f'{field!r} is not an integer field of {type_name}')
+        size = struct.calcsize(_INTEGERS[kind])
         place += -place % size
-        return CounterField(place + ENCAPSULATION_BYTES, struct.Struct(f'<{_WHOLE[kind]}'), struct.Struct(f'>{_WHOLE[kind]}'))
+        return CounterField(
+            place + ENCAPSULATION_BYTES, struct.Struct(f'<{_INTEGERS[kind]}'), struct.Struct(f'>{_INTEGERS[kind]}')
+        )
 
     def _end(self, description: FieldDesc, place: int) -> int:
-        """Where a field ends that begins at ``place`` or, aligned, after it, in bytes after the encapsulation (XCDR1)."""
+        """The end of a field that starts at ``place``, aligned, in bytes after the encapsulation (XCDR1)."""
         if description[0] == Nodetype.BASE and description[1][0] in SIZES:
             size = SIZES[description[1][0]]
             return place + -place % size + size
@@ -168,7 +179,7 @@ class MessageTypes:
             for _, each in self.fields(description[1]):
                 place = self._end(each, place)
             return place
-        raise Rejected('unknown_field', 'it comes after a field whose length changes')
+        raise Rejected('unknown_field', 'it follows a field of variable length, so its offset varies')
 
     def _load(self, type_name: str) -> Fielddefs:
         with self._lock:
@@ -188,47 +199,47 @@ class MessageTypes:
             return self._known[type_name]
 
     def _compile(self, type_name: str) -> None:
-        """Under the lock, with all that is nested in it; ``rosbags`` has no code for a ``wstring``."""
+        """Compile the decoder of ``rosbags``, under the lock."""
         try:
             self._store.get_msgdef(type_name)
-        except KeyError:
+        except KeyError:  # ``rosbags`` cannot decode a wstring
             self._uncompiled.add(type_name)
 
     def _collect(self, type_name: str, definitions: Typesdict, within: tuple[str, ...]) -> None:
-        """Add the definition of a type and of all it is made of. Raises LookupError with a sentence."""
+        """Add the definitions of a type and its nested types. Raises LookupError with a sentence."""
         if type_name in within:
             raise LookupError(f'{type_name} contains itself')
         if type_name in definitions or type_name in self._store.fielddefs:
             return
-        definition = self._find(type_name)
+        definition = self._read_types(type_name)
         for _, description in definition[type_name][1]:
             nested = nested_type(description)
             if nested is not None:
                 self._collect(nested, definitions, (*within, type_name))
         definitions.update(definition)
 
-    def _find(self, type_name: str) -> Typesdict:
+    def _read_types(self, type_name: str) -> Typesdict:
         if not _TYPE_NAME.fullmatch(type_name):
             raise LookupError(f'{type_name!r} is not a message type')
         with suppress(FileNotFoundError):
             found = get_types_from_msg(read_definition(self._prefixes, type_name, 'msg'), type_name)
             if not any((nested_type(description) or '').endswith('/wstring') for _, description in found[type_name][1]):
                 return found
-        with suppress(FileNotFoundError, KeyError):  # ``rosbags`` knows a wstring only there
+        with suppress(FileNotFoundError, KeyError):  # ``rosbags`` supports wstring only in .idl
             found = get_types_from_idl(without_includes(read_definition(self._prefixes, type_name, 'idl')))
             return {type_name: found[type_name]}
-        if type_name not in self._shipped.fielddefs:
-            raise LookupError(f'no definition of {type_name}: is its package installed and sourced?')
-        return {type_name: self._shipped.fielddefs[type_name]}
+        if type_name not in self._standard_types.fielddefs:
+            raise LookupError(f'no definition of {type_name}: install its package and source its workspace')
+        return {type_name: self._standard_types.fielddefs[type_name]}
 
     @cached_property
-    def _shipped(self) -> Typestore:
-        """The standard messages of the newest distribution; loaded late because it takes 0.1 s."""
+    def _standard_types(self) -> Typestore:
+        """The standard messages of the newest distribution; loaded late because loading takes 0.1 s."""
         return get_typestore(Stores.LATEST)
 
 
 def nested_type(description: FieldDesc) -> str | None:
-    """The type name of a field that is a message, or an array or sequence of them; else None."""
+    """The type name of a field that is a message, or an array or sequence of messages; otherwise None."""
     if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         return nested_type(description[1][0])
     return description[1] if description[0] == Nodetype.NAME else None

@@ -1,7 +1,7 @@
-"""YUV images of cameras as planes of Y, U and V, at the resolution of the camera.
+"""YUV images of cameras as planes of Y, U and V, at the camera's resolution.
 
-A JPEG (JFIF) holds such planes as they are, in the colors of ITU-R BT.601 and the full range of values. Cameras and
-OpenCV (``cv_bridge``) use BT.601 in the limited range, 16 to 235 for Y: only the range is changed here, never the colors.
+A JPEG (JFIF) contains such planes directly, in ITU-R BT.601 colors and the full range of values. Cameras and OpenCV
+(``cv_bridge``) use BT.601 with the limited range, 16 to 235 for Y: this module converts only the range, never the colors.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Planes(NamedTuple):
-    """Of an image; those of U and V are smaller where pixels share them, rounded up."""
+    """The planes of an image. U and V are smaller where pixels share them; their sizes are rounded up."""
 
     y: Plane
     u: Plane
@@ -25,7 +25,7 @@ class Planes(NamedTuple):
 
 
 class _Packed(NamedTuple):
-    """Two pixels in four bytes: where they are."""
+    """Two pixels in four bytes: the position of the first Y, and of U and V."""
 
     y: int
     u: int
@@ -33,14 +33,14 @@ class _Packed(NamedTuple):
 
 
 class _SemiPlanar(NamedTuple):
-    """Y, then U and V in turns."""
+    """The Y plane, then alternating U and V."""
 
     columns: int
     """Pixels in a row that share U and V."""
     rows: int
-    """Rows of pixels that share them."""
+    """Rows that share U and V."""
     u: int
-    """Whether U comes first (0) or V (1)."""
+    """The position of U in each pair: 0 or 1."""
 
 
 _LAYOUTS: Final[dict[str, _Packed | _SemiPlanar]] = {
@@ -56,11 +56,11 @@ _LAYOUTS: Final[dict[str, _Packed | _SemiPlanar]] = {
     'nv24': _SemiPlanar(1, 1, 0),
     'nv42': _SemiPlanar(1, 1, 1),
 }
-"""By ROS encoding in lower case, and the names by which V4L2 and drivers know the same."""
+"""Layouts by ROS encoding in lower case; also by the names that V4L2 and drivers use."""
 
 
 def _full_range(low: int, high: int, middle: int, new_middle: int) -> bytes:
-    """A table from values of the limited range to those of the full one."""
+    """A table from limited-range to full-range values."""
     values = (np.arange(256) - middle) * (255 / (high - low)) + new_middle
     return bytes(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
@@ -74,23 +74,23 @@ def is_yuv(encoding: str) -> bool:
     return encoding.lower() in _LAYOUTS
 
 
-def planes_of(message: Any) -> Planes | None:
-    """Those of a sensor_msgs/msg/Image of such an encoding, full range; None if its data have not the size that this takes."""
+def read_planes(message: Any) -> Planes | None:
+    """The full-range planes of a sensor_msgs/msg/Image with a YUV encoding; None if the size of its data is wrong."""
     layout = _LAYOUTS[message.encoding.lower()]
     found = _packed(message, layout) if isinstance(layout, _Packed) else _semi_planar(message, layout)
     if found is None:
         return None
     y, u, v = found
-    return Planes(_translated(y, _LUMA), _translated(u, _CHROMA), _translated(v, _CHROMA))
+    return Planes(_apply_table(y, _LUMA), _apply_table(u, _CHROMA), _apply_table(v, _CHROMA))
 
 
-def _translated(part: Plane, table: bytes) -> Plane:
-    """Each value by the table; ``bytes`` does it in a sixth of the time that numpy takes."""
+def _apply_table(part: Plane, table: bytes) -> Plane:
+    # bytes.translate takes a sixth of the time of numpy indexing.
     return np.frombuffer(part.tobytes().translate(table), np.uint8).reshape(part.shape)
 
 
-def at_full_resolution(planes: Planes) -> Planes:
-    """The same with a U and a V for each pixel."""
+def upsample_chroma(planes: Planes) -> Planes:
+    """The planes with a U and a V for each pixel."""
     height, width = planes.y.shape
 
     def full(part: Plane) -> Plane:
@@ -106,7 +106,7 @@ def _packed(message: Any, layout: _Packed) -> tuple[Any, Any, Any] | None:
     if step < 2 * width or message.data.size != step * height:
         return None
     rows = message.data.reshape(height, step)[:, : 4 * pairs]
-    if rows.shape[1] < 4 * pairs:  # an odd width without the second half of its last pair: that of the pair before it
+    if rows.shape[1] < 4 * pairs:  # odd width without the second half of the last pair: use that of the previous pair
         half = rows[:, -4:-2] if width > 1 else np.full((height, 2), 128, np.uint8)
         rows = np.concatenate((rows[:, : 2 * width], half), axis=1)
     quads = rows.reshape(height, pairs, 4)
@@ -114,7 +114,7 @@ def _packed(message: Any, layout: _Packed) -> tuple[Any, Any, Any] | None:
 
 
 def _semi_planar(message: Any, layout: _SemiPlanar) -> tuple[Any, Any, Any] | None:
-    """``step`` is that of Y; publishers that set it to their size divided by the height are understood too."""
+    """``step`` should be the step of Y; also accepts publishers that set it to the data size divided by the height."""
     width, height, data = message.width, message.height, message.data
     columns, rows = -(-width // layout.columns), -(-height // layout.rows)
     for step in (message.step, width, 2 * columns):

@@ -25,7 +25,7 @@ from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
 from shadowhound_data_logger.formats.rows import parts
-from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MOST_TEXT, REMOVED
+from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MAX_TEXT, REMOVED
 from shadowhound_data_logger.formats.rows.schema import BUCKET, Row
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -69,10 +69,10 @@ class Label:
     def checked(self) -> Label:
         """With its id. Raises SettingError, NameRefused for an invalid label."""
         check_name(self.robot, 'the robot name')
-        if not self.label.strip() or len(self.label) > MOST_TEXT or not self.label.isprintable():
-            raise SettingError('label', self.label[:80], f'a text on one line, of at most {MOST_TEXT} letters')
-        if len(self.note) > 10 * MOST_TEXT:
-            raise SettingError('note', self.note[:80], f'a text of at most {10 * MOST_TEXT:,} letters')
+        if not self.label.strip() or len(self.label) > MAX_TEXT or not self.label.isprintable():
+            raise SettingError('label', self.label[:80], f'a text on one line, of at most {MAX_TEXT} letters')
+        if len(self.note) > 10 * MAX_TEXT:
+            raise SettingError('note', self.note[:80], f'a text of at most {10 * MAX_TEXT:,} letters')
         if not 0 <= self.since_ns <= self.until_ns < 1 << 63:
             raise SettingError('until', self.until_ns, f'a time after since, which is {self.since_ns}')
         box = [getattr(self, name) for name in _BOX]

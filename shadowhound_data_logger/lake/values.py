@@ -30,9 +30,9 @@ from shadowhound_data_logger.core.expression import MAX_SHOWN, STORED, Compariso
 from shadowhound_data_logger.core.expression import parse as parse_expression
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
-from shadowhound_data_logger.formats.image import of_jpeg
-from shadowhound_data_logger.formats.pointcloud import of_points
-from shadowhound_data_logger.formats.records import AT_ONCE
+from shadowhound_data_logger.formats.image import jpeg_statistics
+from shadowhound_data_logger.formats.pointcloud import point_statistics
+from shadowhound_data_logger.formats.records import RECORDS_PER_PART
 from shadowhound_data_logger.formats.rows.schema import OBJECTS as OBJECT_ROWS
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS
 from shadowhound_data_logger.formats.statistics import (
@@ -42,7 +42,7 @@ from shadowhound_data_logger.formats.statistics import (
     FieldStatistics,
     Statistic,
     covers,
-    values_of,
+    field_values,
 )
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, default_source
@@ -612,15 +612,15 @@ def statistics_of(key: str, body: bytes, chosen: Sequence[str] = ()) -> dict[str
     if extension == _JSON:
         return _collected(records(body), chosen)
     if extension == _PCD:
-        return of_points(cloud_points(body))
-    return of_jpeg(body) if extension == _JPEG else {}
+        return point_statistics(cloud_points(body))
+    return jpeg_statistics(body) if extension == _JPEG else {}
 
 
 def _collected(messages: Sequence[Mapping[str, Any]], chosen: Sequence[str]) -> dict[str, Statistic]:
     collected = FieldStatistics(chosen)
-    for start in range(0, len(messages), AT_ONCE):
-        collected.add(messages[start : start + AT_ONCE])
-    return collected.told()
+    for start in range(0, len(messages), RECORDS_PER_PART):
+        collected.add(messages[start : start + RECORDS_PER_PART])
+    return collected.result()
 
 
 def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
@@ -632,7 +632,7 @@ def _met(expression: Expression, messages: Sequence[Mapping[str, Any]]) -> Mask:
     assert isinstance(expression, Comparison)
     if expression.function:
         return np.full(len(messages), _met_by(expression, _collected(messages, (expression.path,)), None))
-    return np.array([any(map(expression.holds, values_of(each, expression.path))) for each in messages], bool)
+    return np.array([any(map(expression.holds, field_values(each, expression.path))) for each in messages], bool)
 
 
 def _met_by(expression: Expression, found: Mapping[str, Statistic], points: NDArray[Any] | None) -> bool:

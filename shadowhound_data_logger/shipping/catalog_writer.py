@@ -24,7 +24,7 @@ from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS, WITHDRAWN, Statement, complete, date_of, name_of, statement
 from shadowhound_data_logger.formats.rows.schema import BUCKET, KEPT, OBJECTS, SENSOR, Row, TableSchema, row_of
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
-from shadowhound_data_logger.formats.statistics import unpacked_statistics
+from shadowhound_data_logger.formats.statistics import unpack_statistics
 from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
@@ -116,7 +116,7 @@ class CatalogWriter:
             told = (
                 (number, one)
                 for number, row in rows[begin : begin + OBJECTS_A_PART]
-                for one in statistic_rows(row, unpacked_statistics(packed[number]))
+                for one in statistic_rows(row, unpack_statistics(packed[number]))
             )
             yield from (self._part(*each, STATISTICS) for each in parts.by_folder(told))
 

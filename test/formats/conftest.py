@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, Sample
-from shadowhound_data_logger.formats.registry import Encoding, encode
+from shadowhound_data_logger.formats.encoders import Encoding, encode
 from shadowhound_data_logger.formats.types import MessageTypes
 
 GO2_MESSAGES = Path(__file__).parents[2] / 'interfaces' / 'go2_interfaces' / 'msg'

@@ -21,7 +21,7 @@ import numpy as np
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
 from shadowhound_data_logger.core.options import FORMATS
-from shadowhound_data_logger.formats.registry import Encoding, encode
+from shadowhound_data_logger.formats.encoders import Encoding, encode
 from shadowhound_data_logger.formats.types import MessageTypes, header_frame_id, header_stamp_ns
 
 LENGTHS: Final = (0, 1, 2, 3, 4, 5, 0x7F, 0xFF, 0x100, 0xFFFF, 0x10000, 0xFF_FFFF, 0x3FFF_FFFF, 0x7FFF_FFFF, 0x8000_0000,

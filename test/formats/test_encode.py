@@ -13,7 +13,7 @@ from profiles import examples
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.core.config import FORMATS
-from shadowhound_data_logger.formats.registry import ENCODERS
+from shadowhound_data_logger.formats.encoders import ENCODERS
 
 IMU = 'go2_interfaces/msg/IMU'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from shadowhound_data_logger.formats.statistics import ALL, unpacked_statistics
+from shadowhound_data_logger.formats.statistics import ALL, unpack_statistics
 from shadowhound_data_logger.lake.values import statistics_of
 
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -152,7 +152,7 @@ def test_a_jpeg_has_brightness_and_sharpness(ros: Any) -> None:
     for name, gray in (('dark', np.full((96, 128), 20)), ('board', board)):
         picture = np.repeat(gray[:, :, None].astype(np.uint8), 3, axis=2)
         made = compressed(ros, bytes(simplejpeg.encode_jpeg(picture, quality=95))).object
-        told[name] = unpacked_statistics(made.statistics)
+        told[name] = unpack_statistics(made.statistics)
         assert told[name] == statistics_of(made.key, made.body)
         assert (set(told[name]), told[name][ALL].count) == ({ALL, 'brightness', 'sharpness'}, 1)
     assert told['dark']['brightness'].mean == pytest.approx(20, abs=2)

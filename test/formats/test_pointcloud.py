@@ -13,7 +13,7 @@ from profiles import examples
 from pypcd4.pypcd4 import PointCloud
 
 from shadowhound_data_logger.formats.pointcloud import xyz_of
-from shadowhound_data_logger.formats.statistics import ALL, unpacked_statistics
+from shadowhound_data_logger.formats.statistics import ALL, unpack_statistics
 from shadowhound_data_logger.lake.values import statistics_of
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
@@ -204,7 +204,7 @@ def test_no_points_are_a_measurement(ros: Any, shape: dict[str, int]) -> None:
     made = ros.encode(CLOUD, cloud(ros, XYZI, b'', point_step=16, **shape))
     assert (made.rejected, made.corrected, made.object.metadata['points']) == ({}, {}, '0')
     assert (read(made.object.body).points, header(made.object.body)['POINTS']) == (0, '0')
-    assert statistics_of(made.object.key, made.object.body) == unpacked_statistics(made.object.statistics)
+    assert statistics_of(made.object.key, made.object.body) == unpack_statistics(made.object.statistics)
 
 
 def test_fields_that_overlap(ros: Any) -> None:
@@ -295,7 +295,7 @@ def test_a_cloud_has_its_number_of_points_and_their_bounds(ros: Any) -> None:
     """Field by field, with how many are not finite; whoever opens the object finds the same."""
     points = xyzi()
     made = ros.encode(CLOUD, cloud(ros, XYZI, points.tobytes(), width=5, point_step=16)).object
-    told = unpacked_statistics(made.statistics)
+    told = unpack_statistics(made.statistics)
     assert told == statistics_of(made.key, made.body)
     assert (set(told), told['points'].max) == ({ALL, 'points', 'x', 'y', 'z', 'intensity'}, 5)
     assert (told['x'].min, told['x'].max, told['x'].count) == (points[:, 0].min(), points[:, 0].max(), 5)

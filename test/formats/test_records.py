@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
-from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.rows.schema import row_of
 from shadowhound_data_logger.formats.statistics import ALL, FieldStatistics
 from shadowhound_data_logger.formats.types import MessageTypes
@@ -295,7 +295,7 @@ def test_statistics_count_infinities(ros: Any) -> None:
     """Among what is not finite, also where they are read from the JSON again."""
     found = FieldStatistics()
     found.add([{'a': ['Infinity', 1.0, None], 'b': '-Infinity', 'c': 'text'}, {'a': [2.0, 1.0, 3.0], 'b': 4.0, 'c': 'Infinite'}])
-    assert {name: (each.count, each.nan_count, each.max) for name, each in found.told().items() if name != ALL} == {
+    assert {name: (each.count, each.nan_count, each.max) for name, each in found.result().items() if name != ALL} == {
         'a.0': (1, 1, 2.0), 'a.1': (2, 0, 1.0), 'a.2': (1, 1, 3.0), 'b': (1, 1, 4.0),
     }  # fmt: skip
 

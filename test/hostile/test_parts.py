@@ -139,7 +139,7 @@ def test_rows_of_others_are_refused_and_counted_and_the_rest_of_the_part_is_answ
     found = lake.objects(source, findings=findings)['key'].to_pylist()
     assert sorted(found) == sorted([*before, *(str(each['key']) for each in mine)])
     assert [(one.key, one.rows) for one in findings] == [(key, 3)]
-    assert '3 rows are rejected: of another robot (first in line 3)' in str(next(iter(findings)))
+    assert '3 rows are rejected: names another robot (first in line 3)' in str(next(iter(findings)))
 
 
 def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:

@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
-from shadowhound_data_logger.formats.statistics import MOST_FIELDS, FieldStatistics
+from shadowhound_data_logger.formats.statistics import MAX_FIELDS, FieldStatistics
 from shadowhound_data_logger.lake import query, values
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
@@ -71,7 +71,7 @@ def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], ch
             if is_told:
                 found = FieldStatistics(chosen)
                 found.add(orjson.loads(content)['samples'])
-                statistics += statistic_rows(row, found.told())
+                statistics += statistic_rows(row, found.result())
         add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
         for name in 'ab' if statistics else '':  # told twice, as after a power cut
             key = STATISTICS.part_key('thor', '2026-10-28', f'20261028T12000{"ab".index(name)}_{name}')
@@ -231,9 +231,9 @@ def test_other_readers_read_the_statistics(tmp_path: Path) -> None:
 
 def test_fields_beyond_the_bound_are_unknown(tmp_path: Path) -> None:
     """The first fields have statistics; of the others nobody says that they never were so."""
-    wide = [[{f'f{place:03d}': 1.0 for place in range(MOST_FIELDS + 1)}]]
+    wide = [[{f'f{place:03d}': 1.0 for place in range(MAX_FIELDS + 1)}]]
     source = filled(tmp_path, wide, [True])
-    last = f's.f{MOST_FIELDS:03d} = 1'
+    last = f's.f{MAX_FIELDS:03d} = 1'
     assert (values.ranges('s.f063 = 1', source).unknown, len(values.ranges('s.f063 = 1', source).ranges)) == (0, 1)
     assert (values.ranges(last, source).unknown, len(values.ranges(last, source).ranges)) == (1, 0)
     assert len(values.ranges(last, source, scan=True).ranges) == 1

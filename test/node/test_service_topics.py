@@ -23,10 +23,10 @@ from rosbags.highlevel import AnyReader
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch
 from shadowhound_data_logger.formats.definitions import describe
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
-from shadowhound_data_logger.formats.registry import encode
 from shadowhound_data_logger.formats.types import MessageTypes
 
 pytestmark = pytest.mark.ros

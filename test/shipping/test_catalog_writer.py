@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.core.zstd import ZstdDecompressor
-from shadowhound_data_logger.formats.statistics import FieldStatistics, packed
+from shadowhound_data_logger.formats.statistics import FieldStatistics, pack_statistics
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -236,7 +236,7 @@ def test_statistics_go_into_parts_of_their_own_once_the_object_is_delivered(spoo
     said = {name: FieldStatistics() for name in 'ab'}
     said['a'].add([{'x': 1.5}, {'x': None}])
     said['b'].add([{'x': 9.0}])
-    told = {name: packed(each.told()) for name, each in said.items()}
+    told = {name: pack_statistics(each.result()) for name, each in said.items()}
     first, second, third = put(spool, of('a', statistics=told['a']), of('b', statistics=told['b']), of('c'))
     assert catalog.parts() == []
     spool.commit(outcomes=[Outcome(second, State.EVICTED)])
@@ -260,7 +260,7 @@ def test_statistics_of_many_objects_go_into_several_parts(
     monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.OBJECTS_A_PART', 2)
     said = FieldStatistics()
     said.add([{'x': 1.5}])
-    deliver(spool, put(spool, *(of(name, statistics=packed(said.told())) for name in 'abcde')))
+    deliver(spool, put(spool, *(of(name, statistics=pack_statistics(said.result())) for name in 'abcde')))
     made = [part for part in catalog.parts() if '/_stats/' in part.key]
     found = [lines(part.body) for part in made if isinstance(part.body, bytes)]
     assert [sorted({row['key'] for row in rows}) for rows in found] == [['a', 'b'], ['c', 'd'], ['e']]

@@ -1,11 +1,11 @@
-"""The gap journal in the store: statements of what was lost, and of the time for which losses are known, in row files.
+"""The gap journal in the store: row files with statements about losses, and about the time up to which losses are known.
 
 A row is a statement and never changes: a later statement about the same gap has the same ``id`` and a higher ``revision``. The
-newest counts; ``withdrawn`` means that the gap does not exist any more (a late message filled it, an object was retried). So
-statements can arrive in any order, or twice: the answer is the same.
+newest one is valid; ``withdrawn`` means that the gap no longer exists (a late message filled it, an object was retried). The
+result does not depend on the order in which statements arrive, or on duplicates.
 
-``complete`` statements are the watermark of a sink and topic: all losses between their two times have statements, and everything
-else is in the store. After the last such statement, losses are unknown. Row files are at
+``complete`` statements are the watermark of a sink and topic: all losses between their two times have statements, and all other
+messages are in the store. After the last such statement, losses are unknown. Row files are at
 ``<robot>/_gaps/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<...>.jsonl.zst``; the date is that of ``to_ns``, UTC: a query for a
 time reads its own date and the later ones.
 """
@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, utc
 from shadowhound_data_logger.formats.rows.schema import GAPS_FOLDER, INT32, INT64, STRING, TIME, UNDATED, TableSchema
 
 FORMAT_VERSION: Final = 1
-"""Of the statements. Columns are only ever added, at the end."""
+"""Version of the statements. Columns are only ever added, at the end."""
 GAP, WITHDRAWN, COMPLETE = 'gap', 'withdrawn', 'complete'
 """Values of ``what``."""
 GAPS: Final = TableSchema(
@@ -54,21 +54,21 @@ GAPS: Final = TableSchema(
 )
 """``sink topic publisher session kind cause count merged grade mission_id`` are those of ``shadowhound-data ledger --gaps``.
 
-Of a gap, ``from_ns`` is the stamp of the last message before it and ``to_ns`` that of the first one after it;
+In a gap, ``from_ns`` is the stamp of the last message before it and ``to_ns`` that of the first one after it;
 ``received_from_ns`` and ``received_to_ns`` are when these two messages arrived. A ``complete`` statement covers ``from_ns`` to
 ``to_ns``. All are null if the time is unknown. ``clock`` is ``unset`` if they count from the robot's boot: then ``t_from`` and
 ``t_to`` are null. ``received`` and ``skipped`` (downsampled) are the messages of the session until ``to_ns``; only ``complete``
 statements have them.
 """
 WATERMARK_NS: Final = 600 * SECOND
-"""The newest ``complete`` statement of a session in each period of this length counts."""
+"""In each period of this length, the newest ``complete`` statement of a session is valid."""
 
 Statement = dict[str, Any]
 """Column -> value; a time as an int of microseconds."""
 
 
 def statement(robot: str, what: str, name: str, revision: int, **columns: Any) -> Statement:
-    """A row; columns that are not given are null. ``name`` identifies the gap among all of the robot."""
+    """A row; columns that are not given are null. ``name`` identifies the gap among all gaps of the robot."""
     found: Statement = dict.fromkeys(GAPS.columns)
     found.update(columns, robot=robot, what=what, id=name, revision=revision, format_version=FORMAT_VERSION)
     is_dated = found['clock'] != 'unset'

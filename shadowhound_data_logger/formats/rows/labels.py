@@ -1,4 +1,4 @@
-"""The table of labels (lake/labels.py) of times, objects and boxes in them."""
+"""The table of labels of times, objects and boxes in objects (lake/labels.py)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shadowhound_data_logger.formats.rows.schema import DOUBLE, INT32, INT64, LA
 LABEL, REMOVED = 'label', 'removed'
 LABEL_KINDS: Final = (LABEL, REMOVED)
 """Values of ``what``."""
-MOST_TEXT: Final = 200
+MAX_TEXT: Final = 200
 LABELS: Final = TableSchema(
     folder=LABELS_FOLDER,
     columns={
@@ -33,5 +33,5 @@ LABELS: Final = TableSchema(
     },
     required=('robot', 'what', 'id', 'label', 'since_ns', 'until_ns', 'made_ns', 'format_version'),
 )
-"""Every label has ``since_ns`` to ``until_ns``, both included; that of an object has ``bucket key``, and that of a box in it
-``x y width height``, in pixels. ``by`` is the author and ``made`` the time; the newest row of an ``id`` counts."""
+"""Every label has ``since_ns`` to ``until_ns``, both included. The label of an object also has ``bucket key``, and the label of a
+box in it ``x y width height``, in pixels. ``by`` is the author and ``made`` the time; the newest row of an ``id`` is valid."""

@@ -1,9 +1,9 @@
 """Row files: what robots write about their data, one JSON object per line, compressed with zstd (docs/formats.md).
 
 Every line has its kind as ``row`` (an object, a gap, ...) and the columns of that kind's table; a column that is null is omitted.
-Anybody with a robot's keys can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a limit,
-bounds the lines, and checks the type and range of each value. A row may name only its own robot and the keys of that robot.
-Rejected lines are counted by reason, and the other rows are used.
+Anyone with a robot's credentials can write such a file, so the reader trusts nothing: it decompresses piece by piece up to a
+limit, bounds the lines, and checks the type and range of each value. A row may name only its own robot and the keys of that
+robot. Rejected lines are counted by reason, and the other rows are used.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MAX_FILE_BYTES: Final = 16 << 20
 MAX_BYTES: Final = 64 << 20
 """Decompressed: the statistics of 400 objects can have 26,000 rows, which take 10 MB."""
 MAX_RATIO: Final = 400
-"""Of the decompressed size, beyond the slack, to that of the file. Rows that differ only in a number reach 230."""
+"""Maximum ratio of the decompressed size, minus the slack, to the file size. Rows that differ only in a number reach 230."""
 SLACK_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 64 << 10
 MAX_LINES: Final = 100_000
@@ -96,7 +96,7 @@ class RowsRead:
     def findings(self) -> str:
         """What is missing and why, in a sentence; empty for a valid file."""
         found = [f'{rows_are(each.lines)} rejected: {each.why} (first in line {each.first:,})' for each in self.rejected]
-        return '; '.join([*found, *([f'the rest of it is not read: {self.ended}'] if self.ended else [])])
+        return '; '.join([*found, *([f'the rest of the file is not read: {self.ended}'] if self.ended else [])])
 
 
 def rows_are(count: int) -> str:
@@ -110,7 +110,7 @@ def encode(rows: Sequence[Row], of: TableSchema = OBJECTS) -> bytes:
 
 
 def by_folder(rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[str | None, str, list[tuple[int, Row]]]]:
-    """(robot, date, rows in the order of their times) of each file that is written; each row with the id of its object."""
+    """(robot, date, rows sorted by time) for each file to write; each row with the id of its object."""
     folders: dict[tuple[str | None, str], list[tuple[int, Row]]] = {}
     for number, row in rows:
         folders.setdefault((row['robot'], date_of(row)), []).append((number, row))
@@ -140,14 +140,14 @@ def read_rows(content: bytes, robot: str) -> RowsRead:
 
 def _line(row: Row, of: TableSchema) -> bytes:
     kind = _KIND_OF[of.folder] if row.get('what') != COMPLETE else 'watermark'
-    told = {'row': kind, **{name: value for name, value in row.items() if value is not None}}
+    line = {'row': kind, **{name: value for name, value in row.items() if value is not None}}
     try:
-        return orjson.dumps(told, option=orjson.OPT_APPEND_NEWLINE)
-    except TypeError:  # half a surrogate pair in a text
-        told = {
-            name: value.encode(errors='replace').decode() if isinstance(value, str) else value for name, value in told.items()
+        return orjson.dumps(line, option=orjson.OPT_APPEND_NEWLINE)
+    except TypeError:  # a lone surrogate in a text
+        line = {
+            name: value.encode(errors='replace').decode() if isinstance(value, str) else value for name, value in line.items()
         }
-        return orjson.dumps(told, option=orjson.OPT_APPEND_NEWLINE)
+        return orjson.dumps(line, option=orjson.OPT_APPEND_NEWLINE)
 
 
 def _lines(content: bytes, found: RowsRead) -> Iterator[bytes | None]:
@@ -161,7 +161,7 @@ def _lines(content: bytes, found: RowsRead) -> Iterator[bytes | None]:
         if len(rest) > MAX_LINE_BYTES:
             rest, is_long = b'', True
     if (rest or is_long) and found.ended is None:
-        found.ended = 'its last line has no end'
+        found.ended = 'its last line is incomplete'
 
 
 def _pieces(content: bytes, found: RowsRead) -> Iterator[bytes]:
@@ -199,22 +199,22 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
     if line is None:
         raise ValueError(f'longer than {MAX_LINE_BYTES:,} bytes')
     try:
-        said = orjson.loads(line)
+        values = orjson.loads(line)
     except orjson.JSONDecodeError:
         raise ValueError('not JSON') from None
-    kind = said.pop('row', None) if isinstance(said, dict) else None
+    kind = values.pop('row', None) if isinstance(values, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError('no known kind of row')
     of = KINDS[kind]
     checks = _CHECKS[of.folder]
-    for name, value in said.items():
+    for name, value in values.items():
         check = checks.get(name)
         if check is not None and value is not None and not check(value):
             raise ValueError(f'{name} is invalid')
-    has_unknown = not checks.keys() >= said.keys()
+    has_unknown = not checks.keys() >= values.keys()
     if has_unknown:
-        said = {name: value for name, value in said.items() if name in checks}
-    row = {**_EMPTY[of.folder], **said}
+        values = {name: value for name, value in values.items() if name in checks}
+    row = {**_EMPTY[of.folder], **values}
     for name in _REQUIRED[of.folder]:
         if row[name] is None:
             raise ValueError(f'{name} is missing')
@@ -230,9 +230,9 @@ def _checked(line: bytes | None, robot: str) -> tuple[TableSchema, Row, bool]:
 def _check_owner(row: Row, robot: str, of: TableSchema) -> None:
     named = row['robot']
     if named != robot and (named is not None or of.folder in _OWNED_BY_ROBOT):
-        raise ValueError('of another robot')
+        raise ValueError('names another robot')
     if of.folder not in _OWNED_BY_ROBOT and not row['key'].startswith(f'{robot}/'):
-        raise ValueError('of a key of another robot')
+        raise ValueError('has a key of another robot')
 
 
 def _is_text(value: Any) -> bool:

@@ -21,11 +21,11 @@ from shadowhound_data_logger.core.earth import is_place
 STRING, INT32, INT64, DOUBLE, TIME = 'string', 'int32', 'int64', 'double', 'time'
 """Kinds of columns. ``TIME`` is whole microseconds since 1970, UTC."""
 SUFFIX: Final = '.jsonl.zst'
-"""Of the names of row files."""
+"""Suffix of the names of row files."""
 FORMAT_VERSION: Final = 1
-"""Of the rows. Columns are only ever added, at the end."""
+"""Version of the rows. Columns are only ever added, at the end."""
 BUCKET: Final = 'sensor-data'
-"""Of the catalog; its rows name objects of any bucket."""
+"""The catalog's bucket; its rows name objects in any bucket."""
 COLUMNS: Final[Mapping[str, str]] = {
     'robot': STRING,
     'sensor': STRING,
@@ -61,18 +61,18 @@ COLUMNS: Final[Mapping[str, str]] = {
 }
 """Name -> kind. ``bucket``, ``key``, ``bytes`` and ``format_version`` are never null; others are null if unknown.
 
-Times are in microseconds, because Spark reads no TIMESTAMP(NANOS); the exact times are also there as int64.
+Times are in microseconds, because Spark cannot read TIMESTAMP(NANOS); the ``_ns`` columns have the exact times.
 ``x y yaw`` are meters and radians (REP-103) in the frame ``pose_frame``, the map or that of the odometry, and ``latitude
 longitude altitude`` are degrees and meters (WGS 84), at the object's time: ``t_start`` of a single message, the middle of a
 batch. ``clock`` is how well the times are known (spool/redating.py). With ``unset`` there is no date: ``t_start`` and ``t_end``
 are null, the ns count from the robot's boot, and the file is below ``date=1970-01-01``. With ``set_later``, ``clock_offset_ns``
-must be added to the times in the content. ``received_*`` is when its messages arrived;
-``by_arrival`` of them are dated by that, because their stamps were not trusted.
+must be added to the times in the content. ``received_*`` is when the messages arrived; ``by_arrival`` is the number of messages
+dated by their arrival because their stamps were not trusted.
 """
 REQUIRED: Final = ('bucket', 'key', 'bytes', 'format_version')
 UNDATED: Final = '1970-01-01'
 SENSOR: Final = '_catalog'
-"""Of row files, which have no rows themselves."""
+"""The folder of the catalog's row files, which have no rows themselves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +85,7 @@ class TableSchema:
     required: tuple[str, ...]
     """Columns without nulls."""
     is_apart: bool = False
-    """Whether the files are outside of the robots' folders: a robot's credentials may not write them."""
+    """Whether the files are outside the robots' folders, where a robot's credentials cannot write them."""
 
     def prefix(self, robot: str) -> str:
         """The start of the keys of a robot's row files."""
@@ -102,11 +102,11 @@ class TableSchema:
 
 OBJECTS: Final = TableSchema(SENSOR, COLUMNS, REQUIRED)
 KEPT: Final = TableSchema('_kept', {**COLUMNS, 'where': STRING, 'reason': STRING}, (*REQUIRED, 'where'))
-"""What robots keep until it is requested: rows like those of the catalog, and ``where`` each object is.
+"""Objects that robots keep until they are requested: rows like those of the catalog, and ``where`` each object is.
 
 ``robot``: on the robot's disk. ``lost``: evicted there, or rejected by the store; ``reason`` is why. A row of the same object in
-the catalog supersedes both, because the store has the object then, and ``lost`` supersedes ``robot``, in any order. Readers of
-the catalog alone see only what the store has.
+the catalog supersedes both, because the store has the object then, and ``lost`` supersedes ``robot``, in any order. The catalog
+itself has only objects that are in the store.
 """
 FORGOTTEN: Final = TableSchema(
     '_forgotten',
@@ -129,14 +129,14 @@ FORGOTTEN: Final = TableSchema(
     ('bucket', 'key', 'bytes', 't_start_ns', 'forgotten_ns', 'format_version'),
     is_apart=True,
 )
-"""What ``lake prune`` deleted from the store: columns of the object's row in the catalog, when it was ``forgotten``, and by which
-``rule``.
+"""Objects that ``lake prune`` deleted from the store: columns of the object's row in the catalog, the time (``forgotten``), and
+the ``rule``.
 
 The row in the catalog is kept; one here, with the same date, supersedes it. It is written before the object is deleted: a robot
 that could write such a row could have objects deleted.
 """
 GAPS_FOLDER: Final = '_gaps'
-"""Of the gap journal's row files."""
+"""The folder of the gap journal's row files."""
 STATISTICS_FOLDER: Final = '_stats'
 LABELS_FOLDER: Final = '_labels'
 
@@ -158,7 +158,7 @@ def date_of(row: Row) -> str:
 def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mapping[str, str]) -> Row:
     """The row of an object from its S3 metadata; never raises: missing or invalid values are null.
 
-    ``robot`` is that of its key, whatever the metadata is; so is ``sensor`` without metadata.
+    ``robot`` always comes from the key; ``sensor`` comes from the key if the metadata does not have it.
     """
     parts = key.split('/')
     start_ns, end_ns = _int(metadata, words.T_START_NS, words.BOOT_START_NS), _int(metadata, words.T_END_NS, words.BOOT_END_NS)
@@ -218,7 +218,7 @@ def _micros(stamp_ns: int | None) -> int | None:
 
 
 def _int(metadata: Mapping[str, str], *names: str) -> int | None:
-    """The first of these that exists, as an integer of 64 bits; None if it is not one."""
+    """The first of these that exists, as a 64-bit integer; None if it is not one."""
     for name in names:
         if name in metadata:
             try:

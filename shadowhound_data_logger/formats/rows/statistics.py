@@ -14,7 +14,7 @@ from shadowhound_data_logger.formats.rows.schema import DOUBLE, INT32, INT64, ST
 from shadowhound_data_logger.formats.statistics import NUMBERS, Statistic, numbers_of
 
 FORMAT_VERSION: Final = 1
-"""Of the rows. Columns are only ever added, at the end."""
+"""Version of the rows. Columns are only ever added, at the end."""
 STATISTICS: Final = TableSchema(
     folder=STATISTICS_FOLDER,
     columns={
@@ -38,14 +38,14 @@ STATISTICS: Final = TableSchema(
 )
 """``robot sensor bucket key t_start t_start_ns`` are those of the object's row in the catalog.
 
-``first last min max mean`` are of the ``count`` finite numbers of a ``field``; ``nan_count`` were NaN or infinite. The row whose
-``field`` is empty is of the object as a whole: ``count`` messages, and ``nan_count`` fields without statistics.
+``first last min max mean`` describe the ``count`` finite numbers of a ``field``; ``nan_count`` were NaN or infinite. The row with
+an empty ``field`` is about the object: ``count`` messages, and ``nan_count`` fields without statistics.
 """
 _OF_OBJECT: Final = ('robot', 'sensor', 'bucket', 'key', 't_start', 't_start_ns')
 
 
 def statistic_rows(of: Row, found: Mapping[str, Statistic]) -> Iterator[Row]:
-    """The rows of an object by its row in the catalog."""
+    """The statistics rows of an object; ``of`` is its row in the catalog."""
     common = {name: of[name] for name in _OF_OBJECT}
     for field, each in found.items():
         numbers = dict(zip(NUMBERS, numbers_of(each), strict=True))

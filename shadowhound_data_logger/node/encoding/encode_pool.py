@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.model import Batch, DataObject
 from shadowhound_data_logger.core.stamps import by_arrival
 from shadowhound_data_logger.core.status import QueueStatus
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.rejections import ENCODER_FAILED, RejectionLog
 from shadowhound_data_logger.spool.writer import SpoolWriter

@@ -108,12 +108,12 @@ BAD: dict[str, tuple[bytes, str]] = {
     'a size below zero': (line(bytes=-1), 'bytes is invalid'),
     'no size': (line(bytes=None), 'bytes is missing'),
     'a year of six digits': (line(t_start=1 << 62), 't_start is invalid'),
-    'another robot': (line(robot='tachi'), 'of another robot'),
-    'the key of another robot': (line(key='tachi/camera/1.jpg'), 'of a key of another robot'),
+    'another robot': (line(robot='tachi'), 'names another robot'),
+    'the key of another robot': (line(key='tachi/camera/1.jpg'), 'has a key of another robot'),
     'a bucket that is a path': (line(bucket='../etc'), 'bucket is invalid'),
     'a gap of another robot': (
         orjson.dumps({'row': 'gap', 'robot': 'tachi', 'what': 'gap', 'id': 'a', 'revision': 1, 'sink': 's', 'topic': 't',
-                      'format_version': 1}) + b'\n', 'of another robot',
+                      'format_version': 1}) + b'\n', 'names another robot',
     ),
     'a gap that says it is a watermark': (
         orjson.dumps({'row': 'gap', 'robot': 'thor', 'what': 'complete', 'id': 'a', 'revision': 1, 'sink': 's', 'topic': 't',
@@ -157,7 +157,7 @@ def test_a_truncated_file_gives_the_rows_before_the_cut() -> None:
         assert (found.ended, bool(read)) == ('it is truncated', True)
     assert parts.read_rows(b'', 'thor').ended == 'it is empty'
     assert 'cannot be decompressed' in str(parts.read_rows(b'PAR1 is another format', 'thor').ended)
-    assert parts.read_rows(compress(line() + line()[:-9]), 'thor').ended == 'its last line has no end'
+    assert parts.read_rows(compress(line() + line()[:-9]), 'thor').ended == 'its last line is incomplete'
 
 
 BOMBS: dict[str, Callable[[], bytes]] = {

@@ -13,7 +13,7 @@ import pytest
 from shadowhound_data_logger.core.config import QueueSettings, SensorSettings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.core.stamps import Times, by_arrival
-from shadowhound_data_logger.formats.registry import Encoding, encode
+from shadowhound_data_logger.formats.encoders import Encoding, encode
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding import encode_pool as pool_module
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, EncodePool

@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample
 from shadowhound_data_logger.core.options import POINT_CLOUD
 from shadowhound_data_logger.core.status import MissionStatus
-from shadowhound_data_logger.formats.registry import encode
+from shadowhound_data_logger.formats.encoders import encode
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.missions import journal
 from shadowhound_data_logger.missions.folder import Run, missions

@@ -1,4 +1,4 @@
-"""The registry of formats, and the one call that turns a batch into an object. No input makes it raise."""
+"""The encoder of each format, and ``encode``, which turns a batch into an object. No input makes it raise."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ ENCODERS: Final[Mapping[str, Encoder]] = {
     'zip': archive(pack_zip, 'zip', 'application/zip'),
     'tar': archive(pack_tar, 'tar', 'application/x-tar'),
 }
-"""Format name of the settings -> encoder. A new format is one file and one line here (and its name in options.FORMATS)."""
+"""Format name in the settings -> encoder. A new format is one file and one line here (and its name in options.FORMATS)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """What became of a batch: ``object.samples`` plus the sum of ``rejected`` is its number of samples.
+    """The result of encoding a batch: ``object.samples`` plus the sum of ``rejected`` is its number of samples.
 
-    Those that were corrected are among ``object.samples``.
+    ``object.samples`` includes the corrected samples.
     """
 
     object: DataObject | None
-    """None when no sample could be encoded."""
+    """None if no sample could be encoded."""
     rejections: tuple[Rejection, ...] = ()
-    """The samples that are not in it, by reason and publisher."""
+    """The samples that are not in the object, by reason and publisher."""
     corrected: Mapping[str, int] = field(default_factory=dict)
-    """Reason -> number of samples that are in the object although something was wrong with them."""
+    """Reason -> number of samples that were corrected and are in the object."""
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -65,7 +65,7 @@ class Encoding:
 
     @property
     def details(self) -> dict[str, str]:
-        """Reason -> what was wrong with the first of them."""
+        """Reason -> what was wrong with the first rejected sample."""
         found: dict[str, str] = {}
         for each in self.rejections:
             found.setdefault(each.reason, each.text)
@@ -73,10 +73,10 @@ class Encoding:
 
 
 def encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes) -> Encoding:
-    """Encode a batch in the sensor's format. Thread-safe; a sample that cannot be encoded is counted, the rest goes on."""
+    """Encode a batch in the sensor's format. Thread-safe. A sample that cannot be encoded is counted and skipped."""
     rejections = Rejections()
-    made = _encode(batch, sensor, robot, types, rejections)
-    return Encoding(made, tuple(rejections.found.values()), dict(rejections.corrected) if made else {})
+    encoded = _encode(batch, sensor, robot, types, rejections)
+    return Encoding(encoded, tuple(rejections.found.values()), dict(rejections.corrected) if encoded else {})
 
 
 def _encode(batch: Batch, sensor: SensorSettings, robot: str, types: MessageTypes, rejections: Rejections) -> DataObject | None:
@@ -125,7 +125,7 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
 
 
 def _other_times(samples: Sequence[Sample]) -> dict[str, str]:
-    """When the messages arrived, if that is known, and the stamps of those that are dated by their arrival."""
+    """The arrival times of the messages, if known, and the stamps of messages that are dated by their arrival."""
     found: dict[str, str] = {}
     received = [sample.received_ns for sample in samples if sample.received_ns >= EARLIEST_SANE_NS]
     if len(received) == len(samples):

@@ -1,9 +1,9 @@
-"""Statistics of a batch from its CDR bytes at once, one numpy pass for all messages, without decoding any of them.
+"""Statistics of a batch from its CDR bytes: one numpy pass over all messages, without decoding them.
 
-In messages of one type whose strings and sequences are all as long as those of the first, each number has the same place. That
-is checked on every batch. Of other batches nothing is told here: formats/statistics.py then looks into the JSON.
+If the strings and sequences of all messages are as long as those of the first one, each number has the same offset in all
+messages. This is checked for every batch. For other batches, formats/statistics.py computes the statistics from the JSON.
 
-The numbers are those that stand in the JSON, but the mean, which is right to ``MEAN_ERROR`` (formats/statistics.py).
+The numbers equal those in the JSON, except for the mean, which is accurate to ``MEAN_ERROR`` (formats/statistics.py).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from shadowhound_data_logger.formats.cdr import ENCAPSULATION_BYTES
-from shadowhound_data_logger.formats.statistics import MAX_DEPTH, MAX_ELEMENTS, MOST_FIELDS, covers, packed_parts
+from shadowhound_data_logger.formats.statistics import MAX_DEPTH, MAX_ELEMENTS, MAX_FIELDS, covers, pack_parts
 from shadowhound_data_logger.formats.types import PLACEHOLDER, SIZES, MessageTypes
 
 if TYPE_CHECKING:
@@ -31,15 +31,15 @@ _CODES: Final = {
     'uint32': '<u4', 'int64': '<i8', 'uint64': '<u8', 'float32': _FLOAT32, 'float64': '<f8',
 }  # fmt: skip
 _TEXT_BYTES: Final = frozenset({'uint8', 'byte', 'char', 'octet'})
-"""Sequences of these are text in the JSON."""
+"""Sequences of these become text in the JSON."""
 
 
-class _Unknown(Exception):
-    """A layout that this module does not know."""
+class _Unsupported(Exception):
+    """A layout that this module does not support."""
 
 
 class _Run(NamedTuple):
-    """Numbers that lie side by side in a message."""
+    """Adjacent numbers in a message."""
 
     code: str
     offset: int
@@ -48,39 +48,41 @@ class _Run(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Where the numbers are in all messages with the same lengths."""
+    """The offsets of the numbers in all messages with the same lengths."""
 
     fixed: NDArray[np.intp]
-    """Places of the bytes that tell the endianness and the lengths."""
+    """Offsets of the bytes that contain the endianness and the lengths."""
     content: NDArray[np.uint8]
-    """What they are."""
+    """The values of these bytes."""
     dtype: np.dtype[Any]
-    """A message, and in it each run of numbers by its place in ``starts``."""
+    """A message as a structured type: each run of numbers is a field, named by its index in ``starts``."""
     starts: tuple[int, ...]
-    """First column of each run of fields that have one number in a message, then the end."""
+    """First column of each run of fields that have one number per message, then the end."""
     names: tuple[list[str], list[str]]
-    """Those of these fields that are float32, and the others."""
+    """The names of these fields: the float32 ones, and the others."""
     columns: tuple[NDArray[np.intp], NDArray[np.intp]]
-    manies: tuple[tuple[str, tuple[str, ...]], ...]
-    """Fields with several numbers in a message, and their runs."""
-    left_out: int
+    """Their columns."""
+    multiples: tuple[tuple[str, tuple[str, ...]], ...]
+    """Fields with several numbers per message, and their runs."""
+    omitted: int
+    """The number of fields without statistics."""
 
     def fits(self, rows: NDArray[np.uint8]) -> bool:
-        """Whether messages, a row each, have it."""
+        """Whether messages, one per row, have this layout."""
         return rows.shape[1] == self.dtype.itemsize and bool((rows[:, self.fixed] == self.content).all())
 
 
 class BatchStatistics:
-    """Of batches of one type. Any thread; the layout that was seen last is kept."""
+    """Computes the statistics of batches of one type, in any thread. Caches the last layout."""
 
     def __init__(self, types: MessageTypes, type_name: str, chosen: tuple[str, ...], named: Callable[[str], str | None]) -> None:
-        """``named``: what a field is called in the document, by its path in the message; None where it is not in it."""
+        """``named`` maps the path of a field in the message to its name in the document; None if it is not in the document."""
         self._types, self._type, self._named = types, type_name, named
         self._chosen = tuple(name for name in chosen if name)
         self._layout: _Layout | None = None
 
-    def told(self, messages: Sequence[bytes]) -> bytes | None:
-        """As ``packed``; None where the messages are not of one layout."""
+    def compute(self, messages: Sequence[bytes]) -> bytes | None:
+        """The packed statistics; None if the messages differ in their layouts."""
         size = len(messages[0])
         if size <= ENCAPSULATION_BYTES or len(set(map(len, messages))) > 1:
             return None
@@ -89,17 +91,17 @@ class BatchStatistics:
         layout = self._layout
         if layout is None or not layout.fits(rows):
             try:
-                layout = _Walk(self._types, messages[0], self._named).layout(self._type, self._chosen)
-            except (_Unknown, struct.error):
+                layout = _LayoutReader(self._types, messages[0], self._named).layout(self._type, self._chosen)
+            except (_Unsupported, struct.error):
                 return None
             if not layout.fits(rows):
                 return None
             self._layout = layout
-        return _told(layout, np.frombuffer(joined, layout.dtype))
+        return _compute(layout, np.frombuffer(joined, layout.dtype))
 
 
-class _Walk:
-    """Goes through a message once to find where everything is."""
+class _LayoutReader:
+    """Walks through one message to find the offsets of its numbers."""
 
     def __init__(self, types: MessageTypes, cdr: bytes, named: Callable[[str], str | None]) -> None:
         self._types, self._cdr, self._named = types, cdr, named
@@ -108,22 +110,24 @@ class _Walk:
         self._found: dict[str, list[_Run]] = {}
 
     def layout(self, type_name: str, chosen: tuple[str, ...]) -> _Layout:
-        """Raises _Unknown, or struct.error at the end of the bytes."""
+        """Raises _Unsupported, or struct.error if the message is truncated."""
         if self._cdr[1] != 1:
-            raise _Unknown
+            raise _Unsupported
         self._message(type_name, '', 0, is_seen=True)
         if self._at > len(self._cdr):
-            raise _Unknown
-        names = [name for name in self._found if not chosen or any(covers(each, name) for each in chosen)][:MOST_FIELDS]
+            raise _Unsupported
+        names = [name for name in self._found if not chosen or any(covers(each, name) for each in chosen)][:MAX_FIELDS]
         singles: list[tuple[str, list[_Run]]] = []
-        manies: list[tuple[str, list[_Run]]] = []
+        multiples: list[tuple[str, list[_Run]]] = []
         for name in names:
             runs = self._found[name]
-            (singles if len(runs) == runs[0].size == 1 else manies).append((name, runs))
-        joined = _joined(runs[0] for _, runs in singles)
-        wide = [(name, [f'{number} {place}' for place in range(len(runs))]) for number, (name, runs) in enumerate(manies)]
+            (singles if len(runs) == runs[0].size == 1 else multiples).append((name, runs))
+        joined = _join_runs(runs[0] for _, runs in singles)
+        wide = [(name, [f'{number} {place}' for place in range(len(runs))]) for number, (name, runs) in enumerate(multiples)]
         fields = [(str(number), run) for number, run in enumerate(joined)]
-        fields += [pair for (_, places), (_, runs) in zip(wide, manies, strict=True) for pair in zip(places, runs, strict=True)]
+        fields += [
+            pair for (_, places), (_, runs) in zip(wide, multiples, strict=True) for pair in zip(places, runs, strict=True)
+        ]
         layout: Any = {'names': [name for name, _ in fields], 'formats': [(run.code, (run.size,)) for _, run in fields]}
         layout |= {'offsets': [run.offset for _, run in fields], 'itemsize': len(self._cdr)}
         are_floats = [runs[0].code == _FLOAT32 for _, runs in singles]
@@ -162,18 +166,18 @@ class _Walk:
             return
         for place in range(count):
             if self._at > len(self._cdr):
-                raise _Unknown
+                raise _Unsupported
             self._value(inner, f'{name}.{place if count <= MAX_ELEMENTS else "*"}', depth + 1, is_seen=is_seen)
 
     def _numbers(self, base: str, count: int, name: str, *, is_seen: bool) -> None:
         size = SIZES.get(base)
         if size is None:
-            raise _Unknown
+            raise _Unsupported
         if not count:
             return
         self._at += -(self._at - ENCAPSULATION_BYTES) % size
-        if is_seen and (told := self._named(name)) is not None:
-            self._found.setdefault(told, []).append(_Run(_CODES[base], self._at, count))
+        if is_seen and (field := self._named(name)) is not None:
+            self._found.setdefault(field, []).append(_Run(_CODES[base], self._at, count))
         self._at += count * size
 
     def _length(self) -> int:
@@ -184,8 +188,8 @@ class _Walk:
         return int(length)
 
 
-def _joined(runs: Iterable[_Run]) -> list[_Run]:
-    """Runs of one kind that lie side by side as one."""
+def _join_runs(runs: Iterable[_Run]) -> list[_Run]:
+    """Adjacent runs of the same type, joined."""
     found: list[_Run] = []
     for run in runs:
         last = found[-1] if found else None
@@ -196,7 +200,7 @@ def _joined(runs: Iterable[_Run]) -> list[_Run]:
     return found
 
 
-def _told(layout: _Layout, rows: NDArray[Any]) -> bytes:
+def _compute(layout: _Layout, rows: NDArray[Any]) -> bytes:
     messages, parts = len(rows), []
     table = np.empty((messages, layout.starts[-1]))
     for number, (start, end) in enumerate(pairwise(layout.starts)):
@@ -211,14 +215,14 @@ def _told(layout: _Layout, rows: NDArray[Any]) -> bytes:
                 parts.append(_part(names, some, messages, is_float=is_float))
             else:
                 parts += [_one(name, table[:, column], is_float=is_float) for name, column in zip(names, columns, strict=True)]
-        for name, runs in layout.manies:
+        for name, runs in layout.multiples:
             values = (rows[runs[0]] if len(runs) == 1 else np.concatenate([rows[run] for run in runs], axis=1)).reshape(-1)
             parts.append(_one(name, values, is_float=values.dtype == np.float32))
-    return packed_parts(messages, layout.left_out, parts)
+    return pack_parts(messages, layout.omitted, parts)
 
 
 def _numbers(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A row for each of first, last, mean, min, max; a number that is not finite shows in the last two."""
+    """Rows first, last, mean, min, max. A non-finite number in a column makes its min or max non-finite."""
     found = np.empty((5, table.shape[1]))
     found[0], found[1] = table[0], table[-1]
     np.add.reduce(table, 0, None, found[2])
@@ -229,7 +233,7 @@ def _numbers(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _one(name: str, values: NDArray[Any], *, is_float: bool) -> dict[str, Any]:
-    """Of one field, whose numbers need not be finite."""
+    """The part of one field, whose numbers may be non-finite."""
     present = values[np.isfinite(values)]
     if not len(present):
         return {'fields': [name], 'numbers': [], 'count': 0, 'nan_count': len(values)}
@@ -238,6 +242,10 @@ def _one(name: str, values: NDArray[Any], *, is_float: bool) -> dict[str, Any]:
 
 
 def _part(names: list[str], numbers: NDArray[np.float64], count: int, nan_count: int = 0, *, is_float: bool) -> dict[str, Any]:
-    """The shortest decimals of float32 are those in the JSON."""
-    said = numbers.astype(np.float32) if is_float else numbers
-    return {'fields': names, 'numbers': said, 'count': count, 'nan_count': nan_count}
+    # The JSON has the shortest decimals of float32, so orjson must write float32 here too.
+    return {
+        'fields': names,
+        'numbers': numbers.astype(np.float32) if is_float else numbers,
+        'count': count,
+        'nan_count': nan_count,
+    }

@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Batch, Sample
-from shadowhound_data_logger.formats.registry import encode
-from shadowhound_data_logger.formats.statistics import ALL, MEAN_ERROR, FieldStatistics, unpacked_statistics
+from shadowhound_data_logger.formats.encoders import encode
+from shadowhound_data_logger.formats.statistics import ALL, MEAN_ERROR, FieldStatistics, unpack_statistics
 from shadowhound_data_logger.formats.types import MessageTypes
 
 STAMP_NS = 1_760_788_800_250_000_000
@@ -91,7 +91,7 @@ def of_document(body: bytes, chosen: tuple[str, ...]) -> dict[str, Any]:
     found = FieldStatistics(chosen)
     document = json.loads(body)
     found.add(document.get('samples', [document]))
-    return found.told()
+    return found.result()
 
 
 @given(st.data())
@@ -108,7 +108,7 @@ def test_they_are_those_of_the_json(types: MessageTypes, data: st.DataObject) ->
     batch = Batch('s', '/s', 'own_msgs/msg/Every', samples, 1)
     made = encode(batch, sensor(batch_s=data.draw(st.sampled_from([0.0, 1.0])), statistics=chosen), 'thor', types).object
     assert made is not None
-    found, expected = unpacked_statistics(made.statistics), of_document(made.body, chosen)
+    found, expected = unpack_statistics(made.statistics), of_document(made.body, chosen)
     assert found.keys() == expected.keys()
     for name, one in expected.items():
         told = found[name]

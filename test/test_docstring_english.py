@@ -1,0 +1,69 @@
+"""Docstrings and comments of the modules listed here are in plain English: idioms that this project had do not return."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / 'shadowhound_data_logger'
+DONE = ('formats/*.py', 'formats/rows/*.py')
+"""The modules of the package that have been rewritten. Add a folder when it is done."""
+IDIOMS = {
+    r'\b(un)?told\b|\btells?\b|\bsaid\b': 'reported, recorded, contains, states',
+    r'\bmend(s|ed|ing)?\b': 'fix, repair',
+    r'\b(is|are|was|were|been|be) (once |first )?asked for\b': 'requested, required',
+    r'\banew\b|\bmade again\b': 'again, rebuilt',
+    r'(?<!there )\b(is|are|was|were) (?-i:none)\b': 'does not exist, is not one',
+    r'\b(lies|lie|stands?|stood) (in|at|there|behind|beside|side)\b': 'is in, is at',
+    r'\b(leaves?|left) out\b': 'skips, omits, ignored',
+    r'\b(nobody|somebody|someone|anybody|anyone else|whoever)\b': 'name the role: the operator, a client, another process',
+    r'\bshall\b': 'should, must',
+    r'\bto effect\b': 'effectively exactly once',
+    r'\bas (it|they) (is|are|came|was|were)\b(?! in\b)': 'unchanged, verbatim, in arrival order',
+    r'\bfor (good|ever)\b': 'permanently, indefinitely',
+    r'\bby (itself|themselves)\b': 'automatically, on its own',
+    r'\bof (its|their) own\b': 'its own X, a separate X',
+    r'\bgreatest\b|(?<!at )\bleast\b': 'maximum, minimum',
+    r'\bmeanwhile\b': 'until then, during that time',
+    r'\bgoes on\b|\bgo on\b': 'continues',
+    r'\bbeside\b': 'next to, in addition to',
+    r'\ball the same\b': 'anyway, nevertheless',
+    r'\bhad to be\b|\bhas to be\b|\bhave to be\b|\b(is|are) to be\b': 'must be',
+    r'\bof which\b|\bby which\b|\bfor whom\b|\bwith which\b': 'use a verb',
+    r'\bLife:': 'Lifecycle:',
+    r'\b(catalogue|colour|grey|metre|journalled|behaviour|centre|neighbour)\w*': 'the American spelling',
+    r'\b(a row|a line|one) a (row|line|message|point|pixel|second|day|format|object)\b': 'per',
+    r'\bis not judged\b|\bknows nothing of\b|\bis known of\b': 'is not checked, does not depend on, is known about',
+}
+"""A pattern -> what to write instead."""
+FILES = sorted(path for pattern in DONE for path in PACKAGE.glob(pattern))
+
+
+def prose(path: Path) -> Iterator[tuple[int, str]]:
+    """(line, text) of each docstring and comment, without the code in backticks."""
+    source = path.read_text(encoding='utf-8')
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.lineno, re.sub(r'`[^`]*`', '', node.value.value)
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], re.sub(r'`[^`]*`', '', token.string)
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_module_has_none_of_these_idioms(path: Path) -> None:
+    """The list is the mechanical part of plain English: a sentence that passes may still deserve rewriting."""
+    found = [
+        f'line {line + text[: match.start()].count(chr(10))}: {match[0]!r}: write {instead}'
+        for line, text in prose(path)
+        for pattern, instead in IDIOMS.items()
+        for match in re.finditer(pattern, text, re.IGNORECASE)
+    ]
+    assert found == []
