@@ -141,7 +141,7 @@ SECTIONS: Final = (
     Section(
         'Keep what led to an event',
         'The last seconds of some topics are held in memory, and an event makes a bag of them. Off while no topic is named '
-        '([bags](bags.md)).',
+        '([bags](bags.md#events)).',
         (
             'events.topics',
             'events.regex',
