@@ -9,6 +9,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
 from types import FrameType
 from typing import Final
 
@@ -23,9 +24,9 @@ from rclpy.utilities import get_default_context, remove_ros_args
 from shadowhound_data_logger.core import heap
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
 from shadowhound_data_logger.core.ros_arguments import NODE, rules_for
+from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.middleware import SETTING, Middleware
 from shadowhound_data_logger.node.parameters import Parameters
-from shadowhound_data_logger.node.pipeline import Pipeline, Ros
 from shadowhound_data_logger.node.reporting.front import Front
 from shadowhound_data_logger.ros.shared_memory import PortGuard, dead_ports_avoided, orphans
 
@@ -51,6 +52,19 @@ SECOND_SIGNAL_S = 1.0
 """A second signal later than this ends the node at once; an earlier one is the same key press."""
 WATCHDOG_PART: Final = 3
 """The node says that it lives this many times within the time that systemd allows, so that one lost word is not a death."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ros:
+    """How the logger takes part in ROS."""
+
+    node: Node
+    """The node that listens."""
+    name: str
+    """The full name under which ROS knows the logger."""
+    middleware: Middleware
+    front: Front | None
+    """Offers services, parameters and diagnostics in the robot's RMW; None if the node itself does, or no process can."""
 
 
 class SystemdService:
@@ -147,9 +161,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         size = sum(each.bytes for each in freed)
         log.info('freed %.0f MB of shared memory (%d segments) that killed processes had left', size / 1e6, len(freed))
     if avoided:
-        log.info(
-            'not listening at %d ports in shared memory of processes that were killed: others may still write there', len(avoided)
-        )
+        log.debug('%d shared-memory ports of killed processes are not reused: publishers may still write to them', len(avoided))
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
         node.get_logger().warning(UNHEARD.format(name=name))
@@ -204,7 +216,10 @@ def log_until(stop: StopSignals, ros: Ros) -> None:
     if given.capture.rmw != middleware.asked:
         allowed = f'{middleware.asked!r}, which is what the command line says to those who read it before ROS is loaded'
         raise SettingError(SETTING, given.capture.rmw, allowed)
-    pipeline = Pipeline(ros, given, parameters)
+    early = EarlyReaders(node, given.sensors)
+    from shadowhound_data_logger.node.pipeline import Pipeline  # noqa: PLC0415 - half a second, in which the robot is heard already
+
+    pipeline = Pipeline(ros, given, parameters, early)
     pipeline.open()
     service.ready(pipeline.describe())
     executor = SingleThreadedExecutor()

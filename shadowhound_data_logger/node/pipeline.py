@@ -9,10 +9,8 @@ import sqlite3
 import time
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
-
-from rclpy.node import Node
+from typing import TYPE_CHECKING
 
 from shadowhound_data_logger.bags.kept import KeptCut, sweep
 from shadowhound_data_logger.bags.manifest import MissionOf
@@ -37,9 +35,9 @@ from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, Encode
 from shadowhound_data_logger.node.encoding.halving import Halving
 from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
+from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.intake import Intake
-from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.node.intake.sampling import Sampler
 from shadowhound_data_logger.node.intake.unheard import Unheard
 from shadowhound_data_logger.node.keeping.keeping import Keeping, keeps_bag
@@ -52,7 +50,6 @@ from shadowhound_data_logger.node.recording.mission import MissionWatch
 from shadowhound_data_logger.node.recording.mission_observer import MissionObserver
 from shadowhound_data_logger.node.reporting.commands import Commands
 from shadowhound_data_logger.node.reporting.control import ControlSocket
-from shadowhound_data_logger.node.reporting.front import Front
 from shadowhound_data_logger.node.reporting.interface import Interface
 from shadowhound_data_logger.node.reporting.status import PERIOD_S, Stages, Status
 from shadowhound_data_logger.ros.reader import endpoints, node_of
@@ -69,6 +66,9 @@ from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
 
+if TYPE_CHECKING:
+    from shadowhound_data_logger.node.node import Ros
+
 log = logging.getLogger(__name__)
 
 CLOSE_S = 5.0
@@ -78,29 +78,17 @@ DAMAGED_S = 0.5
 LEDGER_BUCKET = 'sensor-data'
 
 
-@dataclass(frozen=True, slots=True)
-class Ros:
-    """How the logger takes part in ROS."""
-
-    node: Node
-    """That listens."""
-    name: str
-    """The full name under which ROS knows the logger."""
-    middleware: Middleware
-    front: Front | None
-    """Offers all else in the robot's RMW; None where the node itself does, or nobody can."""
-
-
 class Pipeline:
     """Puts the stages of the node together, and starts and stops them in order.
 
     New; open once; close once.
     """
 
-    def __init__(self, ros: Ros, settings: Settings, parameters: Parameters) -> None:
+    def __init__(self, ros: Ros, settings: Settings, parameters: Parameters, early: EarlyReaders) -> None:
         self._settings = settings
         self._parameters = parameters
         self._ros = ros
+        self._early = early
         self._record = record = ClockRecord(settings.spool_path, settings.robot)
         self._clock = ClockWatch(SystemClock.of_this_machine(), settings.clock.hold_s, record.steps)
         self.spool = Spool(settings.spool_path, settings.spool, self._clock, settings.robot, settings.keep)
@@ -160,7 +148,8 @@ class Pipeline:
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
         named = [node.resolve_topic_name(topic) for sensor in settings.sensors for topic in sensor.topics]
         found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
-        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.is_place, found=found)
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.is_place, found=found,
+                             early=self._early)  # fmt: skip
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks,
                                    track.place)  # fmt: skip

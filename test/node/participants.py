@@ -32,8 +32,9 @@ class Participant:
         profile.durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         self._publishers[topic] = self.node.create_publisher(message_class, topic, profile)
 
-    def matched(self, topic: str = '') -> bool:
-        return bool(self._of(topic).get_subscription_count())
+    def matched(self, topic: str = '') -> int:
+        """How many subscriptions it is matched with."""
+        return int(self._of(topic).get_subscription_count())
 
     def publish(self, *messages: Any, topic: str = '', period_s: float = 0.0) -> None:
         """Messages, serialized or not; returns when the last one is out."""

@@ -21,6 +21,7 @@ from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.consumers import Consumer
+from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
 from shadowhound_data_logger.node.intake.found_topics import FoundTopics
 from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
@@ -44,15 +45,17 @@ class Intake:
 
     def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,  # noqa: PLR0913 - its neighbors
                  stamps: StampRule, consumers: Sequence[Consumer], *, first: Callable[[SensorSettings], bool] = lambda _: False,
-                 found: FoundTopics | None = None) -> None:  # fmt: skip
+                 found: FoundTopics | None = None, early: EarlyReaders | None = None) -> None:  # fmt: skip
         """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
 
-        ``first`` selects sensors that are drained before all others; ``found`` finds sensors in the graph.
+        ``first`` selects sensors that are drained before all others; ``found`` finds sensors in the graph; ``early`` are
+        subscriptions that exist already.
         """
         self._sensors = sensors
         self._consumers = consumers
         self._found = found
-        self._around = around = Surroundings(node, PolledGroup(), accounts, types, stamps)
+        self._early = early
+        self._around = around = Surroundings(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
         self._others = OtherTypes(node, accounts)
         self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
         self._is_first = first
@@ -150,6 +153,9 @@ class Intake:
         if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
             todo += [partial(self._find, now_s), *(partial(subscriber.refresh, now_s) for subscriber in self._by_turn)]
+        if refreshes and self._early is not None:  # after the first look at the graph
+            todo.append(self._early.close)
+            self._early = None
         todo += [partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)]
         todo.append(self._others.drain)
         if refreshes and self._listening:

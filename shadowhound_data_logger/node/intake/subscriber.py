@@ -26,6 +26,7 @@ from shadowhound_data_logger.formats.payload import Rejection
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
 from shadowhound_data_logger.node.intake.consumers import Consumer
+from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, alternatives, logged_type, plans
 from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, node_of, unavailable
@@ -155,6 +156,8 @@ class Surroundings(NamedTuple):
     accounts: Accounts
     types: MessageTypes
     stamps: StampRule
+    early: EarlyReaders | None = None
+    """Subscriptions that exist already."""
 
 
 class Subscriber:
@@ -169,7 +172,7 @@ class Subscriber:
         """
         self.sensor = sensor
         self._others = others
-        self._node, self._group, self._accounts, self._message_types, self._stamps = around
+        self._node, self._group, self._accounts, self._message_types, self._stamps, self._early = around
         self._consumers = consumers
         node = self._node
         self._topics: list[str] = [node.resolve_topic_name(topic) for topic in sensor.topics]
@@ -357,6 +360,8 @@ class Subscriber:
             )
         self._type = type_name
         self._history = HistoryDepth(type_name)
+        if self._early is not None:
+            self._readers += self._early.adopt(self._chosen, type_name)
 
     def _retire(self, wanted: set[Plan], now_s: float) -> None:
         """Close the subscriptions that are not wanted any more, once their successors are matched; none is missed so."""

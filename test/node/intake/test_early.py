@@ -1,0 +1,121 @@
+"""Subscriptions that exist before the intake does, over real DDS."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Final
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from domains import free_domain
+from node.intake.test_stream import Batches
+from node.participants import Participant
+from rclpy.serialization import deserialize_message
+from std_msgs.msg import Int32, String
+
+from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import SensorSettings
+from shadowhound_data_logger.core.stamps import StampRule
+from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.early import EarlyReaders
+from shadowhound_data_logger.node.intake.intake import Intake
+from shadowhound_data_logger.node.intake.sampling import Sampler
+from shadowhound_data_logger.spool.accounts import Accounts
+
+pytestmark = pytest.mark.ros
+WAIT_S: Final = 60.0
+QUALITIES: Final = {'best_effort': (False, False), 'reliable': (True, False), 'latched': (True, True)}
+STRING: Final = 'std_msgs/msg/String'
+
+
+class Start:
+    """A node that starts: its early readers, and later its intake."""
+
+    def __init__(self, domain: int, stack: ExitStack) -> None:
+        self._stack = stack
+        self.robot, self.logger = Participant('robot', domain), Participant('logger', domain)
+        stack.callback(self.robot.end)
+        stack.callback(self.logger.end)
+        self.accounts, self.batches = Accounts(), Batches()
+
+    def sensor(self, name: str, types: tuple[str, ...] = (STRING,)) -> SensorSettings:
+        return SensorSettings(name=name, topics=(f'/{name}',), types=types, rate_hz=0.0, batch_s=3600.0)
+
+    def intake(self, early: EarlyReaders, *sensors: SensorSettings) -> Intake:
+        named = {sensor.name: sensor for sensor in sensors}
+        types = MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
+        sampler = Sampler(named, self.accounts, types, self.batches)  # type: ignore[arg-type]
+        stamps = StampRule(SystemClock.of_this_machine())
+        intake = Intake(self.logger.node, named, self.accounts, types, stamps, [sampler], early=early)
+        intake.open()
+        self._stack.callback(intake.close, WAIT_S)
+        return intake
+
+    def received(self, topic: str) -> int:
+        totals = self.accounts.totals().get(topic)
+        return totals.received if totals is not None else 0
+
+    def kept(self, topic: str) -> list[str]:
+        return [deserialize_message(sample.cdr, String).data
+                for batch in self.batches if batch.topic == topic for sample in batch.samples]  # fmt: skip
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    end_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s, what
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    with free_domain() as domain, ExitStack() as stack:
+        yield Start(domain, stack)
+
+
+@pytest.mark.parametrize('quality', QUALITIES)
+def test_messages_that_arrive_before_the_intake_exists_are_kept_once(start: Start, quality: str) -> None:
+    """All that was published after the match, in order, whatever the publisher's QoS, and what follows as well."""
+    reliable, latched = QUALITIES[quality]
+    start.robot.create(String, '/a', reliable=reliable, latched=latched)
+    early = EarlyReaders(start.logger.node, [start.sensor('a')])
+    matches = 2 if reliable else 1  # a RELIABLE publisher matches both of the pair
+    until(lambda: start.robot.node.count_subscribers('/a') == 2, 'the subscriptions are in the graph')
+    until(lambda: start.robot.matched('/a') >= matches, 'they are matched')
+    texts = [str(number) for number in range(300)]
+    start.robot.publish(*(String(data=text) for text in texts[:200]), topic='/a', period_s=0.001)
+    intake = start.intake(early, start.sensor('a'))
+    until(lambda: start.received('/a') >= 200, 'the messages of before are taken')
+    start.robot.publish(*(String(data=text) for text in texts[200:]), topic='/a', period_s=0.001)
+    until(lambda: start.received('/a') >= 300, 'those that follow are taken')
+    assert intake.flush(WAIT_S)
+    assert start.kept('/a') == texts
+
+
+def test_a_subscription_that_is_not_needed_ends(start: Start) -> None:
+    """It belongs to a sensor that is off now, or whose topic has another type than the settings named."""
+    a, b = start.sensor('a'), start.sensor('b')
+    start.robot.create(Int32, '/a')
+    early = EarlyReaders(start.logger.node, [a, b])
+    assert start.logger.node.count_subscribers('/b') == 2
+    intake = start.intake(early, a)
+    until(lambda: start.logger.node.count_subscribers('/b') == 0, 'the subscriptions of b end')
+    assert intake.flush(WAIT_S)
+    assert early.adopt('/b', STRING) == []
+
+
+def test_what_cannot_be_subscribed_to_is_left_to_the_intake(start: Start) -> None:
+    """A type that is not installed, several possible types, or none, raise nothing and make no subscription."""
+    sensors = [
+        start.sensor('a', ('no_such_package/msg/X',)),
+        start.sensor('b', (f'{STRING}|std_msgs/msg/Int32',)),
+        start.sensor('c', ()),
+    ]
+    early = EarlyReaders(start.logger.node, sensors)
+    assert [start.logger.node.count_subscribers(f'/{name}') for name in 'abc'] == [0, 0, 0]
+    early.close()
