@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
-from shadowhound_data_logger.core.config import UploadSettings, home, store_settings
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT, UploadSettings, home, store_settings
 from shadowhound_data_logger.core.errors import NameRefused, SettingError, StoreError
 from shadowhound_data_logger.core.keys import check_name, is_name
-from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.times import age_in_ns
 
@@ -162,30 +161,19 @@ spool_folder = click.option(
 def the_robot(named: str | None, spool: Path | None = None, *, in_store: bool = False, must_exist: bool = False) -> str:
     """The robot that a verb is about.
 
-    The named one, else SHADOWHOUND_ROBOT, else the one whose node runs here, or the only one whose node has run here; with
-    ``in_store`` else the only one of the store. Without any of these it is the default of the node, ``thor``. Raises BadUsage
-    if there are several, or none and it ``must_exist``.
+    The named one, otherwise that of this machine (``local_robots``); with ``in_store`` otherwise the only one of the store. If
+    there is none of these, it is the default of the node. Raises BadUsage if there are several, or none and it ``must_exist``.
     """
-    if named := named or os.environ.get('SHADOWHOUND_ROBOT'):
+    from shadowhound_data_logger.spool.local_robot import local_robots  # noqa: PLC0415 - SQLite
+
+    if named:
         return named
-    found = running(the_spool(spool))
+    found = local_robots(os.environ, the_spool(spool))
     if not found and in_store:
         found = the_store_robots()
     if len(found) > 1 or (must_exist and not found):
         raise BadUsage(f'which robot? There are {", ".join(found) or "none"}', '--robot NAME, or set SHADOWHOUND_ROBOT')
-    return found[0] if found else DEFAULT
-
-
-def running(spool: Path) -> list[str]:
-    """The robots whose nodes run here; if none does, those whose nodes have run here."""
-    from shadowhound_data_logger.core.clock import SystemClock  # noqa: PLC0415 - SQLite
-    from shadowhound_data_logger.spool.status import read  # noqa: PLC0415
-
-    names = robots(spool)
-    if len(names) < 2:
-        return names
-    clock = SystemClock.of_this_machine()
-    return [name for name in names if read(spool, name, clock).running] or names
+    return found[0] if found else DEFAULT_ROBOT
 
 
 def the_store_robots() -> list[str]:

@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from shadowhound_data_logger.cli.audit import verify_delivered
-from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, running, spool_folder, the_spool
+from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code, spool_folder, the_spool
 from shadowhound_data_logger.cli.output import (
     duration,
     figure,
@@ -26,8 +26,8 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.dataclass_json import parse
-from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
@@ -44,6 +44,7 @@ from shadowhound_data_logger.spool.ledger import (
     rows_of,
 )
 from shadowhound_data_logger.spool.ledger import read as read_ledger
+from shadowhound_data_logger.spool.local_robot import local_robots, robots
 from shadowhound_data_logger.spool.status import not_logged
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
@@ -116,7 +117,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
 
 
 def _robot(folder: Path) -> str:
-    return os.environ.get('SHADOWHOUND_ROBOT') or next(iter(running(folder)), DEFAULT)
+    return next(iter(local_robots(os.environ, folder)), DEFAULT_ROBOT)
 
 
 def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None, cause: str) -> bool:

@@ -25,7 +25,7 @@ from shadowhound_data_logger.cli.common import (
 )
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.core import heap
-from shadowhound_data_logger.core.local_robot import DEFAULT
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 
 PORT = 8765
 RTSP_PORT = 8554
@@ -94,7 +94,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
         parts = urlsplit(robot_url)
         if parts.scheme not in ('http', 'https') or not parts.hostname or '@' in parts.netloc:
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
-    robot = robot or (DEFAULT if is_of_store else the_robot(robot, folder))
+    robot = robot or (DEFAULT_ROBOT if is_of_store else the_robot(robot, folder))
     settings = LiveSettings(
         spool=folder, robot=robot, tokens=tokens, bind=bind, port=port, names=names,
         certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, is_of_store=is_of_store,

@@ -22,7 +22,6 @@ from shadowhound_data_logger.cli.progress import ProgressBar, progress
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock, iso
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError
-from shadowhound_data_logger.core.local_robot import robots
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import Uploader, UploadStatus, delivering
@@ -30,6 +29,7 @@ from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, usage_by_sensor
 from shadowhound_data_logger.spool.listing import resend_gaps as resend_all_gaps
 from shadowhound_data_logger.spool.listing import retry as retry_objects
+from shadowhound_data_logger.spool.local_robot import robots
 from shadowhound_data_logger.spool.object_table import MISSING
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import limits, targets

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,14 +38,16 @@ from shadowhound_data_logger.cli.output import (
     unsure,
     volume,
 )
-from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock, SystemClock, utc
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.errors import PolicyError
-from shadowhound_data_logger.core.local_robot import DEFAULT, robots
 from shadowhound_data_logger.core.status import BagStatus, EventStatus, NodeStatus, SpoolStatus, TopicStatus
+from shadowhound_data_logger.core.times import iso_ns
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX
 from shadowhound_data_logger.policies.trust import follows_signers, why_stale
 from shadowhound_data_logger.spool.gaps import EXACT
+from shadowhound_data_logger.spool.local_robot import robots
 from shadowhound_data_logger.spool.status import FINE_STORE, NOT_RUNNING, NOT_RUNNING_TEXT, NodeReport, NodeSession
 from shadowhound_data_logger.spool.status import read as read_status
 
@@ -119,7 +120,7 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
 
 def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     """The requested robot, or the first that runs, or the first that has a status."""
-    names = [robot] if robot else robots(spool) or [DEFAULT]
+    names = [robot] if robot else robots(spool) or [DEFAULT_ROBOT]
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each.running), found[0])
     others = tuple(each.robot for each in found if each.running and each is not chosen)
@@ -302,10 +303,12 @@ def _add_store(grid: Table, node: NodeStatus) -> None:
 def _add_mission(grid: Table, node: NodeStatus) -> None:
     """The active mission, its type, since when, and its run."""
     mission = node.mission
-    started, now = (datetime.fromisoformat(stamp.replace('Z', '+00:00')) for stamp in (mission.started, node.time))
-    since = f'since {shown_iso(mission.started)} UTC, {duration((now - started).total_seconds())}'
-    if started < utc(EARLIEST_SANE_NS):
-        since = 'begun before the clock was set'
+    started_ns, now_ns = iso_ns(mission.started), iso_ns(node.time)
+    since = 'since an unknown time'
+    if started_ns is not None and now_ns is not None:
+        since = f'since {shown_iso(mission.started)} UTC, {duration((now_ns - started_ns) / SECOND)}'
+        if started_ns < EARLIEST_SANE_NS:
+            since = 'started before the clock was set'
     grid.add_row('mission', Text('active', 'cyan'), plain(f'{mission.type}, {since}'))
     grid.add_row('', '', plain(mission.mission_id))
     if mission.policy:

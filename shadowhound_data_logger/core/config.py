@@ -63,6 +63,8 @@ __all__ = [
     'store_settings',
 ]  # fmt: skip
 
+DEFAULT_ROBOT: Final = 'thor'
+"""The Go2 of the integration guide."""
 MIN_RATE_HZ: Final = 1e-4
 """A message every three hours."""
 MAX_INT: Final = (1 << 63) - 1
@@ -199,7 +201,7 @@ def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
     if not isinstance(given, str):
         raise SettingError('robot', given, 'a string')
     of_shell = environ.get('SHADOWHOUND_ROBOT')
-    name = given or of_shell or namespace.strip('/').replace('/', '_') or 'thor'
+    name = given or of_shell or namespace.strip('/').replace('/', '_') or DEFAULT_ROBOT
     try:
         return check_name(name, 'the robot name')
     except NameRefused as error:

@@ -44,7 +44,7 @@ def moment(name: str, given: str | datetime, now_ns: int) -> int:
         midnight = utc(now_ns).replace(hour=0, minute=0, second=0, microsecond=0)
         return _ns(midnight - timedelta(days=_DAYS_AGO[text.lower()]))
     age_ns = _age_ns(text)
-    found = _iso_ns(text) if age_ns is None else now_ns - age_ns
+    found = iso_ns(text) if age_ns is None else now_ns - age_ns
     if found is None or not _is_a_date(found):
         raise SettingError(name, given, TIMES)
     return found
@@ -73,14 +73,14 @@ def moment_in_bag(name: str, text: str, t_start_ns: int, t_end_ns: int) -> int:
         if seconds >= EPOCH_S:
             return int(seconds * SECOND) if seconds < EPOCH_S * SECOND / 10 else int(seconds)
         return (t_end_ns if text.startswith('-') else t_start_ns) + int(seconds * SECOND)
-    found = _iso_ns(text)
+    found = iso_ns(text)
     if found is None:
         raise SettingError(name, text, TIMES_IN_BAG)
     return found
 
 
-def _iso_ns(text: str) -> int | None:
-    """Unix ns of an ISO 8601 time, to the nanosecond; None for what is none."""
+def iso_ns(text: str) -> int | None:
+    """Unix ns of an ISO 8601 time, UTC unless it names a zone, to the nanosecond; None if it is not one."""
     found = _ISO.fullmatch(text)
     if found is None:
         return None
@@ -92,6 +92,8 @@ def _iso_ns(text: str) -> int | None:
     offset_s = 0
     if zone and zone not in 'Zz':
         digits = zone[1:].replace(':', '').ljust(4, '0')
+        if digits[:2] > '23' or digits[2:] > '59':
+            return None
         offset_s = (int(digits[:2]) * 3600 + int(digits[2:]) * 60) * (-1 if zone[0] == '-' else 1)
     return _ns(time) - offset_s * SECOND + int(Decimal(fraction or 0) * SECOND)
 

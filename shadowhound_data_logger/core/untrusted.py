@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import unicodedata
 import warnings
@@ -125,10 +126,12 @@ def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
 
 
 def from_strict_json(content: bytes, most: int) -> Any:
-    """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for NaN."""
+    """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for
+    what is not a finite number.
+    """
     check_size(len(content), most)
     try:
-        return shallow(json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number))
+        return shallow(json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number, parse_float=_finite))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
@@ -156,6 +159,11 @@ def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _no_number(word: str) -> Any:
     raise ValueError(f'{word} is no number of JSON')
+
+
+def _finite(text: str) -> float:
+    found = float(text)
+    return found if math.isfinite(found) else _no_number(text)
 
 
 def from_yaml(content: str) -> Any:

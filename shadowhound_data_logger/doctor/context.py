@@ -12,10 +12,10 @@ from urllib.parse import urlsplit
 
 from shadowhound_data_logger.core.config import ENDPOINTS, Settings, home
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.core.local_robot import local_robot
 from shadowhound_data_logger.core.ros_arguments import NODE, read_parameters
 from shadowhound_data_logger.doctor.machine import listening
 from shadowhound_data_logger.doctor.model import Context, Role
+from shadowhound_data_logger.spool.local_robot import local_robot, local_robots
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001
@@ -36,8 +36,14 @@ def make(
     node = f'/{namespace.strip("/")}/{NODE}' if namespace.strip('/') else None
     given = dict(parameters if parameters is not None else read_parameters(parameter_file, node) if parameter_file else {})
     known, left, refused = dict(environ), dict(given), []
-    if not left.get('robot') and not namespace.strip('/') and (robot := local_robot(environ, home(environ))):
-        known['SHADOWHOUND_ROBOT'] = robot
+    if not left.get('robot') and not namespace.strip('/'):
+        spool = home(environ) / 'spool'
+        try:
+            robot = local_robot(environ, spool)
+        except SettingError as error:  # the first of several is examined
+            refused.append(error)
+            robot = local_robots(environ, spool)[0]
+        known |= {'SHADOWHOUND_ROBOT': robot} if robot else {}
     while True:
         try:
             settings = Settings.load(left, known, namespace)

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.config import home as home_of
 from shadowhound_data_logger.core.errors import NameRefused, SettingError
 from shadowhound_data_logger.core.keys import check_name
-from shadowhound_data_logger.core.local_robot import DEFAULT, local_robot
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
@@ -31,6 +31,7 @@ from shadowhound_data_logger.missions.overview import Report, has_arrived, repor
 from shadowhound_data_logger.missions.recorder import Mission, MissionStarter
 from shadowhound_data_logger.missions.state import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
+from shadowhound_data_logger.spool.local_robot import local_robot
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +78,7 @@ class MissionDataLogger:
         uri = _text('tracking_uri', tracking_uri)
         environ = dict(os.environ) | ({'MLFLOW_TRACKING_URI': uri} if uri else {})
         self.home = _home(environ | ({'SHADOWHOUND_HOME': given} if (given := _text('home', home)) else {}))
-        self.robot = _robot(_text('robot', robot) or local_robot(environ, self.home) or DEFAULT)
+        self.robot = _robot(_text('robot', robot) or local_robot(environ, self.home / 'spool') or DEFAULT_ROBOT)
         experiment = _text('experiment', experiment) or f'{self.robot}_missions'
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)

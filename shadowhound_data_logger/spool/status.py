@@ -6,7 +6,6 @@ Whether a node runs is decided by the boot clock, because a robot's wall clock m
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
 from collections.abc import Iterator, Mapping
@@ -18,10 +17,11 @@ from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.errors import SpoolError
-from shadowhound_data_logger.core.local_robot import robots
 from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.core.status import NodeStatus, OtherType, SpoolStatus, TopicStatus, Totals
+from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_strict_json
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.local_robot import robots
 from shadowhound_data_logger.spool.usage import usage_of
 
 FRESH_NS: Final = 5 * SECOND
@@ -130,10 +130,10 @@ def _written(spool: Path, robot: str) -> tuple[NodeStatus, str]:
     """The last status of a node, and why it cannot be read; a power cut may damage it. Without figures if there is none."""
     path = file(spool, robot)
     try:
-        return parse(NodeStatus, json.loads(path.read_bytes())), ''
+        return parse(NodeStatus, from_strict_json(path.read_bytes(), MOST_DOCUMENT_BYTES)), ''
     except FileNotFoundError:
         return NodeStatus(), ''
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         return NodeStatus(), f'the status {path} cannot be read: {error}'
 
 

@@ -360,6 +360,10 @@ def test_verbs_are_about_the_robot_of_this_machine(spool: Path, capsys: pytest.C
     with pytest.raises(BadUsage, match='which robot'):
         the_robot(None)
     assert the_robot('tachi') == 'tachi'
+    with pytest.raises(SettingError, match='one of tachi, turtle'):
+        MissionDataLogger(replay=False)
+    examined = make(os.environ)
+    assert (examined.settings.robot, [str(error.data['name']) for error in examined.refused]) == ('tachi', ['SHADOWHOUND_ROBOT'])
     with pytest.raises(BadUsage, match='which robot'):
         cli(['bag', 'list'], standalone_mode=False)
 

@@ -145,7 +145,7 @@ def test_it_says_which_mission_is_active() -> None:
     assert 'policy go2_patrol@7#0123456789abcdef' in shown(mission={**mission, 'policy': 'go2_patrol@7#0123456789abcdef'})
     text = shown(mission={**mission, 'run_id': 'a' * 32, 'started': '1970-01-01T00:02:00.000000Z'})
     assert f'MLflow run {"a" * 32}' in text
-    assert 'patrol, begun before the clock was set' in text
+    assert 'patrol, started before the clock was set' in text
     assert max(len(each.rstrip()) for each in text.splitlines()) <= 80
 
 

@@ -18,9 +18,9 @@ from spool.making import NOON_NS, FakeClock, make, new_spool, put, settle
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, iso
 from shadowhound_data_logger.core.config import SpoolSettings
-from shadowhound_data_logger.core.local_robot import robots
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.stamps import CAUSES as OF
+from shadowhound_data_logger.spool.local_robot import robots
 from shadowhound_data_logger.spool.status import NodeSession, file, limits, not_logged, read, targets
 
 OWN = SpoolSettings(max_bytes=20 << 20, min_free_bytes=10)
