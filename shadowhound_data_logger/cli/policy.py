@@ -581,7 +581,7 @@ def _telling() -> Iterator[None]:
 
 def _no_mission(robot: str = '') -> Callable[[], bool]:
     missions = MissionFinder(the_home(), the_robot(robot or None))
-    return lambda: missions.look() is None
+    return lambda: missions.active() is None
 
 
 def _registry() -> MlflowRegistry:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.datasets.lerobot import OURS, EpisodeRow, Lerobot
-from shadowhound_data_logger.missions.contact_sheet import INK, evenly
+from shadowhound_data_logger.missions.contact_sheet import INK, evenly_spaced
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,7 @@ PALE, RED, GREEN = '#9aa7b3', '#d62828', '#4c9f70'
 
 def draw(made: Lerobot, target: Path) -> None:
     """Write the picture of a dataset that has at least one episode. Raises LakeError, OSError."""
-    rows = evenly(made.rows, MOST)
+    rows = evenly_spaced(made.rows, MOST)
     sheet = Image.new('RGB', (WIDTH, len(rows) * (HEIGHT + GAP) + GAP), 'white')
     for place, row in enumerate(rows):
         _episode(made, row, sheet, GAP + place * (HEIGHT + GAP))

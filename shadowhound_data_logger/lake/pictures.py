@@ -21,7 +21,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
 from shadowhound_data_logger.lake.link import LinkSample
-from shadowhound_data_logger.missions.contact_sheet import MOST, LoggedFrame, contact_sheet, evenly
+from shadowhound_data_logger.missions.contact_sheet import MAX_FRAMES, LoggedFrame, contact_sheet, evenly_spaced
 
 IMAGES: Final = ('.jpg', '.jpeg', '.png')
 THREADS: Final = 8
@@ -61,7 +61,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
         return LoggedFrame(row.get('t_start_ns') or 0, number, path)
 
     with tempfile.TemporaryDirectory(prefix='shadowhound-sheet-') as folder, ThreadPoolExecutor(THREADS) as pool:
-        frames = [frame for frame in pool.map(save, evenly(images, MOST)) if frame is not None]
+        frames = [frame for frame in pool.map(save, evenly_spaced(images, MAX_FRAMES)) if frame is not None]
         try:
             contact_sheet(frames, title, min((frame.time_ns for frame in frames), default=0), target)
         except (OSError, ValueError) as error:

@@ -1,6 +1,6 @@
-"""Which mission is active: the one with a journal that its agent has locked. Read from the disk, not from topics or processes.
+"""Finds the active mission: the one whose journal is locked by its agent. Reads the disk, not topics or processes.
 
-Each look takes a stat of the folder, and a probe of the lock of each mission that is active.
+Each poll takes one stat of the folder, and a probe of the lock of each active mission.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, mis
 log = logging.getLogger(__name__)
 
 THIS_MACHINE: Final = SystemClock('')
-"""The boot id does not matter: only times of one boot are compared here."""
+"""Without a boot id: only times of one boot are compared here."""
 
 
 @dataclass(frozen=True, slots=True)
-class Active:
-    """A mission that was active at the time of the look."""
+class ActiveMission:
+    """A mission that was active when the disk was read."""
 
     folder: MissionFolder
     mission_type: str
@@ -38,57 +38,57 @@ class Active:
         return self.folder.mission_id
 
     def has(self, stamp_ns: int) -> bool:
-        """Whether a time is within the mission; UTC of another machine is, if this machine never knew UTC."""
+        """Whether a time is within the mission. If this machine never knew UTC, any UTC time of another machine is."""
         is_before_end = self.end_ns is None or stamp_ns <= self.end_ns or self.end_ns < EARLIEST_SANE_NS <= stamp_ns
         return self.start_ns <= stamp_ns and is_before_end
 
     def since_start_ns(self, stamp_ns: int) -> int:
-        """How long the mission had lasted, even if the clock was set during that time."""
+        """The age of the mission at this time, even if the clock was set since the start."""
         if self.start_ns < EARLIEST_SANE_NS <= stamp_ns:
             stamp_ns -= self.clock.wall_ns() - self.clock.boot_ns()
         return stamp_ns - self.start_ns
 
 
 class MissionFinder:
-    """Finds a robot's active mission, of several the one that began last. Not thread-safe."""
+    """Finds a robot's active mission; if there are several, the one that started last. Not thread-safe."""
 
     def __init__(self, home: Path, robot: str) -> None:
         self._home = home
         self._robot = robot
         self._known: set[str] = set()
-        self._open: dict[str, MissionFolder] = {}  # those that have not ended, or have no first record yet
+        self._open: dict[str, MissionFolder] = {}  # missions that have not ended, or have no first record yet
         self._starts: dict[str, Mapping[str, Any]] = {}
-        self._looked_ns = -1
+        self._listed_ns = -1
         self._logged_error = ''
 
-    def look(self) -> Active | None:
+    def active(self) -> ActiveMission | None:
         """The mission that is active now; None if the folder cannot be read, which is logged once."""
         try:
             self._find()
-            found = [active for folder in tuple(self._open.values()) if (active := self._judge(folder))]
+            found = [active for folder in tuple(self._open.values()) if (active := self._check(folder))]
         except OSError as error:
             if str(error) != self._logged_error:
                 self._logged_error = str(error)
-                log.warning('cannot look for missions: %s', error)
+                log.warning('cannot read the missions: %s', error)
             return None
         return max(found, key=lambda active: active.start_ns, default=None)
 
     def _find(self) -> None:
-        """Find new missions; once more after a change, because two changes may have the same time."""
+        """Find new missions. List the folder once more after a change, because two changes may have the same time."""
         try:
             changed_ns = os.stat(self._home / MISSIONS).st_mtime_ns  # noqa: PTH116 - several times a second
         except FileNotFoundError:
             return
-        if changed_ns == self._looked_ns:
+        if changed_ns == self._listed_ns:
             return
         folders = {folder.mission_id: folder for folder in missions(self._home)}
         self._open |= {name: folder for name, folder in folders.items() if name not in self._known}
         if self._known.issuperset(folders):
-            self._looked_ns = changed_ns
+            self._listed_ns = changed_ns
         self._known = set(folders)
 
-    def _judge(self, folder: MissionFolder) -> Active | None:
-        """None for a mission that has ended, has not started yet, or is another robot's."""
+    def _check(self, folder: MissionFolder) -> ActiveMission | None:
+        """None for a mission that has ended, has not started yet, or belongs to another robot."""
         name = folder.mission_id
         try:
             start = self._starts.get(name) or journal.first(folder.journal)
@@ -103,15 +103,15 @@ class MissionFinder:
             self._forget(name)
             return None
         self._starts[name] = start
-        return Active(folder, str(start['type']), int(start['t']))
+        return ActiveMission(folder, str(start['type']), int(start['t']))
 
     def _forget(self, name: str) -> None:
         del self._open[name]
         self._starts.pop(name, None)
 
 
-def ended(active: Active) -> Active:
-    """The same with the end that the agent recorded; None if the agent was killed."""
+def ended(active: ActiveMission) -> ActiveMission:
+    """The same mission with the end time that the agent recorded; None if the agent was killed."""
     try:
         end = journal.last(active.folder.journal)
     except OSError:

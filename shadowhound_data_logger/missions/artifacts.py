@@ -1,6 +1,6 @@
-"""The artifacts of a mission's run: which files they are, and how each file gets its name there.
+"""The artifacts of a mission's run, and their names.
 
-trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   what the agent passed to log_artifact
+trajectories/trajectory.csv   camera/frame_NNNNNN.jpg (a sample)   the files that the agent passed to log_artifact
 summary.json   camera_summary.jpg   trajectory.png   battery.png   events.jsonl   mission_command.txt
 """
 
@@ -20,7 +20,7 @@ from shadowhound_data_logger.missions.values import MAX_PARAM
 
 
 class Artifact(NamedTuple):
-    """A file of the mission's folder, and its name among the run's artifacts."""
+    """A file in the mission's folder, and its name among the run's artifacts."""
 
     path: Path
     name: str
@@ -28,7 +28,7 @@ class Artifact(NamedTuple):
 
 
 def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, state: MissionState) -> Iterator[Artifact]:
-    """The artifacts of a record of the journal, in the order in which they are sent; the summary last. Raises OSError."""
+    """The artifacts of one record of the journal, in sending order, the summary last. Raises OSError."""
     kind, files = record.get('k'), folder.files
     if kind == 'start' and len(record['command']) > MAX_PARAM:
         path = files / 'command'
@@ -49,18 +49,21 @@ def artifacts_of(record: Mapping[str, Any], folder: MissionFolder, state: Missio
         yield Artifact(folder.summary, 'summary.json')
 
 
-def prepared(folder: MissionFolder, artifact: Artifact) -> Path:
-    """The file under the name that MLflow is to use. Raises FileNotFoundError if it was deleted."""
-    place = folder.files / 'sending'
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(mode=0o700)
+def staged_file(folder: MissionFolder, artifact: Artifact) -> Path:
+    """A link to the file with the artifact's name, because MLflow uploads a file under its own name.
+
+    Raises FileNotFoundError if the file was deleted.
+    """
+    staging = folder.files / 'sending'
+    shutil.rmtree(staging, ignore_errors=True)
+    staging.mkdir(mode=0o700)
     try:
-        os.link(artifact.path, place / artifact.name)
+        os.link(artifact.path, staging / artifact.name)
     except FileNotFoundError:
         raise
-    except OSError:  # a file system without links
-        shutil.copyfile(artifact.path, place / artifact.name)
-    return place / artifact.name
+    except OSError:  # a file system without hard links
+        shutil.copyfile(artifact.path, staging / artifact.name)
+    return staging / artifact.name
 
 
 def _write_events(folder: MissionFolder) -> Path:

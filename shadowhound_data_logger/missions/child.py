@@ -1,4 +1,4 @@
-"""The missions' sender as the agent sees it: a child process that is started, woken, restarted when it dies, and released."""
+"""The agent's handle on the missions' sender: a child process that it starts, wakes, restarts after an exit, and releases."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from shadowhound_data_logger.missions.folder import MISSIONS
 
 log = logging.getLogger(__name__)
 
-AGAIN_S: Final = 5.0
-LONGEST_S: Final = 60.0
-"""The longest pause before a sender that exits is restarted."""
-MOST_LOG_BYTES: Final = 1 << 20
+RESTART_PAUSE_S: Final = 5.0
+MAX_RESTART_PAUSE_S: Final = 60.0
+"""The longest pause before a sender that exited is restarted."""
+MAX_LOG_BYTES: Final = 1 << 20
 _released: list[subprocess.Popen[bytes]] = []
-"""Senders that keep running after their logger was closed; polled, so that none stays a zombie."""
+"""Senders that keep running after their logger was closed; polled, so that none becomes a zombie."""
 PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 UNUSABLE: Final = 78
 """The exit code (EX_CONFIG) of an interpreter that cannot import the sender."""
 NICE: Final = 5
-HOLD_S: Final = 1.0
-"""How long it waits to be woken, or for the agent to exit, before it loads MLflow: loading takes a core for seconds, which the
-first mission's request for a run should not have to share."""
+LOAD_DELAY_S: Final = 1.0
+"""How long the sender waits to be woken, or for the agent to exit, before it loads MLflow: loading keeps a core busy for seconds,
+which would delay the first mission's request for a run."""
 PROGRAM: Final = f"""\
 import os, sys
 if sys.path[:1] == ['']:
@@ -45,24 +45,24 @@ except ImportError as error:
     print(error, file=sys.stderr)
     sys.exit({UNUSABLE})
 sys.exit(main())
-"""  # noqa: S608 - it is no SQL
-"""The sender. It does not import modules from the agent's working directory: a ``queue.py`` there would replace Python's."""
+"""  # noqa: S608 - not SQL
+"""The sender. It imports no modules from the agent's working directory: a ``queue.py`` there would replace Python's."""
 _PYTHON: Final = re.compile(r'(?:python|pypy)(\d+(?:\.\d+)?)?[a-z]*')
-"""Names of interpreters, and their version."""
+"""File names of interpreters, with their version."""
 REMEDY: Final = 'send them with `shadowhound-data missions resume`, from a Python that has this package'
 
 
 class Replayer:
     """Starts and wakes the process that sends missions.
 
-    Lifecycle: New; start once; wake and look any number of times; release once. Only ``wake`` is thread-safe.
+    Lifecycle: New; start once; wake and supervise any number of times; release once. Only ``wake`` is thread-safe.
 
-    The process runs in the agent's working directory at construction, so that relative paths in the environment
-    (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) mean the same to it as to the agent.
+    The process runs in the directory that was the agent's working directory at construction, so that both resolve relative
+    paths in the environment (MLFLOW_TRACKING_URI, AWS_CA_BUNDLE, PYTHONPATH, ...) in the same way.
     """
 
     def __init__(self, home: Path, experiment: str, environ: Mapping[str, str]) -> None:
-        """Raises SettingError for stores of objects and artifacts to which the process could send nothing."""
+        """Raises SettingError for an object or artifact store that the process could not use."""
         store_settings(environ, home)
         if artifacts := environ.get('MLFLOW_S3_ENDPOINT_URL'):
             endpoint_url(artifacts, 'MLFLOW_S3_ENDPOINT_URL')
@@ -73,21 +73,21 @@ class Replayer:
         self._folder = _working_directory()
         self._is_usable = True
         self._process: subprocess.Popen[bytes] | None = None
-        self._pause_s = AGAIN_S
+        self._pause_s = RESTART_PAUSE_S
         self._next_s = 0.0
 
     def start(self) -> None:
-        """Returns immediately. The process loads MLflow when woken, or after ``HOLD_S``; ``look`` retries a failed start."""
+        """Start the process, which loads MLflow when woken or after ``LOAD_DELAY_S``; ``supervise`` retries a failed start."""
         _released[:] = [process for process in _released if process.poll() is None]
         folder = self._home / MISSIONS
         if self._python is None:
-            self._disable(f'this program has no Python interpreter to start (sys.executable is {sys.executable!r})')
+            self._disable(f'no Python interpreter was found (sys.executable is {sys.executable!r})')
             return
-        command = [self._python, '-c', PROGRAM, str(HOLD_S), '--home', str(self._home), '--experiment', self._experiment]
+        command = [self._python, '-c', PROGRAM, str(LOAD_DELAY_S), '--home', str(self._home), '--experiment', self._experiment]
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with os.fdopen(os.open(folder / 'replay.log', os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), 'ab') as output:
-                if output.tell() > MOST_LOG_BYTES:
+                if output.tell() > MAX_LOG_BYTES:
                     output.truncate(0)
                 self._process = subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=output, stderr=output, env=self._environ,
@@ -100,28 +100,28 @@ class Replayer:
             os.set_blocking(self._process.stdin.fileno(), False)
 
     def wake(self) -> None:
-        """Have it read the journals now."""
+        """Make the sender read the journals now."""
         process = self._process
         if process is not None and process.stdin is not None:
             with suppress(OSError, ValueError):  # it has exited, was released, or its pipe is full
                 os.write(process.stdin.fileno(), b'\n')
 
-    def look(self) -> None:
-        """Restart it if it has exited, after a pause that doubles."""
+    def supervise(self) -> None:
+        """Restart the sender if it has exited, after a pause that doubles."""
         if self._is_usable and self._process is not None and self._process.poll() == UNUSABLE:
-            self._disable(f'{self._python} cannot import it: see {self._home / MISSIONS / "replay.log"}')
+            self._disable(f'{self._python} cannot import the sender: see {self._home / MISSIONS / "replay.log"}')
         if self._is_usable and (self._process is None or self._process.poll() is not None):
             if self._process is not None and self._next_s == 0.0:
                 log.warning("the missions' sender exited with %s; restarting it", self._process.returncode)
             if self._next_s == 0.0:
                 self._next_s = time.monotonic() + self._pause_s
             elif time.monotonic() >= self._next_s:
-                self._pause_s, self._next_s = min(2 * self._pause_s, LONGEST_S), 0.0
+                self._pause_s, self._next_s = min(2 * self._pause_s, MAX_RESTART_PAUSE_S), 0.0
                 self._close_pipe()
                 self.start()
 
     def release(self) -> None:
-        """Let it run on without the agent: it exits when it has sent everything."""
+        """Let the sender continue without the agent: it exits when it has sent everything."""
         self._close_pipe()
         process, self._process = self._process, None
         if process is not None:
@@ -134,7 +134,7 @@ class Replayer:
             self._process.returncode, self._process = 0, None
 
     def _disable(self, reason: str) -> None:
-        """Send nothing, and log that once."""
+        """Stop sending, and log that once."""
         self._is_usable = False
         log.warning('missions are journaled in %s but not sent: %s; %s', self._home / MISSIONS, reason, REMEDY)
 
@@ -145,10 +145,10 @@ class Replayer:
 
 
 def interpreter() -> str | None:
-    """The path of the Python that runs this program, or of the one that is installed where its library is.
+    """The path of the Python that runs this program, or of the one that is installed next to its library.
 
-    In a program that embeds Python or is frozen, ``sys.executable`` is None, empty or that program, which must not be started a
-    second time: only a file with the name of an interpreter is used. None if there is no such file.
+    In a program that embeds Python or is frozen, ``sys.executable`` is None, empty or that program, which must not be started
+    again: only a file with the name of an interpreter is used. None if there is no such file.
     """
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
     own = () if getattr(sys, 'frozen', False) else (sys.executable, getattr(sys, '_base_executable', None))
@@ -169,7 +169,7 @@ def _is_python(path: object, version: str) -> bool:
 
 
 def _import_path(environ: Mapping[str, str], python: str | None) -> list[str]:
-    """The agent's PYTHONPATH and this package; also the agent's packages if the interpreter is another one."""
+    """The agent's PYTHONPATH and this package; also the agent's packages if the interpreter is not the agent's."""
     given = []
     with suppress(OSError):  # the working directory was deleted
         given = [os.path.abspath(entry) for entry in environ.get('PYTHONPATH', '').split(os.pathsep) if entry]  # noqa: PTH100

@@ -1,4 +1,4 @@
-"""``camera_summary.jpg``: frames of a mission on one sheet, 800 pixels wide, each with its id and time."""
+"""``camera_summary.jpg``: a contact sheet of a mission's frames, 800 pixels wide, each with its id and time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.untrusted import open_image
 
 WIDTH: Final = 800
-MOST: Final = 20
+MAX_FRAMES: Final = 20
 """Frames on a sheet: four columns, five rows."""
 GAP: Final = 8
 CAPTION: Final = 22
@@ -25,7 +25,7 @@ _Item = TypeVar('_Item')
 
 
 class LoggedFrame(NamedTuple):
-    """A frame of a mission, or of an answer of the lake."""
+    """A frame of a mission, or of a query of the lake."""
 
     time_ns: int
     number: int
@@ -38,13 +38,13 @@ class _Thumb(NamedTuple):
 
 
 def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, target: Path, *, below: str = '') -> str:
-    """Write the JPEG, with a line ``below`` its title; returns a note: '' or how many frames are not images.
+    """Write the JPEG, with the line ``below`` under its title; returns a note: '' or how many frames are not images.
 
     Raises ValueError if there is no image.
     """
     if not frames:
         raise ValueError('no camera frame was sampled')
-    chosen = evenly(frames, MOST)
+    chosen = evenly_spaced(frames, MAX_FRAMES)
     columns = _columns(len(chosen))
     width = (WIDTH - GAP) // columns - GAP
     thumbs, broken = _thumbs(chosen, width)
@@ -70,19 +70,19 @@ def contact_sheet(frames: Sequence[LoggedFrame], title: str, start_ns: int, targ
     return f'{broken} of {len(chosen)} frames are not images' if broken else ''
 
 
-def evenly(items: Sequence[_Item], most: int) -> list[_Item]:
-    """At most so many of them, evenly chosen; the first and the last are among them."""
-    count = min(most, len(items))
+def evenly_spaced(items: Sequence[_Item], limit: int) -> list[_Item]:
+    """At most ``limit`` items, evenly spaced, including the first and the last."""
+    count = min(limit, len(items))
     return [items[round(place * (len(items) - 1) / max(1, count - 1))] for place in range(count)]
 
 
 def _columns(count: int) -> int:
-    """As few as possible while the sheet is full."""
+    """As few columns as fill the sheet."""
     return {1: 1, 2: 2, 4: 2}.get(count, 3 if count <= 9 else 4)
 
 
 def _thumbs(frames: Sequence[LoggedFrame], width: int) -> tuple[list[_Thumb], int]:
-    """The frames at a sheet's size, and how many of them could not be read."""
+    """The frames scaled to this width, and how many of them could not be read."""
     thumbs: list[_Thumb] = []
     for frame in frames:
         try:
@@ -96,7 +96,7 @@ def _thumbs(frames: Sequence[LoggedFrame], width: int) -> tuple[list[_Thumb], in
 
 
 def _caption(pen: ImageDraw.ImageDraw, place: tuple[int, int], width: int, frame: LoggedFrame, start_ns: int) -> None:
-    """The id at the left, the time (UTC, and since the start where there is room) at the right."""
+    """The id on the left; on the right the time (UTC, followed by the time since the start if it fits)."""
     font = _font(12)
     seconds = max(0, frame.time_ns - start_ns) // SECOND
     time = f'{utc(frame.time_ns):%H:%M:%S}'

@@ -1,4 +1,4 @@
-"""Files that a mission keeps until they are sent: complete or not at all, and never on a disk that is almost full."""
+"""Writes the files that a mission keeps until they are sent: completely or not at all, and never to an almost full disk."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Final
 from shadowhound_data_logger.core.errors import Rejected
 
 MIN_FREE_BYTES: Final = 64 << 20
-"""Below it no file is kept: the journal needs the rest."""
+"""With less free space no file is written: the journal needs the rest."""
 COPY_BYTES: Final = 1 << 20
-SPARES: Final = 4
-"""At 10 Hz, one is needed between two syncs."""
+PREALLOCATED: Final = 4
+"""Files. At 10 Hz, one is used between two syncs."""
 
 
-class Spares:
-    """Frames of a mission, in files that were made before they are needed.
+class PreallocatedFiles:
+    """Writes the frames of a mission to files that were created in advance.
 
-    After each sync, creating the next file in a folder takes ext4 longer than writing a frame (its journal copies what it is
-    committing), so the thread that syncs does it. Lifecycle: New; ``write`` and ``fill`` from any thread; close once.
-    ``_lock`` guards the files that were made ahead.
+    After a sync, ext4 takes longer to create the next file in a folder than to write a frame (its journal copies the data that it
+    is committing), so the thread that syncs creates the files. Lifecycle: New; ``write`` and ``fill`` from any thread; close
+    once. ``_lock`` guards the files created in advance.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -36,21 +36,21 @@ class Spares:
         self._is_open = True
 
     def write(self, data: memoryview) -> str:
-        """The name of a file with this content. Raises OSError, and then nothing is there."""
-        _check_room(self._folder)
+        """Write a file and return its name. Raises OSError, and then leaves no file behind."""
+        _check_free_space(self._folder)
         try:
             target, descriptor = self._ready.popleft()
         except IndexError:
-            target, descriptor = self._new()
+            target, descriptor = self._create()
         _write(target, descriptor, data)
         return target.name
 
     def fill(self) -> None:
-        """Make some ahead if there is room."""
+        """Create files in advance if there is free space."""
         with self._lock, suppress(OSError):
-            while self._is_open and len(self._ready) < SPARES:
-                _check_room(self._folder)
-                self._ready.append(self._new())
+            while self._is_open and len(self._ready) < PREALLOCATED:
+                _check_free_space(self._folder)
+                self._ready.append(self._create())
 
     def close(self) -> None:
         """Remove unused files; idempotent."""
@@ -67,14 +67,14 @@ class Spares:
         while self._ready:
             os.close(self._ready.popleft()[1])
 
-    def _new(self) -> tuple[Path, int]:
+    def _create(self) -> tuple[Path, int]:
         target = self._folder / f'{next(self._numbers):08d}.jpg'
         return target, _create(target)
 
 
 def write(target: Path, data: memoryview) -> None:
-    """Raises OSError, and then nothing is there."""
-    _check_room(target.parent)
+    """Write a new file. Raises OSError, and then leaves no file behind."""
+    _check_free_space(target.parent)
     _write(target, _create(target), data)
 
 
@@ -92,11 +92,11 @@ def _write(target: Path, descriptor: int, data: memoryview) -> None:
         os.close(descriptor)
     if written != len(data):
         target.unlink()
-        raise OSError(f'only a part of {target} was written')
+        raise OSError(f'{target} was only partly written')
 
 
 def copy(source: str | os.PathLike[str], target: Path) -> None:
-    """Raises Rejected for what is not a file that can be read, OSError when there is no room; then nothing is there."""
+    """Copy a file. Raises Rejected if ``source`` is not a readable file, OSError if the disk is full; then leaves no copy."""
     try:
         if not os.path.isfile(source):  # noqa: PTH113 - a text or a Path; reading a pipe would not end
             raise FileNotFoundError(f'{source!s:.200} is not a file')
@@ -104,7 +104,7 @@ def copy(source: str | os.PathLike[str], target: Path) -> None:
     except (OSError, TypeError, ValueError) as error:
         raise Rejected('no_file', str(error)) from error
     with opened:
-        _check_room(target.parent)
+        _check_free_space(target.parent)
         try:
             with os.fdopen(_create(target), 'wb') as file:
                 shutil.copyfileobj(opened, file, COPY_BYTES)
@@ -113,7 +113,7 @@ def copy(source: str | os.PathLike[str], target: Path) -> None:
             raise
 
 
-def _check_room(folder: Path) -> None:
+def _check_free_space(folder: Path) -> None:
     status = os.statvfs(folder)
     if status.f_bavail * status.f_frsize < MIN_FREE_BYTES:
-        raise OSError(f'the disk of {folder} is full')
+        raise OSError(f'the disk of {folder} has less than {MIN_FREE_BYTES >> 20} MiB free')

@@ -1,17 +1,17 @@
-"""The folder of a mission, ``$SHADOWHOUND_HOME/missions/<mission id>/``, which has everything about it.
+"""The folder of a mission, ``$SHADOWHOUND_HOME/missions/<mission id>/``, with everything about it.
 
-    journal        what the agent logged (journal.py)
+    journal        the agent's journal (journal.py)
     files/         copies of frames, trajectories and artifacts, until they are sent
-    run.json       the MLflow run, once there is one
-    sent.json      how far the replayer came
-    summary.json   what the mission was, once it is over
-    pictures.json  what became of its pictures
-    clock.json     what is added to times of before the clock was set (dating.py)
-    floor.npy      x and y (m) of lidar points, a row each, where the node saw any: the floor plan under the trajectory's picture
-    trajectory.csv what the node made of odometry, once the mission is over and where the agent logged no trajectory
-    node/          the same for what the node logged: its journal, files/ and sent.json
+    run.json       the MLflow run, once it exists
+    sent.json      how far the mission is sent
+    summary.json   the summary, once the mission has ended
+    pictures.json  notes about the mission's pictures
+    clock.json     the offset to add to times from before the clock was set (dating.py)
+    floor.npy      x and y (m) of lidar points, one row each, if the node received any: the floor plan under the trajectory's plot
+    trajectory.csv computed by the node from odometry after the mission has ended, if the agent logged no trajectory
+    node/          the node's journal, files/ and sent.json
 
-Both ids find it: the folder has the mission's, ``run.json`` the run's.
+A mission is found by either id: the folder is named by the mission id, and ``run.json`` has the run id.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from shadowhound_data_logger.missions.journal import Line, dated, read
 
 MISSIONS: Final = 'missions'
 UNIQUE_BYTES: Final = 4
-"""Of the random end of a mission's id: another robot may start a patrol in the same second."""
+"""Length of the random suffix of a mission id: another robot may start a patrol in the same second."""
 _UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
 
 
@@ -49,22 +49,22 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class MissionSent:
-    """How far a mission is sent: offsets in its journal, up to which each receiver has everything."""
+    """How far a mission is sent: for each receiver, the offset in the journal up to which it has everything."""
 
     metrics: int = 0
     artifacts: int = 0
     objects: int = 0
     held: bool = False
-    """Whether the spool may hold some of its objects until there is a run."""
+    """Whether the spool may hold some of the mission's objects until the run exists."""
     ended: bool = False
-    """Whether the run has its last state."""
+    """Whether the run has its final state."""
     complete: bool = False
     refused: int = 0
     """Points, params and tags that the tracking server refused permanently."""
     unattached: int = 0
-    """Artifacts that it refused permanently, or that have no file any more."""
+    """Artifacts that the server refused permanently, or whose file was deleted."""
     missing: int = 0
-    """Frames and trajectories with a file that was deleted before it was spooled."""
+    """Frames and trajectories whose file was deleted before it was spooled."""
     error: str = ''
     """The last refusal."""
 
@@ -105,29 +105,29 @@ class MissionFolder:
 
     @property
     def node(self) -> MissionFolder:
-        """What the node logged in addition to the agent."""
+        """The folder of the node's journal."""
         return MissionFolder(self.path / 'node')
 
     def lines(self, offset: int = 0) -> Iterator[Line]:
-        """The agent's journal from ``offset`` on, with times corrected by ``clock.json``. Raises OSError."""
+        """The lines of the agent's journal from ``offset``, with times corrected by ``clock.json``. Raises OSError."""
         return dated(read(self.journal, offset), self.clock_offset_ns() or 0)
 
     def node_lines(self, offset: int = 0) -> Iterator[Line]:
-        """The same of the node's journal, empty if there is none. Raises OSError."""
+        """The same for the node's journal; empty if it does not exist. Raises OSError."""
         journal = self.node.journal
         return dated(read(journal, offset), self.clock_offset_ns() or 0) if journal.exists() else iter(())
 
     def clock_offset_ns(self) -> int | None:
-        """What is added to times from before the clock was set; None until that is decided."""
+        """The offset to add to times from before the clock was set; None until it is known."""
         found = read_json(self.path / 'clock.json').get('offset_ns')
         return found if isinstance(found, int) else None
 
     def set_clock_offset_ns(self, offset_ns: int) -> None:
-        """Once: points that are sent again after a crash must have the times that they had before."""
+        """Set the offset, only once: points that are sent again after a crash must have the same times as before."""
         write_json(self.path / 'clock.json', {'offset_ns': offset_ns}, durable=True)
 
     def run(self) -> Run | None:
-        """The run, once it was created."""
+        """The run; None until it was created."""
         found = read_json(self.path / 'run.json')
         try:
             return Run(**{spec.name: str(found[spec.name]) for spec in fields(Run)})
@@ -138,7 +138,7 @@ class MissionFolder:
         write_json(self.path / 'run.json', {**asdict(run), 'mission_id': self.mission_id}, durable=True)
 
     def sent(self) -> MissionSent:
-        """All zero if the file is missing or unreadable: sending again changes nothing."""
+        """How far the mission is sent; all zero if the file is missing or unreadable, because sending again is harmless."""
         found = read_json(self.path / 'sent.json')
         try:
             return MissionSent(**found)
@@ -146,7 +146,7 @@ class MissionFolder:
             return MissionSent()
 
     def age_s(self) -> float:
-        """Time since something of it was last sent. Raises OSError if nothing was."""
+        """Time since anything was last sent. Raises OSError if nothing was."""
         return time.time() - (self.path / 'sent.json').stat().st_mtime
 
     def set_sent(self, sent: MissionSent, *, durable: bool = False) -> None:
@@ -154,7 +154,7 @@ class MissionFolder:
 
 
 def missions(home: Path) -> Iterator[MissionFolder]:
-    """All missions of a home, by name, which puts the newest of a type last. Raises OSError, but not for a missing folder."""
+    """All missions of a home, by name, so that the newest of a type comes last. Raises OSError, but not for a missing folder."""
     try:
         names = sorted(entry.name for entry in os.scandir(home / MISSIONS) if entry.is_dir() and not entry.name.startswith('.'))
     except FileNotFoundError:
@@ -163,9 +163,9 @@ def missions(home: Path) -> Iterator[MissionFolder]:
 
 
 def safe_type(mission_type: str) -> str:
-    """The mission type in keys and names of files: unchanged if possible, otherwise the nearest valid name.
+    """The mission type for keys and file names: unchanged if valid, otherwise with invalid characters replaced.
 
-    Two types may have the same one. Everywhere else a type keeps the spelling that the agent passed.
+    Two types may get the same name. Everywhere else a type keeps the spelling that the agent passed.
     """
     try:
         return check_name(mission_type, 'the mission type')
@@ -173,21 +173,21 @@ def safe_type(mission_type: str) -> str:
         return _UNSAFE.sub('_', mission_type).strip('_.-')[:MAX_NAME_BYTES].replace('..', '_') or 'mission'
 
 
-def stamped(mission_type: str, start_ns: int) -> str:
-    """For keys and names of files: ``<mission type>_YYYYMMDD_HHMMSS``, UTC."""
+def timestamped_name(mission_type: str, start_ns: int) -> str:
+    """``<mission type>_YYYYMMDD_HHMMSS`` (UTC), for keys and file names."""
     return run_name(safe_type(mission_type), start_ns)
 
 
 def run_name(mission_type: str, start_ns: int) -> str:
-    """The name of the run in MLflow: the same, with the type as the agent spelled it."""
+    """The run's name in MLflow: like ``timestamped_name``, but with the type as the agent spelled it."""
     return f'{mission_type or "mission"}_{utc(start_ns):%Y%m%d_%H%M%S}'
 
 
 def new_folder(home: Path, mission_type: str, start_ns: int) -> MissionFolder:
-    """Make the folder of a new mission, readable by its owner alone. Raises OSError."""
+    """Create the folder of a new mission, readable only by its owner. Raises OSError."""
     (home / MISSIONS).mkdir(mode=0o700, parents=True, exist_ok=True)
     while True:
-        folder = MissionFolder(home / MISSIONS / f'{stamped(mission_type, start_ns)}_{secrets.token_hex(UNIQUE_BYTES)}')
+        folder = MissionFolder(home / MISSIONS / f'{timestamped_name(mission_type, start_ns)}_{secrets.token_hex(UNIQUE_BYTES)}')
         try:
             folder.path.mkdir(mode=0o700)
         except FileExistsError:
@@ -206,6 +206,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any], *, durable: bool = False) -> None:
-    """Replace a file atomically: a reader sees the old or the new one. Raises OSError."""
+    """Replace a file atomically: a reader sees the old or the new content. Raises OSError."""
     with replacing(path, is_synced=durable, mode=0o600) as file:
         file.write(json.dumps(content, indent=1).encode())

@@ -1,7 +1,7 @@
-"""The journal of one mission: an append-only file that contains what was logged when the call returns.
+"""The journal of one mission: an append-only file. When a log call returns, its record is in the file.
 
-One record per line: eight hex digits, the CRC-32 of what follows the space, then JSON in ASCII. A line break cannot occur in such
-JSON, so a torn or corrupt line affects no other. The file is locked (flock) as long as its writer runs.
+One record per line: the CRC-32 of the JSON in eight hex digits, a space, then the JSON in ASCII. Such JSON contains no line
+break, so a torn or corrupt line does not affect the others. The file is locked (flock) as long as its writer runs.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from shadowhound_data_logger.core.durable_files import lock
 
 CHUNK: Final = 1 << 20
 TAIL_BYTES: Final = 64 << 10
-"""Contains the last record of a mission, which is short."""
+"""Enough for the last record of a mission, which is short."""
 MAX_LINE_BYTES: Final = 16 << 20
-"""More without a line break is damage: records are limited to far less."""
+"""More bytes without a line break are damage: records are far shorter."""
 
 
 class Line(NamedTuple):
@@ -33,13 +33,13 @@ class Line(NamedTuple):
     end: int
     """Offset of the first byte after it, where reading continues."""
     record: Mapping[str, Any] | None
-    """None for a line that is damaged."""
+    """None for a damaged line."""
 
 
 class Journal:
     """Writes the journal of a mission. Lifecycle: New; create once; append from any thread; sync from one; close once.
 
-    ``_lock`` guards the descriptor and makes a line one write.
+    ``_lock`` guards the descriptor, and ensures that a line is one write.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,17 +49,17 @@ class Journal:
         self._torn = False
 
     def create(self) -> None:
-        """Raises FileExistsError if there is one, OSError if the disk is full or does not permit it."""
+        """Create the file and lock it. Raises FileExistsError, or another OSError (a full disk, no permission)."""
         self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
         lock(self._descriptor)
         _open.add(self)
 
     def reopen(self) -> None:
-        """Continue the journal of an earlier writer, or start one. Raises BlockingIOError while another writer runs, OSError."""
+        """Continue the journal of an earlier writer, or create one. Raises BlockingIOError while another writer runs, OSError."""
         descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         try:
             if not lock(descriptor, wait=False):
-                raise BlockingIOError(errno.EAGAIN, 'another process writes it', str(self.path))
+                raise BlockingIOError(errno.EAGAIN, 'another process is writing this journal', str(self.path))
         except OSError:
             os.close(descriptor)
             raise
@@ -67,25 +67,25 @@ class Journal:
         _open.add(self)
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """After it, the record survives a kill of the process; after ``sync``, a power cut. Raises OSError (a full disk)."""
+        """Write a record. It survives a kill of the process, and after ``sync`` a power cut. Raises OSError (a full disk)."""
         data = line_of(record)
         with self._lock:
             if self._descriptor < 0:
                 return
-            if self._torn:  # what a full disk cut off must not swallow this line
+            if self._torn:  # the previous record was cut off by a full disk: start a new line
                 data = b'\n' + data
             torn, self._torn = self._torn, True
             try:
                 self._torn = os.write(self._descriptor, data) != len(data)
             except OSError:
-                self._torn = torn  # nothing of it was written
+                self._torn = torn  # nothing was written
                 raise
             torn = self._torn
         if torn:
-            raise OSError(f'only a part of a record was written to {self.path}')
+            raise OSError(f'a record was only partly written to {self.path}')
 
     def sync(self) -> None:
-        """Wait for the disk, while others append. Raises OSError."""
+        """Wait for the disk, while other threads append. Raises OSError."""
         with self._lock:
             if self._descriptor < 0:
                 return
@@ -103,7 +103,7 @@ class Journal:
             os.close(descriptor)
 
     def forget(self) -> None:
-        """In a forked child: only the parent writes, and its exit must not be hidden by the child's copy of the lock."""
+        """In a forked child: only the parent writes, and the child's copy of the lock must not hide the parent's exit."""
         self._lock = threading.Lock()
         with suppress(OSError):
             self.close()
@@ -121,13 +121,13 @@ os.register_at_fork(after_in_child=_forget_all)
 
 
 def line_of(record: Mapping[str, Any]) -> bytes:
-    """A record as a line of the file."""
+    """Encode a record as a line of the file."""
     text = json.dumps(record, separators=(',', ':'), allow_nan=False).encode('ascii')
     return b'%08x %s\n' % (zlib.crc32(text), text)
 
 
 def read(path: Path, offset: int = 0) -> Iterator[Line]:
-    """The complete lines from ``offset`` on, without one that is torn or still being written. Raises OSError."""
+    """The complete lines from ``offset``, without a last line that is torn or still being written. Raises OSError."""
     with path.open('rb') as file:
         file.seek(offset)
         rest = b''
@@ -153,7 +153,7 @@ def dated(lines: Iterable[Line], offset_ns: int) -> Iterator[Line]:
 
 
 def parse(line: bytes) -> Mapping[str, Any] | None:
-    """The record of a line, None if the checksum does not match."""
+    """The record of a line; None if the checksum does not match."""
     try:
         if int(line[:8], 16) != zlib.crc32(line[9:]) or line[8:9] != b' ':
             return None
@@ -164,7 +164,7 @@ def parse(line: bytes) -> Mapping[str, Any] | None:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether its writer runs. Raises OSError (there is no such file)."""
+    """Whether the journal's writer is running. Raises OSError (FileNotFoundError)."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         return not lock(descriptor, wait=False, shared=True)
@@ -188,7 +188,7 @@ def last(path: Path) -> Mapping[str, Any]:
 
 @contextmanager
 def abandoned(path: Path) -> Iterator[int | None]:
-    """The journal of a writer that exited, opened and locked to be finished; None while the writer runs."""
+    """Open and lock the journal of a writer that exited, to finish it; None while the writer runs."""
     descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
     try:
         yield descriptor if lock(descriptor, wait=False) else None
@@ -203,6 +203,6 @@ def finish(path: Path, descriptor: int, end: int, record: Mapping[str, Any]) -> 
     data = line_of(record)
     if os.write(descriptor, data) != len(data):
         os.ftruncate(descriptor, end)
-        raise OSError(f'there is no room to finish {path}')
+        raise OSError(f'the disk is too full to finish {path}')
     os.fsync(descriptor)
     return torn

@@ -26,9 +26,9 @@ from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.missions.child import Replayer
 from shadowhound_data_logger.missions.folder import MissionFolder
+from shadowhound_data_logger.missions.mission import Mission, MissionStarter
 from shadowhound_data_logger.missions.new_run import RunRequests
 from shadowhound_data_logger.missions.overview import Report, has_arrived, report, sizes
-from shadowhound_data_logger.missions.recorder import Mission, MissionStarter
 from shadowhound_data_logger.missions.state import FAILED, KILLED
 from shadowhound_data_logger.missions.values import text
 from shadowhound_data_logger.spool.local_robot import local_robot
@@ -36,7 +36,7 @@ from shadowhound_data_logger.spool.local_robot import local_robot
 log = logging.getLogger(__name__)
 
 SYNC_S: Final = 0.1
-"""How often the journal is synced: with a slow fsync, what was logged is on the disk after 250 ms."""
+"""How often the journal is synced: even with a slow fsync, a record is on disk after 250 ms."""
 IDLE_S: Final = 1.0
 POLL_S: Final = 0.01
 CLOSE_S: Final = 5.0
@@ -45,8 +45,8 @@ CLOSE_S: Final = 5.0
 class MissionDataLogger:
     """Logs the missions of one agent, one mission at a time. No call waits for a server or raises because of one.
 
-    What is logged is in a journal on the disk when the call returns. A child process, the sender, delivers it to MLflow and
-    the store, and keeps running after the agent exits until everything is sent. In a frozen or embedded program, which has no
+    Each call writes to a journal on disk before it returns. A child process, the sender, delivers the journal to MLflow and the
+    store, and keeps running after the agent exits until everything is sent. In a frozen or embedded program, which has no
     interpreter to start, missions are only journaled, with one warning. All methods may be called from any thread.
 
     Lifecycle: New; any number of missions; ``close`` once, or never.
@@ -67,9 +67,9 @@ class MissionDataLogger:
             home: the folder of journals and spool. By default ``SHADOWHOUND_HOME``, otherwise ``~/.shadowhound``.
             tracking_uri: the MLflow server. By default ``MLFLOW_TRACKING_URI``, otherwise a SQLite file in ``home``.
             experiment: the MLflow experiment. By default ``ROBOT_missions``.
-            start_timeout_s: for how long the start of a mission may wait for the run's id.
-            frame_artifact_every_s: of the camera frames, one per so many seconds becomes an artifact of the run; the store
-                gets all of them.
+            start_timeout_s: the longest that the start of a mission waits for the run's id.
+            frame_artifact_every_s: one camera frame per this many seconds becomes an artifact of the run; the store gets all
+                frames.
             replay: False only writes journals; another logger with the same home sends them.
 
         Raises:
@@ -83,9 +83,9 @@ class MissionDataLogger:
         self._environ = environ | {'SHADOWHOUND_ROBOT': self.robot}
         self._start_timeout_s = _seconds('start_timeout_s', start_timeout_s)
         every_s = _seconds('frame_artifact_every_s', frame_artifact_every_s)
-        self._runs = RunRequests(self._environ, experiment) if replay and RunRequests.can_ask(self._environ) else None
+        self._runs = RunRequests(self._environ, experiment) if replay and RunRequests.is_supported(self._environ) else None
         self._starter = MissionStarter(self.home, self.robot, every_s, SystemClock.of_this_machine(), self._runs)
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # guards the active mission
         self._mission: Mission | None = None
         self._ended: list[Mission] = []
         self._newest: MissionFolder | None = None
@@ -106,7 +106,7 @@ class MissionDataLogger:
     def __repr__(self) -> str:
         return f'MissionDataLogger(robot={self.robot!r}, home={str(self.home)!r}, mission={self._mission!r})'
 
-    # -- a mission's life ------------------------------------------------------------------------------------------
+    # -- start and end ---------------------------------------------------------------------------------------------
 
     def start_mission(self, mission_type: str, mission_command: str) -> str:
         """Start a mission. If another one is active, it ends as KILLED.
@@ -114,11 +114,11 @@ class MissionDataLogger:
         Args:
             mission_type: such as ``patrol``; at most 128 characters. In keys and file names, characters other than A-Z, a-z, 0-9,
                 ``_``, ``-`` and ``.`` are replaced.
-            mission_command: what the robot is to do, as free text.
+            mission_command: the robot's task, as free text.
 
         Returns:
-            The MLflow run's id, or the mission's own id if no server answers within ``start_timeout_s``. Either finds the mission
-            later: the run has the tag ``shadowhound.mission_id``, and ``missions/MISSION_ID/run.json`` has the run's id.
+            The MLflow run's id, or the mission's own id if no server answers within ``start_timeout_s``. Both identify the
+            mission: the run has the tag ``shadowhound.mission_id``, and ``missions/MISSION_ID/run.json`` has the run's id.
         """
         mission = self._start(mission_type, mission_command)
         return mission.run_id or mission.id
@@ -127,20 +127,20 @@ class MissionDataLogger:
     def mission(self, mission_type: str, mission_command: str) -> Iterator[Mission]:
         """A mission as a context manager, which yields the ``Mission``.
 
-        It ends as FINISHED; an exception ends it as FAILED, is recorded in it, and is raised again.
+        The mission ends as FINISHED. An exception ends it as FAILED, is recorded in it, and propagates.
         """
         mission = self._start(mission_type, mission_command)
         try:
             yield mission
         except BaseException as error:
-            said = text(error)
-            mission.log_event('exception', type=type(error).__name__, text=said)
-            mission.end(success=False, status=FAILED, error=f'{type(error).__name__}: {said}')
+            message = text(error)
+            mission.log_event('exception', type=type(error).__name__, text=message)
+            mission.end(success=False, status=FAILED, error=f'{type(error).__name__}: {message}')
             raise
         else:
             mission.end(success=True)
         finally:
-            self._leave(mission)
+            self._detach(mission)
 
     def end_mission(self, success: bool, distance_m: float, duration_s: float) -> None:
         """End the active mission.
@@ -152,12 +152,12 @@ class MissionDataLogger:
         """
         if mission := self._active('end_mission'):
             mission.end(success, distance_m, duration_s)
-            self._leave(mission)
+            self._detach(mission)
 
-    # -- what happens in it ----------------------------------------------------------------------------------------
+    # -- logging to the active mission -----------------------------------------------------------------------------
 
     def log_camera_frame(self, frame_data: Any, frame_id: int) -> None:
-        """As ``Mission.log_camera_frame``, for the active mission. Without one it does nothing, with one warning."""
+        """As ``Mission.log_camera_frame``, for the active mission. Without one, do nothing but warn once."""
         if mission := self._active('log_camera_frame'):
             mission.log_camera_frame(frame_data, frame_id)
 
@@ -192,7 +192,7 @@ class MissionDataLogger:
         """Wait until everything that agent and node have logged is sent, for at most ``deadline_s`` seconds. Never raises.
 
         Returns:
-            What has arrived of the newest mission, and what it waits for otherwise.
+            How far the newest mission is sent, and what it waits for.
         """
         self._sync()
         if self._replayer:
@@ -207,12 +207,12 @@ class MissionDataLogger:
         """End an active mission as KILLED and release the sender. Idempotent.
 
         Args:
-            deadline_s: for how long to wait for the sender. The sender keeps running and sends the rest, or the next one does.
+            deadline_s: how long to wait for the sender. It keeps running and sends the rest; if it is stopped, the next one does.
         """
         if mission := self._mission:
-            log.warning('mission %s is still active when its logger is closed: it ends as KILLED', mission.id)
+            log.warning('mission %s was still active when its logger was closed: it ends as KILLED', mission.id)
             mission.end(success=False, status=KILLED, error='the logger was closed')
-            self._leave(mission)
+            self._detach(mission)
         found = self.flush(0.0 if self._closed else deadline_s)
         self._closed = True
         self._worker.stop()
@@ -222,16 +222,27 @@ class MissionDataLogger:
             self._replayer.release()
         return found
 
-    # -- within ----------------------------------------------------------------------------------------------------
+    # -- internal --------------------------------------------------------------------------------------------------
 
     def _start(self, mission_type: str, mission_command: str) -> Mission:
-        mission = self._begin(mission_type, mission_command)
-        if self._replayer and mission.is_active:
-            self._await_run(mission, self._replayer)
+        """Start the active mission and wait for its run; if the disk is full, the mission is not logged."""
+        with self._lock:
+            before, self._mission = self._mission, None
+            if before is not None:
+                log.warning('mission %s is still active: it ends as KILLED', before.id)
+                before.end(success=False, status=KILLED, error='another mission was started')
+                self._ended.append(before)
+            mission = self._starter.start(mission_type, mission_command)
+            if mission is None:
+                return self._starter.unlogged(mission_type)
+            self._newest, self._mission = mission.folder, mission
+            self._wake.set()
+        if self._replayer:
+            self._wait_for_run(mission, self._replayer)
         return mission
 
-    def _await_run(self, mission: Mission, replayer: Replayer) -> None:
-        """Wait for ``start_timeout_s``, or until no server answers; the sender is woken after the request of this process."""
+    def _wait_for_run(self, mission: Mission, replayer: Replayer) -> None:
+        """Wait up to ``start_timeout_s``, but not for an unreachable server; wake the sender after this process's request."""
         end, new = time.monotonic() + self._start_timeout_s, mission.new_run
         if new is not None:
             new.is_settled.wait(self._start_timeout_s)
@@ -240,30 +251,15 @@ class MissionDataLogger:
             return
         _until(lambda: mission.run_id is not None, end - time.monotonic())
 
-    def _begin(self, mission_type: str, mission_command: str) -> Mission:
-        """Make it the active mission; on a full disk, the mission is not logged."""
-        with self._lock:
-            before, self._mission = self._mission, None
-            if before is not None:
-                log.warning('mission %s is still active: it ends as KILLED', before.id)
-                before.end(success=False, status=KILLED, error='another mission was started')
-                self._ended.append(before)
-            mission = self._starter.mission(mission_type, mission_command)
-            if mission is None:
-                return self._starter.nothing(mission_type)
-            self._newest, self._mission = mission.folder, mission
-            self._wake.set()
-            return mission
-
     def _active(self, call: str) -> Mission | None:
         mission = self._mission
         if mission is None and call not in self._warned:
             self._warned.add(call)
-            log.warning('%s without a mission does nothing', call)
+            log.warning('%s without an active mission does nothing: call start_mission first', call)
         return mission
 
-    def _leave(self, mission: Mission) -> None:
-        """Have the thread sync and close the ended mission."""
+    def _detach(self, mission: Mission) -> None:
+        """Let the thread sync and close the ended mission."""
         with self._lock:
             if self._mission is mission:
                 self._mission = None
@@ -276,7 +272,7 @@ class MissionDataLogger:
         self._wake.clear()
         self._sync()
         if self._replayer and not self._closed:
-            self._replayer.look()
+            self._replayer.supervise()
 
     def _sync(self) -> None:
         with self._lock:
@@ -321,7 +317,7 @@ def _text(name: str, value: object) -> str:
     except TypeError as error:
         raise SettingError(name, value, 'a text') from error
     if not isinstance(found, str) or '\0' in found:
-        raise SettingError(name, type(value).__name__, 'a text without null characters')  # it may have a password
+        raise SettingError(name, type(value).__name__, 'a text without null characters')  # the value may contain a password
     return found
 
 
@@ -346,7 +342,7 @@ def _robot(name: str) -> str:
 
 
 def _until(done: Callable[[], bool], seconds: float) -> None:
-    """Poll for the result of another process, which is a file."""
+    """Poll for a file that another process writes."""
     end = time.monotonic() + seconds
     while not done() and time.monotonic() < end:
         time.sleep(POLL_S)

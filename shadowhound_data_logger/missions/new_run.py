@@ -1,8 +1,8 @@
 """Creates the run of a new mission in the agent's process, with one request, before the sender has loaded MLflow.
 
-This is a shortcut: if it fails, the sender creates the run, after looking for one with the mission's id, and reports errors.
-During the request the mission's folder is locked (flock), and the sender leaves it alone; the lock ends with the process.
-Stores without a server (``sqlite:``, ``file:``) and logins that only MLflow's client supports have no shortcut.
+This is a shortcut: if it fails, the sender looks for a run with the mission's id, creates one if missing, and reports errors.
+During the request the mission's folder is locked (flock), so that the sender does not create a run; the lock ends with the
+process. Stores without a server (``sqlite:``, ``file:``) and logins that only MLflow's client supports do not use it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from shadowhound_data_logger.missions.tracking import MISSION_TAG
 log = logging.getLogger(__name__)
 
 OTHER_LOGINS: Final = ('MLFLOW_TRACKING_AUTH', 'MLFLOW_TRACKING_AWS_SIGV4')
-"""Variables for logins that only MLflow's client supports."""
+"""Environment variables of logins that only MLflow's client supports."""
 
 
 class NewRun:
     """The run of one mission while it is being created.
 
-    Lifecycle: New, before the mission's journal exists; ``settle`` once, from any thread. In between the folder is locked.
+    Lifecycle: New, before the mission's journal exists; ``settle`` once, from any thread. The folder is locked in between.
     """
 
     def __init__(self, folder: MissionFolder) -> None:
@@ -42,7 +42,7 @@ class NewRun:
         self.folder = folder
         self.run: Run | None = None
         self.is_unreachable = False
-        """Whether no server answered: the sender cannot create a run either."""
+        """Whether no server answered, so that the sender cannot create a run either."""
         self.is_settled = threading.Event()
         self._descriptor = os.open(folder.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -52,24 +52,24 @@ class NewRun:
             raise
 
     def settle(self, run: Run | None = None, *, is_unreachable: bool = False) -> None:
-        """Write down the run, if there is one, and unlock the folder."""
+        """Save the run, if it was created, and unlock the folder."""
         self.run, self.is_unreachable = run, is_unreachable
-        # The agent does not wait for the disk: a run that was not written down is found by the mission's id.
+        # The agent does not wait for the disk: the sender finds a run that was not saved by the mission's id.
         self.is_settled.set()
         try:
             if run is not None:
                 self.folder.set_run(run)
         except OSError as error:
-            log.warning('the run of mission %s cannot be written down: %s', self.folder.mission_id, error)
+            log.warning('the run of mission %s cannot be saved: %s', self.folder.mission_id, error)
         finally:
             descriptor, self._descriptor = self._descriptor, -1
             if descriptor >= 0:
                 with suppress(OSError):
-                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # also releases the copies in forked processes
+                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # also releases the lock of copies in forked processes
                 os.close(descriptor)
 
     def forget(self) -> None:
-        """In a forked child: only the parent creates it."""
+        """In a forked child: only the parent creates the run."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
@@ -91,17 +91,17 @@ class RunRequests:
         self._open: set[NewRun] = set()
 
     @staticmethod
-    def can_ask(environ: Mapping[str, str]) -> bool:
-        """Whether the environment names a server that accepts plain requests."""
+    def is_supported(environ: Mapping[str, str]) -> bool:
+        """Whether the environment names a server that can be used without MLflow's client."""
         is_server = environ.get('MLFLOW_TRACKING_URI', '').startswith(('http://', 'https://'))
         return is_server and not any(environ.get(name, '').lower() not in {'', 'false'} for name in OTHER_LOGINS)
 
     def prepare(self) -> None:
-        """Look for the experiment now; returns immediately."""
+        """Look up the experiment in advance; returns immediately."""
         self._start_thread(self._prepare)
 
     def create(self, new: NewRun, start: Mapping[str, Any]) -> None:
-        """Create the run of a mission with this first record; returns immediately."""
+        """Create the run of a mission, whose first record is ``start``; returns immediately."""
         self._open.add(new)
         if not self._start_thread(self._create, new, start):
             self._settle(new)
@@ -131,10 +131,10 @@ class RunRequests:
         except TrackingUnavailable as error:
             log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
             self._settle(new, is_unreachable=True)
-        except Exception as error:  # noqa: BLE001 - any kind: the sender tries again, and reports it
+        except Exception as error:  # noqa: BLE001 - of any kind: the sender tries again, and reports it
             log.info('mission %s has no run yet: %s', new.folder.mission_id, error)
             with self._lock:
-                self._rest, self._experiment_id = None, ''  # another password, another experiment
+                self._rest, self._experiment_id = None, ''  # password or experiment may have changed
             self._settle(new)
 
     def _settle(self, new: NewRun, run: Run | None = None, *, is_unreachable: bool = False) -> None:
@@ -151,7 +151,7 @@ class RunRequests:
             'tags': [{'key': key, 'value': value} for key, value in {**tags, MISSION_TAG: mission_id}.items()],
         })['run']['info']  # fmt: skip
         if not is_name(str(made['run_id'])):
-            raise ValueError(f'a run id that cannot be in a key: {made["run_id"]!r:.80}')
+            raise ValueError(f'the server returned a run id that cannot be part of a key: {made["run_id"]!r:.80}')
         return Run(str(made['run_id']), experiment_id, str(made['artifact_uri']))
 
     def _connected(self) -> MlflowRest:
@@ -178,7 +178,7 @@ class RunRequests:
 
 
 def _address(environ: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """The server's URL without user and password, and the environment with those that were in it."""
+    """The server's URL without user and password, and the environment with these added."""
     parts = urlsplit(environ['MLFLOW_TRACKING_URI'])
     login, _, server = parts.netloc.rpartition('@')
     user, _, password = login.partition(':')

@@ -1,4 +1,4 @@
-"""A mission's objects for the store: its frames, trajectory and summary, passed to the spool and, without a node, delivered.
+"""A mission's objects for the store: frames, trajectory and summary. Passes them to the spool and, without a node, delivers them.
 
 sensor-data/<robot>/missions/<run id>/camera/frame_NNNNNN.jpg, trajectory.csv, summary.json
 trajectories/<robot>/<mission type>_YYYYMMDD_HHMMSS.csv
@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError, StoreUnavailable
 from shadowhound_data_logger.core.model import Binding, DataObject
-from shadowhound_data_logger.missions.folder import MissionFolder, Run, stamped
+from shadowhound_data_logger.missions.folder import MissionFolder, Run, timestamped_name
 from shadowhound_data_logger.missions.state import BUCKET, TRAJECTORIES
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import delivering
@@ -39,26 +39,26 @@ SLICE_S: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class MissionObject:
     """An object and the file that it was made from."""
 
     content: DataObject
     path: Path
-    is_done_with: bool
-    """Whether the file is not needed any more."""
+    is_disposable: bool
+    """Whether the file can be deleted once the object is spooled."""
 
 
 def held_reason(mission_id: str) -> str:
-    """The reason under which the spool holds objects until the mission has a run."""
+    """The reason that the spool gives for holding objects until the mission has a run."""
     return f'mission-{mission_id}'
 
 
 def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: MissionFolder, run: Run | None,
-               files: Path | None = None) -> Iterator[Item]:  # fmt: skip
-    """The objects of a record of the journal; none if its file was deleted. Raises OSError.
+               files: Path | None = None) -> Iterator[MissionObject]:  # fmt: skip
+    """The objects of one record of the journal; none if its file was deleted. Raises OSError.
 
-    ``files`` is the folder of the journal's files, by default the mission's ``files/``. Without a run the keys have the mission's
-    id, which ``Spooler.bind`` replaces.
+    ``files`` is the folder of the journal's files, by default the mission's ``files/``. Without a run the keys contain the
+    mission id, which ``Spooler.bind`` replaces.
     """
     kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
@@ -68,7 +68,7 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     if kind == 'frame':
         number, path = int(record['id']), files / record['file']
         key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, words.FRAME_ID: str(number)}
-        yield from _item(path, BUCKET, key, time_ns, more, is_done_with=not record.get('artifact'))
+        yield from _item(path, BUCKET, key, time_ns, more, is_disposable=not record.get('artifact'))
     elif kind == 'trajectory':
         yield from _trajectory(files / record['file'], home, start, time_ns, metadata)
     elif kind == 'end':
@@ -76,13 +76,17 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
         yield from _item(folder.summary, BUCKET, f'{home}/summary.json', time_ns, metadata)
 
 
-def _trajectory(path: Path, home: str, start: Mapping[str, Any], time_ns: int, metadata: Mapping[str, str]) -> Iterator[Item]:
+def _trajectory(
+    path: Path, home: str, start: Mapping[str, Any], time_ns: int, metadata: Mapping[str, str]
+) -> Iterator[MissionObject]:
     yield from _item(path, BUCKET, f'{home}/trajectory.csv', time_ns, metadata)
-    yield from _item(path, TRAJECTORIES, f'{start["robot"]}/{stamped(start["type"], int(start["t"]))}.csv', time_ns, metadata)
+    yield from _item(
+        path, TRAJECTORIES, f'{start["robot"]}/{timestamped_name(start["type"], int(start["t"]))}.csv', time_ns, metadata
+    )
 
 
 def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str, str], *,
-          is_done_with: bool = False) -> Iterator[Item]:  # fmt: skip
+          is_disposable: bool = False) -> Iterator[MissionObject]:  # fmt: skip
     try:
         body = path.read_bytes()
     except FileNotFoundError:
@@ -95,13 +99,13 @@ def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str
         protected=not is_frame, metadata=metadata,
         held=None if words.RUN_ID in metadata else held_reason(metadata[words.MISSION_ID]),
     )  # fmt: skip
-    yield Item(content, path, is_done_with)
+    yield MissionObject(content, path, is_disposable)
 
 
 class Spooler:
-    """Puts the objects of missions into the spool; without a node, also delivers them and writes their rows of the catalog.
+    """Adds the objects of missions to the spool; without a node, also delivers them and their rows of the catalog.
 
-    Lifecycle: New; add and drain any number of times; close once. Opened by the first ``add``; one thread.
+    Lifecycle: New; add and drain any number of times; close once. The first ``add`` opens the spool. One thread.
     """
 
     def __init__(self, settings: Settings, clock: Clock, *, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -115,7 +119,7 @@ class Spooler:
         self._spool: Spool | None = None
 
     def add(self, objects: Sequence[DataObject]) -> None:
-        """Commit them to the spool; what is or was there already is skipped. Raises SpoolError."""
+        """Commit objects to the spool; those that are or were in it are skipped. Raises SpoolError."""
         if not objects:
             return
         with self._using(self._opened()) as spool, closing(Index(spool.root / 'index.db', read_only=True)) as known:
@@ -125,7 +129,7 @@ class Spooler:
                 spool.commit(new[begin : begin + MOST_OBJECTS])
 
     def bind(self, mission_id: str, run_id: str) -> bool:
-        """Give the held objects of a mission their final keys; False if nothing is held any more. Raises SpoolError."""
+        """Give the held objects of a mission their final keys; returns whether there were any. Raises SpoolError."""
         with self._using(self._opened()) as spool:
             found = spool.held(held_reason(mission_id))
             spool.bind([
@@ -136,26 +140,26 @@ class Spooler:
         return bool(found)
 
     def pending(self) -> int:
-        """Objects that wait for delivery, if this process has the spool open. Raises SpoolError."""
+        """The number of objects that wait for delivery; 0 if this process has not opened the spool. Raises SpoolError."""
         if self._spool is None:
             return 0
         with self._using(self._spool) as spool:
             return spool.pending_count()
 
     @property
-    def owes(self) -> bool:
-        """Whether an object or its row of the catalog waits for delivery, and no node delivers it."""
+    def has_unsent(self) -> bool:
+        """Whether objects or rows of the catalog wait for delivery, and no node delivers them."""
         try:
             return not self._node_drains and self._has_work()
         except SpoolError:
             return True
 
     def expedite(self) -> None:
-        """Write the rows of the catalog soon: a mission has ended."""
+        """Write the rows of the catalog soon, because a mission has ended."""
         self._catalogue.expedite()
 
     def drain(self) -> None:
-        """Deliver for up to ``SLICE_S`` if no node does. Raises StoreError, SettingError or SpoolError."""
+        """Deliver for up to ``SLICE_S`` unless a node does. Raises StoreError, SettingError or SpoolError."""
         if self._spool is None:
             if self._is_new and (self._settings.spool_path / 'index.db').exists():
                 self._opened()  # for the objects of an earlier process
@@ -199,7 +203,7 @@ class Spooler:
 
     @contextmanager
     def _using(self, spool: Spool) -> Iterator[Spool]:
-        """The spool, which is closed if its index is lost or damaged: the index is rebuilt at the next open."""
+        """Use the spool, and close it if its index is missing or damaged: the next open rebuilds the index."""
         try:
             yield spool
         except (OSError, sqlite3.OperationalError) as error:
@@ -223,7 +227,7 @@ class Spooler:
 def _has(index: Index, item: DataObject) -> bool:
     """Whether the same content was spooled before, under this key or with ``_1``, ``_2``, ... appended (``keys.unique``).
 
-    One query: an agent that gives all frames the same number makes many such keys.
+    One query, because an agent that gives all frames the same number creates many such keys.
     """
     folder, slash, name = item.key.rpartition('/')
     stem, dot, extension = name.partition('.')

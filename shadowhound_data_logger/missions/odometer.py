@@ -1,4 +1,4 @@
-"""How far a robot went, from its odometry, despite jumps, noise at rest and new frames."""
+"""The distance that a robot has traveled, from its odometry: without jumps, noise at rest and changes of the frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shadowhound_data_logger.core.clock import SECOND
 MAX_SPEED_MPS: Final = 5.0
 """No Go2 walks faster."""
 REST_M: Final = 0.02
-"""Smaller movements are noise of a robot at rest: one millimeter at 50 Hz would be 3 m per minute."""
+"""Smaller movements are the noise of a robot at rest: one millimeter at 50 Hz would add up to 3 m per minute."""
 
 
 class Pose(NamedTuple):
@@ -29,18 +29,18 @@ class Pose(NamedTuple):
 
 
 class Odometer:
-    """Sums up the distance over the ground. Lifecycle: New, with the distance so far; ``add`` poses in their order."""
+    """Adds up the distance over the ground. Lifecycle: New, with the distance so far; ``add`` poses in order of time."""
 
     def __init__(self, max_speed_mps: float = MAX_SPEED_MPS, distance_m: float = 0.0) -> None:
-        """A step faster than ``max_speed_mps`` is a jump of the estimate and is not counted."""
+        """A step faster than ``max_speed_mps`` (m/s) is a jump of the estimate and is not counted."""
         self.distance_m = distance_m
         self.jumps = 0
         self._max_speed_mps = max_speed_mps
         self._last: Pose | None = None
-        self._from: Pose | None = None  # the distance is counted up to here
+        self._from: Pose | None = None  # the distance includes the path up to here
 
     def add(self, pose: Pose) -> bool:
-        """Returns whether the pose is valid: finite, and later than the previous one."""
+        """Add a pose; returns whether it is valid: finite, and later than the previous one."""
         last = self._last
         if not pose.is_finite or (last is not None and pose.stamp_ns <= last.stamp_ns):
             return False
@@ -50,7 +50,7 @@ class Odometer:
         elif hypot(pose.x - last.x, pose.y - last.y) * SECOND > self._max_speed_mps * (pose.stamp_ns - last.stamp_ns):
             self.jumps += 1
             self._from = pose
-        elif (way_m := hypot(pose.x - self._from.x, pose.y - self._from.y)) >= REST_M:
-            self.distance_m += way_m
+        elif (step_m := hypot(pose.x - self._from.x, pose.y - self._from.y)) >= REST_M:
+            self.distance_m += step_m
             self._from = pose
         return True

@@ -1,4 +1,4 @@
-"""What a mission is and how far it is sent, read from its folder, without MLflow and without ROS."""
+"""The state of missions and how far they are sent, read from their folders, without MLflow and ROS."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.dataclass_json import as_plain, fields_of, parse
 from shadowhound_data_logger.missions import journal
-from shadowhound_data_logger.missions.dating import REMEDY, WAITS, waits
+from shadowhound_data_logger.missions.dating import NO_DATE, REMEDY, is_undated
 from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, missions, read_json
 from shadowhound_data_logger.missions.state import MissionState, Point
 
 ACTIVE, UNFINISHED = 'active', 'unfinished'
-"""Results of missions without an end: the agent runs; it was killed, and no sender has closed the mission yet."""
+"""Results of missions without an end: the agent is running; or it was killed, and no sender has closed the mission yet."""
 FILES: Final = frozenset({'frame', 'trajectory', 'artifact'})
-"""Records with a file."""
+"""Kinds of records that have a file."""
 STATE: Final = 'replay.json'
 """Next to the missions: the state of the sender."""
 LOCK: Final = 'replay.lock'
@@ -44,7 +44,7 @@ class MissionBrief:
     complete: bool
     """Whether it is completely sent."""
     unsent: Mapping[str, int]
-    """``records`` that are not in the run, ``artifacts`` that are not attached, ``objects`` that are not in the spool."""
+    """``records`` not yet in the run, ``artifacts`` not yet attached to it, ``objects`` not yet in the spool."""
     refused_by_server: int
     last_error: str
     remedy: str
@@ -60,17 +60,17 @@ class MissionOverview(MissionBrief):
     """The last value of each metric."""
     counts: Mapping[str, int]
     refused: Mapping[str, int]
-    """What could not be logged, by reason."""
+    """How often data could not be logged, by reason."""
 
 
 def overviews(home: Path) -> list[MissionBrief]:
-    """All missions of a home in the order of their starts. Raises OSError."""
+    """All missions of a home, in order of their start. Raises OSError."""
     found = [_summarized(folder) or _brief(folder, state_of(folder)) for folder in missions(home)]
     return sorted((each for each in found if each is not None), key=lambda each: each.started)
 
 
 def find(home: Path, wanted: str) -> list[MissionFolder]:
-    """The missions with an id, or a run id, that begins with this; only the exact match if there is one. Raises OSError."""
+    """The missions whose mission id or run id starts with ``wanted``; only the exact match if there is one. Raises OSError."""
     names = {folder: (folder.mission_id, run.run_id if (run := folder.run()) else '') for folder in missions(home)}
     exact = [folder for folder, ids in names.items() if wanted in ids]
     return exact or [folder for folder, ids in names.items() if any(name.startswith(wanted) for name in ids)]
@@ -105,7 +105,7 @@ def _brief(folder: MissionFolder, state: MissionState) -> MissionBrief | None:
 
 
 def _summarized(folder: MissionFolder) -> MissionBrief | None:
-    """Of a mission that is completely sent, from its summary, because its journal may be long. None for any other."""
+    """Reads the summary, because a journal may be long; None for a mission that is not completely sent."""
     sent, summary = folder.sent(), read_json(folder.summary)
     if not sent.complete:
         return None
@@ -120,7 +120,7 @@ def _summarized(folder: MissionFolder) -> MissionBrief | None:
 
 
 def state_of(folder: MissionFolder) -> MissionState:
-    """The state of a mission by its journals, the node's included."""
+    """The state of a mission, computed from both journals."""
     state = MissionState(node=MissionState())
     for source, record in records(folder):
         (state if source == 'agent' else state.node or state).add(record)
@@ -128,14 +128,14 @@ def state_of(folder: MissionFolder) -> MissionState:
 
 
 def records(folder: MissionFolder) -> Iterator[tuple[str, Mapping[str, Any] | None]]:
-    """``node`` or ``agent``, and its records; the node's first, because the agent's end sums up both."""
+    """The records of both journals with their source, ``node`` or ``agent``; the agent's last, because its end uses both."""
     for source, lines in (('node', folder.node_lines), ('agent', folder.lines)):
         if source == 'node' or folder.journal.exists():
             yield from ((source, line.record) for line in lines())
 
 
 def export(folder: MissionFolder) -> dict[str, Any]:
-    """Everything that was logged: parameters, every metric point of ``agent`` and ``node``, events."""
+    """Everything that was logged: parameters, all metric points with their source (``agent`` or ``node``), and events."""
     state = MissionState(node=MissionState())
     points: list[dict[str, Any]] = []
     events: list[dict[str, Any]] = []
@@ -160,7 +160,7 @@ def _counts(state: MissionState) -> dict[str, int]:
 
 
 def _unsent(folder: MissionFolder, sent: MissionSent) -> dict[str, int]:
-    """Records that are not in the run yet, and files that are not among its artifacts or not in the spool yet."""
+    """The records not yet in the run, and the files not yet among its artifacts or not yet in the spool."""
     count = {'records': 0, 'artifacts': 0, 'objects': 0}
     if sent.complete:
         return count
@@ -185,33 +185,37 @@ def _is_locked(folder: MissionFolder) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """How much of one mission has been sent."""
+    """How far one mission is sent, as ``flush`` and ``close`` return it."""
 
     mission_id: str
+    """Empty if the logger has not started a mission."""
     run_id: str | None
+    """The id of the MLflow run; None until it is created."""
     sent: int
-    """Records of the agent and of a node that are in the run."""
+    """Records of the agent and of the node that are in the run."""
     unsent: int
+    """Records that are not in the run yet."""
     complete: bool
     """Whether everything has arrived: metrics and artifacts in the run, objects in the spool."""
     missing: int = 0
-    """Frames and trajectories with a file that was deleted before it was spooled."""
+    """Frames and trajectories whose file was deleted before it was spooled."""
     last_error: str = ''
-    """What delays it now, or was refused last; otherwise empty."""
+    """What delays the mission now, otherwise the last refusal; empty if there is none."""
     remedy: str = ''
+    """What to do about it."""
     refused: int = 0
     """Points, params and tags that the tracking server refused permanently."""
     unattached: int = 0
-    """Artifacts that it refused permanently, or that have no file any more."""
+    """Artifacts that the server refused permanently, or whose file was deleted."""
     waiting_for: str = ''
-    """What remains to be done if it is not complete."""
+    """What an incomplete mission still waits for."""
 
 
 def report(folder: MissionFolder) -> Report:
-    """Reads the journals completely; they exist until the mission is complete."""
+    """How far a mission is sent. Reads both journals completely."""
     sent, run = folder.sent(), folder.run()
     count, unsent = map(sum, zip(_counted(folder.journal, sent), _counted(folder.node.journal, folder.node.sent()), strict=True))
-    error, remedy = (WAITS, REMEDY) if folder.journal.exists() and waits(folder) else ('', '')
+    error, remedy = (NO_DATE, REMEDY) if folder.journal.exists() and is_undated(folder) else ('', '')
     waiting_for, wait_remedy = ('', '') if sent.complete else _waiting_for(folder, unsent)
     if not sent.complete and not error:
         error, remedy = next(iter(errors(folder.path.parent).values()), ('', ''))
@@ -223,31 +227,31 @@ def report(folder: MissionFolder) -> Report:
 
 
 def _waiting_for(folder: MissionFolder, unsent: int) -> tuple[str, str]:
-    """What an incomplete mission waits for, and what can be done about it."""
+    """What an incomplete mission waits for, and the remedy."""
     sent, node = folder.sent(), folder.node.sent()
     if not folder.journal.exists():
-        return 'its journal, which is missing', 'was the folder of the mission deleted?'
+        return 'its journal, which is missing', 'check whether the folder of the mission was deleted'
     if _is_locked(folder):
         return 'its end: the mission is active', ''
     if not is_sending(folder.path.parent):
-        return 'a sender', 'if none is starting, run `shadowhound-data missions resume`'
+        return 'a sender', 'if none starts, run `shadowhound-data missions resume`'
     left = [f'{unsent} records to be in its run'] if unsent else []
     if _is_locked(folder.node):
-        return ', '.join([*left, 'the node to finish its part']), 'it takes a second, at most 30 s; is the node stopped?'
+        return ', '.join([*left, 'the node to finish its part']), 'this takes a second, at most 30 s; check that the node runs'
     files = _unsent(folder, sent)
     left += [f'{files["artifacts"]} artifacts to be in its run'] if files['artifacts'] else []
     left += [f'{files["objects"]} objects to be in the spool'] if files['objects'] else []
     if sent.metrics > sent.artifacts and not folder.summary.exists() and not unsent:
-        left.append('its pictures and its summary, which are being made')
+        left.append('its pictures and its summary, which are being created')
     elif not left and max(sent.metrics, node.metrics) > min(sent.artifacts, sent.objects):
         left.append('its last artifacts and its summary')
     if sent.held:
-        left.append('its objects to get their names')
+        left.append('its objects to get their final keys')
     return ', '.join(left) or 'its run to be closed', 'wait longer, with close(seconds); the sender continues in the background'
 
 
 def _counted(path: Path, sent: MissionSent) -> tuple[int, int]:
-    """Records of a journal, and those that are not in the run yet."""
+    """The number of records in a journal, and of those that are not in the run yet."""
     try:
         ends = [line.end for line in journal.read(path)]
     except FileNotFoundError:
@@ -261,7 +265,7 @@ def sizes(folder: MissionFolder) -> tuple[int, int]:
 
 
 def has_arrived(folder: MissionFolder, sizes_: tuple[int, int] | None) -> bool:
-    """Whether the journals are sent up to these sizes; with None, whether an ended mission has arrived completely."""
+    """Whether the journals are sent up to these sizes; if None, whether an ended mission has arrived completely."""
     if sizes_ is None:
         return folder.sent().complete
     places = (folder.sent(), folder.node.sent())
@@ -276,7 +280,7 @@ def _size(path: Path) -> int:
 
 
 def is_sending(missions: Path) -> bool:
-    """Whether a sender of this folder runs."""
+    """Whether a sender of this folder is running."""
     try:
         return journal.is_locked(missions / LOCK)
     except OSError:
@@ -284,7 +288,7 @@ def is_sending(missions: Path) -> bool:
 
 
 def errors(missions: Path) -> dict[str, tuple[str, str]]:
-    """What delays the sender of this folder now: receiver -> (error, remedy)."""
+    """The errors that delay the sender of this folder now: receiver -> (error, remedy)."""
     found = read_json(missions / STATE).get('errors')
     if not isinstance(found, dict):
         return {}

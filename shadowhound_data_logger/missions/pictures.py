@@ -1,10 +1,10 @@
-"""The pictures of a mission that has ended, made from its folder by a child process of the sender.
+"""Creates the pictures of a mission that has ended, in a child process of the sender.
 
     camera_summary.jpg   trajectory.png   battery.png
 
-``python -m shadowhound_data_logger.missions.pictures FOLDER TITLE`` writes them to files/, and then pictures.json: each name with
-'' or a note about it. A picture that cannot be made does not affect the others. matplotlib's second and 60 MB, and whatever a
-hostile file does to a decoder, stay in that process: the sender continues with other missions and polls it.
+``python -m shadowhound_data_logger.missions.pictures FOLDER TITLE`` writes them to files/, then pictures.json: each name with ''
+or a note, such as why it was not created. A failure of one picture does not affect the others. matplotlib takes a second and
+60 MB, and a hostile file may crash a decoder: both stay in that process, which the sender polls while it sends other missions.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.untrusted import check_commas, csv_encoding
 from shadowhound_data_logger.missions.folder import MissionFolder, read_json, write_json
-from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE, named
+from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE, policy_list
 
 log = logging.getLogger(__name__)
 
 NS_SECONDS: Final = 1e17
-"""A timestamp above it is in nanoseconds: in seconds it would be three billion years from now."""
-MOST_STATES: Final = 20_000
+"""A larger timestamp is in nanoseconds: in seconds it would be three billion years from now."""
+MAX_STATES: Final = 20_000
 SHEET, TRAJECTORY, CHARGE = NAMES = ('camera_summary.jpg', 'trajectory.png', 'battery.png')
 PROGRAM: Final = 'shadowhound_data_logger.missions.pictures'
 DEADLINE_S: Final = 60.0
-"""After it the process is killed."""
-Pictures = Callable[[MissionFolder, str], 'Mapping[str, str] | None']
-"""Notes about the pictures of a mission with this title; None while they are being made."""
+"""The process is killed after this time."""
+MakePictures = Callable[[MissionFolder, str], 'Mapping[str, str] | None']
+"""Returns notes about the pictures of a mission with this title; None while they are being created."""
 
 
-class Drawing:
-    """Has the pictures of missions made by a child process, one mission at a time.
+class PictureProcess:
+    """Creates the pictures of missions in a child process, one mission at a time.
 
-    Lifecycle: New; ``of`` any number of times; close once. Not thread-safe.
+    Lifecycle: New; ``make`` any number of times; close once. Not thread-safe.
     """
 
     def __init__(self, *, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -54,10 +54,11 @@ class Drawing:
 
     @property
     def busy(self) -> bool:
+        """Whether the process is running."""
         return self._process is not None
 
-    def of(self, folder: MissionFolder, title: str) -> Mapping[str, str] | None:
-        """Notes about a mission's pictures, None while they are being made. Raises OSError if no process can be started."""
+    def make(self, folder: MissionFolder, title: str) -> Mapping[str, str] | None:
+        """Notes about a mission's pictures; None while they are being created. Raises OSError if no process can be started."""
         if self._process is None:
             if notes := _notes(folder):
                 return notes
@@ -72,7 +73,9 @@ class Drawing:
             return None
         code, self._process = self._process.returncode, None
         if not _notes(self._folder):
-            write_json(self._folder.pictures, dict.fromkeys(NAMES, f'the process that makes them exited with {code}'))
+            write_json(
+                self._folder.pictures, dict.fromkeys(NAMES, f'not made: the process that creates the pictures exited with {code}')
+            )
         return _notes(folder) if folder == self._folder else None
 
     def close(self) -> None:
@@ -83,12 +86,13 @@ class Drawing:
 
     def _start(self, folder: MissionFolder, title: str) -> None:
         command = [sys.executable, '-m', PROGRAM, str(folder.path), title]
-        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=folder.path)  # where no module is found
+        # That folder contains no Python module that the process could import by mistake.
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, cwd=folder.path)
         self._folder, self._end_s = folder, self._monotonic() + DEADLINE_S
 
 
-def nothing(folder: MissionFolder, title: str) -> Mapping[str, str]:  # noqa: ARG001 - the place of Drawing.of
-    """No pictures at all."""
+def no_pictures(folder: MissionFolder, title: str) -> Mapping[str, str]:  # noqa: ARG001 - replaces PictureProcess.make
+    """Create no pictures."""
     return {}
 
 
@@ -97,8 +101,8 @@ def _notes(folder: MissionFolder) -> dict[str, str]:
 
 
 @dataclass(slots=True)
-class Material:
-    """The data for the pictures."""
+class PictureData:
+    """The data that the pictures show."""
 
     start_ns: int = 0
     frames: list[tuple[int, int, Path]] = field(default_factory=list)
@@ -123,9 +127,9 @@ class Material:
                 self.states[key].append(((time_ns - self.start_ns) / SECOND, record['m'][key]))
 
 
-def material_of(folder: MissionFolder) -> Material:
-    """From the agent's journal, and from the node's if the agent did not log it. Raises OSError."""
-    found, node = Material(), Material()
+def picture_data(folder: MissionFolder) -> PictureData:
+    """Read the agent's journal, and the node's for data that the agent did not log. Raises OSError."""
+    found, node = PictureData(), PictureData()
     for line in folder.lines():
         found.add(line.record or {}, folder.files)
     node.start_ns = found.start_ns
@@ -136,25 +140,25 @@ def material_of(folder: MissionFolder) -> Material:
     found.states = {key: points or node.states[key] for key, points in found.states.items()}
     for key, points in found.states.items():
         points.sort()
-        found.states[key] = points[:: 1 + len(points) // MOST_STATES]
+        found.states[key] = points[:: 1 + len(points) // MAX_STATES]
     return found
 
 
 def make(folder: MissionFolder, title: str) -> dict[str, str]:
-    """Make the pictures; each name with '' or a note about it."""
+    """Create the pictures; returns each name with '' or a note."""
     from shadowhound_data_logger.missions.contact_sheet import LoggedFrame, contact_sheet  # noqa: PLC0415 - the sender needs no Pillow
 
-    material = material_of(folder)
-    frames, start_ns, below = [LoggedFrame(*each) for each in material.frames], material.start_ns, named(material.policies)
+    data = picture_data(folder)
+    frames, below = [LoggedFrame(*each) for each in data.frames], policy_list(data.policies)
     return {
-        SHEET: _made(folder.files / SHEET, lambda target: contact_sheet(frames, title, start_ns, target, below=below)),
-        TRAJECTORY: _made(folder.files / TRAJECTORY, lambda target: _trajectory(material, folder.floor, title, target)),
-        CHARGE: _made(folder.files / CHARGE, lambda target: _battery(material, title, target)),
+        SHEET: _draw(folder.files / SHEET, lambda target: contact_sheet(frames, title, data.start_ns, target, below=below)),
+        TRAJECTORY: _draw(folder.files / TRAJECTORY, lambda target: _trajectory(data, folder.floor, title, target)),
+        CHARGE: _draw(folder.files / CHARGE, lambda target: _battery(data, title, target)),
     }
 
 
 def read_path(path: Path) -> list[tuple[float, float, float]]:
-    """Time (s), x and y (m) of a CSV file with the columns timestamp, x and y; lines without such numbers are skipped.
+    """Read time (s), x and y (m) from a CSV file with the columns timestamp, x and y; lines without valid numbers are skipped.
 
     Raises OSError, or ValueError for a file without these columns.
     """
@@ -176,8 +180,8 @@ def read_path(path: Path) -> list[tuple[float, float, float]]:
     return found
 
 
-def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
-    """Draw a picture; returns a note about it. The file gets its name only when it is complete."""
+def _draw(target: Path, draw: Callable[[Path], str | None]) -> str:
+    """Draw a picture; returns a note, or ''. The file gets its name only when it is complete."""
     part = target.with_name(f'.{os.getpid()}.{target.name}')
     try:
         note = draw(part) or ''
@@ -186,34 +190,34 @@ def _made(target: Path, draw: Callable[[Path], str | None]) -> str:
         note = f'not made: {error}'
     except ImportError as error:
         note = f'not made: {error} (pip install shadowhound_data_logger[missions])'
-    except Exception as error:  # a decoder or a plot can raise anything, and the other pictures have nothing to do with it
+    except Exception as error:  # a decoder or a plot can raise anything, which must not affect the other pictures
         log.warning('%s', target, exc_info=error)
         note = f'not made: {type(error).__name__}: {error}'
     part.unlink(missing_ok=True)
     return note
 
 
-def _trajectory(material: Material, floor: Path, title: str, target: Path) -> None:
-    if material.trajectory is None:
+def _trajectory(data: PictureData, floor: Path, title: str, target: Path) -> None:
+    if data.trajectory is None:
         raise ValueError('no trajectory was logged')
     import numpy as np  # noqa: PLC0415 - unused elsewhere
 
-    from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - a second, and not installed everywhere
+    from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - takes a second, and is not installed everywhere
 
-    path = np.array(read_path(material.trajectory)).reshape(-1, 3)
+    path = np.array(read_path(data.trajectory)).reshape(-1, 3)
     plots.trajectory(path, np.load(floor, allow_pickle=False) if floor.exists() else None, title, target)
 
 
-def _battery(material: Material, title: str, target: Path) -> None:
-    if max(map(len, material.states.values())) < 2:
+def _battery(data: PictureData, title: str, target: Path) -> None:
+    if max(map(len, data.states.values())) < 2:
         raise ValueError('neither battery nor temperature was logged twice')
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415 - see _trajectory
 
-    plots.battery(material.states, title, target)
+    plots.battery(data.states, title, target)
 
 
 def _seconds(text: str) -> float:
-    """Seconds since 1970 of a number (seconds or nanoseconds) or an ISO time."""
+    """Seconds since 1970, from a number (seconds or nanoseconds) or an ISO 8601 time."""
     try:
         number = float(text)
     except ValueError:
@@ -223,7 +227,7 @@ def _seconds(text: str) -> float:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Make the pictures of the mission in the given folder."""
+    """Create the pictures of the mission in the given folder."""
     folder = MissionFolder(Path(arguments[0]))
     write_json(folder.pictures, make(folder, arguments[1]))
     return 0

@@ -1,7 +1,7 @@
 """``trajectory.png`` and ``battery.png``: the plots of a mission, 800 pixels wide.
 
-The style is that of all our plots. Importing this loads matplotlib, which takes a second and 60 MB: nothing that an agent or the
-node runs may import it.
+They share the style of all our plots. Importing this module loads matplotlib, which takes a second and 60 MB: code that runs in
+an agent or the node must not import it.
 """
 
 from __future__ import annotations
@@ -28,30 +28,33 @@ STYLE: Final = {
     'axes.titleweight': 'bold', 'axes.titlesize': 12, 'axes.titlepad': 10,
 }  # fmt: skip
 DPI: Final = 120
-MOST_POINTS: Final = 4000
-"""Of a line: more cannot be distinguished at this size."""
+MAX_POINTS: Final = 4000
+"""Per line: more cannot be distinguished at this size."""
 SPEED_WINDOW_S: Final = 1.0
-"""Over which a speed is taken: odometry's noise from one sample to the next would be all that one saw."""
+"""Speeds are averaged over this time: from one sample to the next, the noise of odometry would hide them."""
 CELL_M: Final = 0.05
-"""Of the floor plan."""
-MOST_CELLS: Final = 1000
+"""Size of a cell of the floor plan."""
+MAX_CELLS: Final = 1000
 """Along an axis of the floor plan."""
-LEAST_SPAN_M: Final = 2.0
-"""Of an axis: a robot that stood must not look as if it had walked."""
-LEAST_SPAN: Final = 10.0
+MIN_SPAN_M: Final = 2.0
+"""Of an axis: a robot at rest must not look as if it had walked."""
+MIN_SPAN: Final = 10.0
 """Percent and degrees Celsius, for the same reason."""
 WIDTH_IN: Final = 800 / DPI
 Array = NDArray[np.float64]
 
 
 def trajectory(path: Array, floor: Array | None, title: str, target: Path) -> None:
-    """The path (rows of time in s, x and y in m) over the floor (rows of x, y in m). Raises ValueError for no path."""
+    """Plot a path (rows of time in s, x and y in m) over the floor (rows of x and y in m).
+
+    Raises ValueError for fewer than two poses.
+    """
     if len(path) < 2:
         raise ValueError(f'{len(path)} poses are not a path')
     time, xy = path[:, 0], path[:, 1:3]
     length = float(np.hypot(*np.diff(xy, axis=0).T).sum())
     speed = _speed(time, xy)
-    kept = np.unique(np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).round().astype(int))
+    kept = np.unique(np.linspace(0, len(xy) - 1, min(len(xy), MAX_POINTS)).round().astype(int))
     xy, speed = xy[kept], speed[kept]
     extent = _extent(xy, floor)
     with mpl.rc_context(STYLE):
@@ -78,7 +81,10 @@ def trajectory(path: Array, floor: Array | None, title: str, target: Path) -> No
 
 
 def battery(series: Mapping[str, Sequence[tuple[float, float]]], title: str, target: Path) -> None:
-    """Battery (%) and temperature (degrees C) over time (s since the start). Raises ValueError where neither has two points."""
+    """Plot battery (%) and temperature (degrees Celsius) over time (s since the start).
+
+    Raises ValueError if neither has two points.
+    """
     panels = [(name, np.array(series[name])) for name in series if len(series[name]) > 1]
     if not panels:
         raise ValueError('neither battery nor temperature was logged twice')
@@ -91,7 +97,7 @@ def battery(series: Mapping[str, Sequence[tuple[float, float]]], title: str, tar
             points = logged[np.argsort(logged[:, 0], kind='stable')]
             axes.plot(points[:, 0] / scale, points[:, 1], color=color, lw=2, marker='o' if len(points) < 30 else '', ms=4)
             low, high = float(points[:, 1].min()), float(points[:, 1].max())
-            room = max(LEAST_SPAN, 1.25 * (high - low)) / 2
+            room = max(MIN_SPAN, 1.25 * (high - low)) / 2
             axes.set(ylabel=f'{label} [{unit}]', ylim=((low + high) / 2 - room, (low + high) / 2 + room))
             axes.set_title(f'{points[0, 1]:.1f} to {points[-1, 1]:.1f} {unit}', loc='right', fontsize=10, fontweight='normal')
         axes.set(xlabel=f'time since the start [{of_time}]')
@@ -103,11 +109,11 @@ def battery(series: Mapping[str, Sequence[tuple[float, float]]], title: str, tar
 _LOOKS: Final[Mapping[str, tuple[str, str, str]]] = {
     'battery_pct': (BLUE, 'battery', '%'), 'temperature_c': (AMBER, 'temperature', '\N{DEGREE SIGN}C'),
 }  # fmt: skip
-"""Colour, label and unit."""
+"""Color, label and unit."""
 
 
 def _speed(time: Array, xy: Array) -> Array:
-    """m/s at each pose, over a window around it; 0 where time does not pass."""
+    """The speed in m/s at each pose, over a window around it; 0 where time does not pass."""
     order = np.maximum.accumulate(time)
     before, after = np.clip(order - SPEED_WINDOW_S / 2, order[0], None), np.clip(order + SPEED_WINDOW_S / 2, None, order[-1])
     steps = np.stack([np.interp(after, order, column) - np.interp(before, order, column) for column in xy.T])
@@ -118,20 +124,20 @@ def _speed(time: Array, xy: Array) -> Array:
 
 
 def _extent(xy: Array, floor: Array | None) -> tuple[float, float, float, float]:
-    """x0, x1, y0, y1 of what is to be seen: all of the path, and of the floor all but its stray points."""
+    """x0, x1, y0, y1 of the plot: the whole path, and the floor without outliers."""
     low, high = xy.min(axis=0), xy.max(axis=0)
     if floor is not None and len(floor):
         low, high = np.minimum(low, np.quantile(floor, 0.005, axis=0)), np.maximum(high, np.quantile(floor, 0.995, axis=0))
     edge = 0.06 * float((high - low).max()) + 0.2
-    middle, half = (low + high) / 2, np.maximum((high - low) / 2 + edge, LEAST_SPAN_M / 2)
-    half = np.maximum(half, (half[1], half[0] / 3))  # neither a strip nor a tower
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2 + edge, MIN_SPAN_M / 2)
+    half = np.maximum(half, (half[1], half[0] / 3))  # limits the aspect ratio to 1:1 to 3:1
     return (float(middle[0] - half[0]), float(middle[0] + half[0]), float(middle[1] - half[1]), float(middle[1] + half[1]))
 
 
 def _from_above(floor: Array, extent: tuple[float, float, float, float]) -> Any:
-    """How often something was seen in each cell, 0 to 1, rows along y."""
+    """How often each cell was occupied, from 0 to 1, rows along y."""
     x0, x1, y0, y1 = extent
-    cell = max(CELL_M, max(x1 - x0, y1 - y0) / MOST_CELLS)
+    cell = max(CELL_M, max(x1 - x0, y1 - y0) / MAX_CELLS)
     shape = (max(1, round((y1 - y0) / cell)), max(1, round((x1 - x0) / cell)))
     strength = np.log1p(np.histogram2d(floor[:, 1], floor[:, 0], bins=shape, range=((y0, y1), (x0, x1)))[0])
     seen = strength[strength > 0]

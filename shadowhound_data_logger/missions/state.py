@@ -1,10 +1,10 @@
-"""The state of a mission, computed from its journal: first and last values, counts, and how the run ends.
+"""The state of a mission, computed from its journals: first and last values, counts, and the values of its run and summary.
 
-The records of a journal, by their ``k``: ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
-``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``policy`` (active from then on, or
-none), ``refused`` (reason), ``end`` (status, what the agent stated, elapsed_s: how long it took), and of the node ``poses``.
-Every record has ``t``, ns since 1970 UTC. ``summary_of`` computes ``summary.json``, the same in the run, in the store and in the
-mission's folder.
+The kinds of records of a journal (``k``): ``start`` (type, command, robot, policy), ``metrics`` (m: key -> value, s: step),
+``frame``, ``trajectory`` and ``artifact`` (file: a copy in files/), ``event``, ``policy`` (active from then on; null for none),
+``refused`` (reason), ``end`` (status, the agent's values, elapsed_s: the duration by a clock that never steps), and ``poses``
+(only the node). Every record has ``t``, ns since 1970 UTC. ``summary_of`` computes ``summary.json``, which is identical in the
+run, in the store and in the mission's folder.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from datetime import timedelta
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import SECOND, iso, utc
-from shadowhound_data_logger.missions.folder import MissionSent, Run, run_name, stamped
+from shadowhound_data_logger.missions.folder import MissionSent, Run, run_name, timestamped_name
 from shadowhound_data_logger.missions.values import MAX_PARAM, MAX_STEP
 
 MS: Final = 1_000_000
 BATTERY, TEMPERATURE, DISTANCE, FRAMES = 'battery_pct', 'temperature_c', 'distance_traveled_m', 'camera_frames'
 KILLED, FAILED, FINISHED = 'KILLED', 'FAILED', 'FINISHED'
-MOST_ERRORS: Final = 20
-MOST_EVENTS: Final = 200
-MOST_EVENT: Final = 2000
-"""Characters of an event in the summary; ``events.jsonl`` in the run has longer ones, too."""
-MOST_POLICIES: Final = 100
-MOST_RENAMED: Final = 1000
+MAX_ERRORS: Final = 20
+MAX_EVENTS: Final = 200
+MAX_EVENT_CHARACTERS: Final = 2000
+"""Longest event in the summary; the run's ``events.jsonl`` also has longer ones."""
+MAX_POLICIES: Final = 100
+MAX_RENAMED: Final = 1000
 BUCKET: Final = 'sensor-data'
 TRAJECTORIES: Final = 'trajectories'
 
@@ -43,7 +43,7 @@ class Point(NamedTuple):
 
 @dataclass(slots=True)
 class MissionState:
-    """The state of a mission, computed from its journal's records in their order; depends on nothing else."""
+    """The state of a mission: a pure function of its journal's records, added in order."""
 
     start: Mapping[str, Any] = field(default_factory=dict)
     end: Mapping[str, Any] = field(default_factory=dict)
@@ -52,19 +52,19 @@ class MissionState:
     errors: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     renamed: dict[str, str] = field(default_factory=dict)
-    """Artifacts whose names MLflow cannot hold: path in the run -> path that the agent passed."""
+    """Artifacts whose names MLflow does not accept: path in the run -> path that the agent passed."""
     policies: list[tuple[str | None, int]] = field(default_factory=list)
-    """The active policies in their order, each with the time of its start; None if there was none."""
+    """The active policies in order, each with the time from which it was active; None if no policy was active."""
     first: dict[str, float] = field(default_factory=dict)
     last: dict[str, float] = field(default_factory=dict)
     latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Step and time (ms) of each key's point that MLflow shows: the one with the highest step, then the latest time."""
+    """Step and time (ms) of the point that MLflow shows for each key: the one with the highest step, then the latest time."""
     last_ns: int = 0
     node: MissionState | None = None
-    """The state of the node's journal; where both have a value, the agent's is used."""
+    """The state of the node's journal; if both have a value, the agent's is used."""
 
     def add(self, record: Mapping[str, Any] | None) -> list[Point]:
-        """Take the next record (None: a damaged one); returns its metric points."""
+        """Add the next record (None: a damaged one); returns its metric points."""
         if record is None:
             self.counts['damaged'] += 1
             return []
@@ -74,31 +74,31 @@ class MissionState:
         if kind == 'start':
             self.start = record
             self.policies = [(record.get('policy'), time_ns)]
-            self._note_latest(DISTANCE, 0, time_ns)
+            self._update_latest(DISTANCE, 0, time_ns)
             return [Point(DISTANCE, 0.0, time_ns // MS, 0)]  # so that every run has one, however it ends
         if kind == 'metrics':
             step = int(record['s'])
             for key, value in record['m'].items():
                 self.first.setdefault(key, value)
                 self.last[key] = value
-                self._note_latest(key, step, time_ns)
+                self._update_latest(key, step, time_ns)
             self.counts['points'] += len(record['m'])
             return [Point(key, value, time_ns // MS, step) for key, value in record['m'].items()]
         if kind == 'frame':
             number = int(record['id'])
-            self._note_latest(FRAMES, self.counts['frame'], time_ns)
+            self._update_latest(FRAMES, self.counts['frame'], time_ns)
             return [Point(f'camera_frame_{number}', 1.0, time_ns // MS, max(number, 0)),
                     Point(FRAMES, float(self.counts['frame']), time_ns // MS, self.counts['frame'])]  # fmt: skip
         if kind == 'event':
-            self._note_event(record, time_ns)
-        if kind == 'policy' and len(self.policies) < MOST_POLICIES:
+            self._keep_event(record, time_ns)
+        if kind == 'policy' and len(self.policies) < MAX_POLICIES:
             self.policies.append((record.get('policy'), time_ns))
-        if kind == 'artifact' and 'given' in record and len(self.renamed) < MOST_RENAMED:
+        if kind == 'artifact' and 'given' in record and len(self.renamed) < MAX_RENAMED:
             self.renamed['/'.join(filter(None, (record['folder'], record['name'])))] = record['given']
         if kind == 'refused':
             self.refused[str(record['reason'])] += 1
         elif kind == 'event' and record.get('name') in {'error', 'exception'}:
-            self.errors = [*self.errors, {'time': iso(time_ns), **record.get('data', {})}][:MOST_ERRORS]
+            self.errors = [*self.errors, {'time': iso(time_ns), **record.get('data', {})}][:MAX_ERRORS]
         elif kind == 'end':
             self.end = record
             return self._final(time_ns // MS)
@@ -106,31 +106,31 @@ class MissionState:
 
     @property
     def battery_consumed_pct(self) -> float | None:
-        """First minus last; None if unknown."""
+        """The first minus the last battery charge; None if unknown."""
         if BATTERY in self.first:
             return self.first[BATTERY] - self.last[BATTERY]
         return self.node.battery_consumed_pct if self.node else None
 
     @property
     def distance_m(self) -> float | None:
-        """What the agent states if positive; otherwise what it logged or what was measured; otherwise what it states (0)."""
+        """The distance that the agent stated at the end if positive, otherwise logged, otherwise measured by the node."""
         stated = self.end.get('distance_m')
         return stated if stated is not None and stated > 0 else self.last.get('distance_m') or self.newest.get(DISTANCE) or stated
 
     @property
     def newest(self) -> dict[str, float]:
-        """The last value of each metric, the agent's where it logged any."""
+        """The last value of each metric; if both logged it, the agent's."""
         return {**(self.node.last if self.node else {}), **self.last}
 
     @property
     def duration_s(self) -> float:
-        """What the agent states if positive; otherwise what it logged, otherwise what was measured."""
+        """The duration that the agent stated at the end if positive, otherwise logged, otherwise measured."""
         stated = self.end.get('duration_s')
         return float(stated) if stated is not None and stated > 0 else self.last.get('duration_s') or self.measured_s
 
     @property
     def measured_s(self) -> float:
-        """From start to end by a clock that never steps; for an agent that was killed, by the times of its records."""
+        """The time from start to end by a clock that never steps; for a killed agent, by the times of its records."""
         elapsed_s = self.end.get('elapsed_s')
         if elapsed_s is not None:
             return float(elapsed_s)
@@ -142,7 +142,7 @@ class MissionState:
 
     @property
     def frames(self) -> int:
-        """Of agent and node together."""
+        """The number of frames of agent and node."""
         return self.counts['frame'] + (self.node.counts['frame'] if self.node else 0)
 
     @property
@@ -151,11 +151,11 @@ class MissionState:
 
     @property
     def policy_names(self) -> str:
-        """All policies in their order; empty if none was ever active."""
-        return named(name for name, _ in self.policies)
+        """All policies in order; empty if none was ever active."""
+        return policy_list(name for name, _ in self.policies)
 
     def params(self) -> dict[str, str]:
-        """The parameters at the start of the run."""
+        """The parameters that the run gets at its start."""
         return {
             'mission_type': self.start['type'],
             'mission_command': self.start['command'][:MAX_PARAM],
@@ -165,20 +165,21 @@ class MissionState:
         }
 
     def final_params(self) -> dict[str, str]:
+        """The parameters that the run gets at its end."""
         changed = {'policies': self.policy_names[:MAX_PARAM]} if len(self.policies) > 1 else {}
         return {'duration_s': f'{self.duration_s:.3f}', **changed}
 
-    def _note_event(self, record: Mapping[str, Any], time_ns: int) -> None:
-        """Keep the first events, if they are short."""
+    def _keep_event(self, record: Mapping[str, Any], time_ns: int) -> None:
+        """Keep the first events, if short, for the summary."""
         event = {'time': iso(time_ns), 'name': record.get('name'), **record.get('data', {})}
-        if len(self.events) < MOST_EVENTS and len(str(event)) <= MOST_EVENT:
+        if len(self.events) < MAX_EVENTS and len(str(event)) <= MAX_EVENT_CHARACTERS:
             self.events.append(event)
 
-    def _note_latest(self, key: str, step: int, time_ns: int) -> None:
+    def _update_latest(self, key: str, step: int, time_ns: int) -> None:
         self.latest[key] = max((step, time_ns // MS), self.latest.get(key, (-MAX_STEP, 0)))
 
     def _final(self, time_ms: int) -> list[Point]:
-        """The values that MLflow shows for an ended run: those of ``summary.json``."""
+        """Points that make MLflow show the values of ``summary.json`` for an ended run."""
         stated: dict[str, float | None] = {
             'success': float(self.success), 'duration_s': self.duration_s, 'distance_m': self.distance_m,
             DISTANCE: self.distance_m, 'battery_consumed_pct': self.battery_consumed_pct,
@@ -190,7 +191,7 @@ class MissionState:
         return [self._newest(key, value, time_ms) for key, value in stated.items() if value is not None]
 
     def _newest(self, key: str, value: float, time_ms: int) -> Point:
-        """A point that MLflow shows, regardless of what agent and node logged under its key."""
+        """A point that MLflow shows instead of all points that agent and node have logged under this key."""
         logged = [state.latest[key] for state in (self, self.node) if state is not None and key in state.latest]
         step, last_ms = max(logged, default=(-1, 0))
         if step < MAX_STEP:
@@ -199,19 +200,19 @@ class MissionState:
 
 
 def run_request(start: Mapping[str, Any]) -> tuple[str, int, dict[str, str]]:
-    """Name, start (ms) and tags of the run of a mission with this first record."""
+    """Name, start (ms) and tags of a mission's run, from the first record of its journal."""
     tags = {'mlflow.user': start['robot'], 'mlflow.source.name': 'shadowhound_data_logger'}
     return run_name(start['type'], int(start['t'])), int(start['t']) // MS, tags
 
 
-def named(policies: Iterable[str | None]) -> str:
+def policy_list(policies: Iterable[str | None]) -> str:
     """``go2_patrol@7#..., none, go2_patrol@6#...``; empty if none was ever active."""
     names = [*policies]
     return ', '.join(name or 'none' for name in names) if any(names) else ''
 
 
 def summary_of(state: MissionState, mission_id: str, run: Run, sent: MissionSent, pictures: Mapping[str, str]) -> dict[str, Any]:
-    """``summary.json`` of an ended mission, once its points and files were passed on."""
+    """The content of ``summary.json``, computed after the mission's points and files were sent."""
     start, end = state.start, state.end
     node = state.node or MissionState()
     return {
@@ -240,9 +241,9 @@ def summary_of(state: MissionState, mission_id: str, run: Run, sent: MissionSent
 
 
 def _ledger(state: MissionState, sent: MissionSent) -> dict[str, Any]:
-    """What became of everything that the agent logged: each ``logged`` is the sum of the values after it.
+    """Accounts for everything that the agent logged: each ``logged`` is the sum of the values after it.
 
-    ``not_logged`` counts what could not be logged, by reason; ``disk_full`` is unknown (null) if the agent was killed.
+    ``not_logged`` counts the calls that could not be logged, by reason; ``disk_full`` is null (unknown) if the agent was killed.
     """
     points, files = state.counts['points'], state.counts['frame'] + state.counts['trajectory']
     refused, missing = min(points, sent.refused), min(files, sent.missing)
@@ -255,9 +256,9 @@ def _ledger(state: MissionState, sent: MissionSent) -> dict[str, Any]:
 
 
 def _places(state: MissionState, run: Run) -> dict[str, Any]:
-    """Where its data are: buckets and prefixes; the node's objects of that time have the mission's id in their metadata."""
+    """Buckets and prefixes of the mission's data. The node's objects of that time have the mission's id in their metadata."""
     robot, start, end = state.start['robot'], utc(int(state.start['t'])), utc(int(state.end['t']))
-    name = stamped(state.start['type'], int(state.start['t']))
+    name = timestamped_name(state.start['type'], int(state.start['t']))
     return {
         'mission': f'{BUCKET}/{robot}/missions/{run.run_id}/',
         'trajectory': f'{TRAJECTORIES}/{robot}/{name}.csv' if state.has_trajectory else None,

@@ -1,8 +1,8 @@
-"""MLflow as missions need it: the one file that imports it. Explicit run ids, never the fluent API.
+"""The requests to MLflow: the only file that imports it. Uses explicit run ids, never the fluent API.
 
-Every method blocks for as long as a request may take (``ENVIRONMENT``) and raises TrackingUnavailable or TrackingRefused; each
-may be repeated: a run is looked up by its mission's id before it is made, and points, params and artifacts that are
-there already stay as they are. (Only ``file:`` stores keep a point twice that is sent twice.)
+Every method blocks until the request times out at the latest (``ENVIRONMENT``), and raises TrackingUnavailable or
+TrackingRefused. Each can be repeated: a run is looked up by its mission's id before it is created, and points, params and
+artifacts that already exist stay unchanged. (Only ``file:`` stores duplicate a point that is sent twice.)
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ ENVIRONMENT: Final = {
     'GIT_PYTHON_REFRESH': 'quiet',
     'AWS_MAX_ATTEMPTS': '2',
 }
-"""Defaults that are set before MLflow is imported: the sender does the retries, with a backoff."""
+"""Defaults that are set before MLflow is imported. No retries: the sender retries with backoff."""
 REFUSALS: Final = frozenset({
     'INVALID_PARAMETER_VALUE', 'BAD_REQUEST', 'MALFORMED_REQUEST', 'RESOURCE_DOES_NOT_EXIST', 'INVALID_STATE',
     'RESOURCE_CONFLICT', 'NOT_IMPLEMENTED',
 })  # fmt: skip
-"""MLflow's error codes that a retry does not change."""
+"""MLflow's error codes that are permanent: a retry would fail, too."""
 LOGIN_CODES: Final = frozenset({'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOMER_UNAUTHORIZED'})
 STATUS_CODES: Final = {401: 'UNAUTHENTICATED', 403: 'PERMISSION_DENIED'}
-"""For answers without a code, such as those of the proxy for artifacts."""
+"""HTTP status -> error code, for responses without a code, such as those of the artifact proxy."""
 TOO_LARGE: Final = 413
-"""The HTTP status of a proxy that refuses this file permanently."""
+"""The HTTP status with which a proxy refuses a file permanently."""
 OF_OBJECT: Final = frozenset({400, 404, 406, 409, 410, 412, 414, 422, 431, 451})
-"""HTTP statuses that may be about the object that was sent: they are if the server accepts others."""
+"""HTTP statuses whose cause may be the object: it is, if the server accepts other objects."""
 OF_PATH: Final = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.EEXIST})
-"""The same for a folder."""
+"""The same for artifacts in a folder."""
 RUN_GONE: Final = 'RUN_GONE'
-"""``data['code']`` of a refusal because the run was deleted."""
-MOST_POINTS: Final = 1000
-"""MLflow's limit of a batch."""
+"""``data['code']`` of TrackingRefused if the run was deleted."""
+MAX_POINTS: Final = 1000
+"""MLflow's limit for a batch."""
 _Batch = tuple[Sequence[Point], Mapping[str, str], Mapping[str, str]]
 """Points, params and tags."""
 S3_REMEDY: Final = 'set MLFLOW_S3_ENDPOINT_URL to the S3 server of Tower, such as http://TOWER_IP:9000'
@@ -63,29 +63,29 @@ _USER: Final = re.compile(r'//[^/\s]*@')
 
 
 class Tracking(Protocol):
-    """The requests of a mission's delivery to a tracking server."""
+    """The requests that deliver a mission to a tracking server."""
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
         """The mission's run, created if missing."""
 
     def log(self, run_id: str, points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> None:
-        """At most 1,000 points, 100 params and 100 tags."""
+        """Log a batch of at most 1,000 points, 100 params and 100 tags."""
 
     def artifact(self, run: Run, path: Path, folder: str) -> None:
-        """Under the file's own name."""
+        """Upload a file under its own name to a folder of the run's artifacts."""
 
     def finish(self, run_id: str, mission_id: str, status: str, end_ms: int) -> None:
-        """Give the run its last state and close what duplicates it."""
+        """Set the final state of the run, and close duplicates of it."""
 
 
 class MlflowTracking:
-    """MLflow as a mission's runs need it.
+    """Sends missions to MLflow.
 
-    Life: New; open once, before anything else; not thread-safe.
+    Lifecycle: New; open once, otherwise the first request does it. Not thread-safe.
     """
 
     def __init__(self, uri: str, experiment: str, artifact_root: Path | None = None) -> None:
-        """``artifact_root`` is where a new experiment's artifacts go; None leaves that to the server."""
+        """A new experiment stores its artifacts in ``artifact_root``; if None, the server decides where."""
         self._uri = uri
         self._experiment = experiment
         self._artifact_root = artifact_root
@@ -101,7 +101,7 @@ class MlflowTracking:
         return _USER.sub('//', self._uri)
 
     def open(self) -> None:
-        """Load MLflow, which takes seconds, and make the client; idempotent; otherwise the first request does it."""
+        """Load MLflow, which takes seconds, and create the client; idempotent."""
         if self._client is not None:
             return
         for name, value in ENVIRONMENT.items():
@@ -109,13 +109,13 @@ class MlflowTracking:
         if endpoint := next(filter(None, map(os.environ.get, ENDPOINTS)), None):
             os.environ.setdefault('MLFLOW_S3_ENDPOINT_URL', endpoint)
         try:
-            with _without('pandas'):  # saves a third of time and memory; mlflow-skinny works without it, too
-                from mlflow import MlflowClient  # noqa: PLC0415 - seconds and 80 MB or more, and not installed everywhere
+            with _without('pandas'):  # saves a third of time and memory; mlflow-skinny also works without it
+                from mlflow import MlflowClient  # noqa: PLC0415 - takes seconds and 80 MB, and is not installed everywhere
         except ImportError as error:
             remedy = 'install mlflow-skinny for a server, mlflow for sqlite: and file: stores'
             raise TrackingUnavailable(f'MLflow cannot be imported: {error}', remedy=remedy) from error
         try:
-            with self._translated('cannot be used'):  # SQLite's tables are made here
+            with self._translated('cannot be used'):  # creates SQLite's tables
                 self._client = MlflowClient(tracking_uri=self._uri)
         except TrackingRefused as error:  # nothing was sent yet: this MLflow does not support the address
             remedy = 'set MLFLOW_TRACKING_URI to a server, http://TOWER_IP:5001; for sqlite: also install mlflow'
@@ -123,7 +123,7 @@ class MlflowTracking:
 
     def run_of(self, mission_id: str, name: str, start_ms: int, tags: Mapping[str, str]) -> Run:
         self.open()
-        with self._translated(f'made no run for {mission_id}'):
+        with self._translated(f'did not create a run for {mission_id}'):
             experiment = self._experiment_of()
             found = self._runs(experiment, mission_id)
             if found:
@@ -138,7 +138,7 @@ class MlflowTracking:
         from mlflow.entities import Metric, Param, RunTag  # noqa: PLC0415 - see open
 
         try:
-            with self._translated(f'took no batch of run {run_id}'):
+            with self._translated(f'did not accept a batch of run {run_id}'):
                 self._client.log_batch(
                     run_id, metrics=[Metric(point.key, point.value, point.time_ms, point.step) for point in points],
                     params=[Param(*item) for item in params.items()], tags=[RunTag(*item) for item in tags.items()],
@@ -156,7 +156,7 @@ class MlflowTracking:
                 f'artifacts of run {run.run_id} are in {run.artifact_uri}, and MLFLOW_S3_ENDPOINT_URL does not name that server'
             )
             raise TrackingUnavailable(text, remedy=S3_REMEDY)
-        what, remedy = f'did not take the artifact {posixpath.join(folder, path.name)!r} of run {run.run_id}', ''
+        what, remedy = f'did not accept the artifact {posixpath.join(folder, path.name)!r} of run {run.run_id}', ''
         if run.artifact_uri.startswith('s3:'):
             what, remedy = f'{what} for {run.artifact_uri}', S3_REMEDY
         with self._translated(what, remedy):
@@ -166,13 +166,13 @@ class MlflowTracking:
         self.open()
         with self._translated(f'did not end run {run_id}'):
             for run in self._runs(self._experiment_of(), mission_id):
-                if run.info.run_id != run_id:  # created by a request that seemed lost
+                if run.info.run_id != run_id:  # created by a request that seemed to fail
                     self._client.set_tag(run.info.run_id, DUPLICATE_TAG, run_id)
                     self._delete(run.info.run_id)
             self._client.set_terminated(run_id, status=status, end_time=end_ms)
 
     def tagged(self, tag: str, value: str) -> list[str]:
-        """The ids of the runs of all experiments that have this tag."""
+        """The ids of the runs with this tag, in all experiments."""
         self.open()
         with self._translated('did not list its runs'):
             experiments = [each.experiment_id for each in self._client.search_experiments()]
@@ -188,7 +188,7 @@ class MlflowTracking:
             return sorted(found)
 
     def _delete(self, run_id: str) -> None:
-        """Without the right to delete, as on a Tower with passwords, the run stays, ended and with its tag."""
+        """Delete a duplicate. Without permission to delete, as on a Tower with passwords, only end it; it keeps its tag."""
         from mlflow.exceptions import MlflowException  # noqa: PLC0415 - see open
 
         try:
@@ -240,7 +240,7 @@ class MlflowTracking:
 
     @contextmanager
     def _translated(self, what: str, remedy: str = '') -> Iterator[None]:
-        """``remedy`` is used for a failure without an answer of MLflow."""
+        """Translate MLflow's exceptions; ``remedy`` is for failures without a response from MLflow."""
         from mlflow.exceptions import MlflowException, RestException  # noqa: PLC0415 - see open
 
         try:
@@ -255,25 +255,26 @@ class MlflowTracking:
             self._raise_distrust(error)
             of_object = code in REFUSALS or _is_of_object(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code, of_object=of_object) from error
-        except Exception as error:  # what else a client or a store of artifacts raises (a portal's page is not JSON)
+        except Exception as error:  # clients and artifact stores raise many types (a captive portal's page is not JSON)
             self._raise_distrust(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             status = _status(error)
             if status == TOO_LARGE:
-                raise TrackingRefused(text, remedy='let the proxy before MLflow take larger files', code='TOO_LARGE') from error
+                remedy = 'raise the limit for the size of requests in the proxy in front of MLflow'
+                raise TrackingRefused(text, remedy=remedy, code='TOO_LARGE') from error
             code = STATUS_CODES.get(status, '')
             remedy = remedy_for(code) if code else remedy or remedy_for('')
             raise TrackingUnavailable(text, remedy=remedy, code=code, of_object=_is_of_object(error)) from error
 
     def _raise_distrust(self, error: Exception) -> None:
-        """Raises TrackingUnavailable if the certificate of the server, or of the store of artifacts, is not trusted."""
+        """Raises TrackingUnavailable if the certificate of the server or of the artifact store is not trusted."""
         bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE if artifacts are sent to the S3 server itself)'
         if found := distrust(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
             raise TrackingUnavailable(found[0], remedy=found[1], code='CERTIFICATE') from error
 
 
 def _status(error: BaseException) -> int:
-    """The HTTP status of the answer of MLflow or an S3 server; 0 without an answer."""
+    """The HTTP status of the response of MLflow or an S3 server; 0 without a response."""
     for cause in causes(error):
         response: Any = getattr(cause, 'response', None)
         if isinstance(response, dict):  # botocore's
@@ -284,14 +285,14 @@ def _status(error: BaseException) -> int:
 
 
 def _is_of_object(error: BaseException) -> bool:
-    """Whether the answer may be about the object alone."""
+    """Whether the cause may be the object: then other objects may be accepted."""
     errors = {cause.errno for cause in causes(error) if type(cause).__module__ == 'builtins' and isinstance(cause, OSError)}
     return _status(error) in OF_OBJECT or not errors.isdisjoint(OF_PATH)
 
 
 @contextmanager
 def _without(module: str) -> Iterator[None]:
-    """Hide an optional dependency, unless it is loaded already."""
+    """Hide an optional dependency, unless it is already loaded."""
     if module in sys.modules:
         yield
         return
@@ -303,7 +304,10 @@ def _without(module: str) -> Iterator[None]:
 
 
 def send(tracking: Tracking, run_id: str, batch: _Batch, refused: Callable[[Exception], None]) -> None:
-    """Send a batch; what the server refuses is found by halving, reported to ``refused`` and skipped. Raises TrackingError."""
+    """Send a batch. Items that the server refuses are found by bisection, passed to ``refused`` and skipped.
+
+    Raises TrackingError.
+    """
     points, params, tags = batch
     if not (points or params or tags):
         return
@@ -320,7 +324,7 @@ def send(tracking: Tracking, run_id: str, batch: _Batch, refused: Callable[[Exce
 
 
 def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str, str]) -> list[_Batch]:
-    """What a refused batch is split into; empty for a single item."""
+    """Split a refused batch into smaller ones; empty for a single item."""
     if len(points) + len(params) + len(tags) <= 1:
         return []
     half = len(points) // 2
@@ -330,12 +334,12 @@ def _parts(points: Sequence[Point], params: Mapping[str, str], tags: Mapping[str
 
 
 def remedy_for(code: str) -> str:
-    """What an operator can do about an error code of MLflow."""
+    """What the operator can do about an error code of MLflow."""
     if code in LOGIN_CODES:
         return (
             'check MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD (or ~/.mlflow/credentials, which is read again '
             'automatically), or MLFLOW_TRACKING_TOKEN'
         )
     if code == 'ENDPOINT_NOT_FOUND':
-        return 'is MLFLOW_TRACKING_URI the address of an MLflow server?'
-    return 'is MLFLOW_TRACKING_URI correct, and Tower on? The request is retried automatically'
+        return 'check that MLFLOW_TRACKING_URI is the address of an MLflow server'
+    return 'check MLFLOW_TRACKING_URI, and that Tower is on; the request is retried automatically'

@@ -1,7 +1,7 @@
-"""What the tracking server accepts: names, numbers and texts, checked or cut before they are journaled.
+"""Checks names, numbers and texts against the tracking server's limits before they are journaled; texts are cut.
 
-The limits are MLflow's own (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2, the smaller of both; the colon in names, which
-2.14 refuses, is not allowed). A request holds at most 1,000 points, params and tags together, and a million characters.
+The limits are MLflow's (``mlflow/utils/validation.py`` of 2.14.0 and 3.17.2, the lower of both; colons in names, which 2.14
+refuses, are not allowed). A request contains at most 1,000 points, params and tags together, and a million characters.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ MAX_KEY: Final = 250
 MAX_KEYS: Final = 50
 """Metrics in one record."""
 MAX_TYPE: Final = 128
-"""Characters of a mission's type, which must fit into an object's metadata."""
+"""Characters of a mission type, which must fit into an object's metadata."""
 MAX_PARAM: Final = 6000
 MAX_TAG: Final = 5000
 """The limit of 2.14; that of 3.17 is 8,000."""
 MAX_TEXT: Final = 1 << 20
-"""Of any text in the journal."""
+"""Characters of any text in the journal."""
 MAX_STEP: Final = (1 << 63) - 1
 MAX_BITS: Final = 1024
-"""Of an integer in an event: Python refuses to print far larger ones."""
+"""Of an integer in an event: Python does not print far larger ones."""
 JPEG: Final = b'\xff\xd8'
 JPEG_QUALITY: Final = 90
 MAX_SIDE: Final = 65_500
 """Pixels; libjpeg's limit."""
 _ARRAYS: Final = ('__array__', '__array_interface__')
 _SPACES: Final = {(): 'GRAY', (1,): 'GRAY', (3,): 'RGB', (4,): 'RGBA'}
-"""What simplejpeg calls an array of so many channels."""
+"""Shape of a pixel -> simplejpeg's name of the color space."""
 MAX_NAME_BYTES: Final = 240
-"""A file has at most 255, of which boto3 needs 9 while it downloads one."""
+"""File systems allow 255, of which boto3 needs 9 while it downloads a file."""
 MAX_EXTENSION: Final = 16
 _ODD: Final = re.compile(r'[\x00-\x1f\x7f-\x9f#?\\\ud800-\udfff]|%(?=[0-9A-Fa-f]{2})|=(?=[0-9A-F]{2})|^ ')
-"""What does not arrive, tested with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX`` until
-none is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS takes a backslash for a slash; urllib drops control characters and
-a leading blank."""
+"""Characters that do not arrive, tested with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX``
+until none is left, and refuses ``#``; a ``?`` ends a URL; SeaweedFS treats a backslash as a slash; urllib drops control
+characters and a leading space."""
 _ODD_FOLDER: Final = re.compile(rf"{_ODD.pattern}|'|^\.(?=\.)")
-"""MLflow puts a folder into a query between quotes, and takes ``..x`` for a way out."""
+"""MLflow puts a folder between quotes into a query, and treats ``..x`` as a path that leads out of the artifacts."""
 _SCHEME: Final = re.compile(r'^([A-Za-z][A-Za-z0-9+.-]*):')
 """``C:`` and ``file:x`` look like URLs."""
 _CUT: Final = re.compile(r'=[0-9A-F]?$')
@@ -51,14 +51,15 @@ _KEY: Final = re.compile(r'[/\w.\- ]+')
 
 
 def metric_key(key: object) -> str:
-    """The key unchanged; raises Rejected for one that MLflow would refuse."""
+    """Return the key unchanged; raises Rejected if MLflow would refuse it."""
     if not isinstance(key, str) or not _KEY.fullmatch(key) or len(key) > MAX_KEY or not _is_plain(key):
-        raise Rejected('bad_name', f'{text(key, 80)!r} cannot name a metric: letters, digits, "_-./ ", at most {MAX_KEY}')
+        allowed = f'use letters, digits and "_-./ ", at most {MAX_KEY} characters'
+        raise Rejected('bad_name', f'{text(key, 80)!r} cannot be the name of a metric: {allowed}')
     return key
 
 
 def number(value: Any, what: str) -> float:
-    """A finite float; raises Rejected for anything else. Arrays of one element and numpy's scalars are numbers, texts are not."""
+    """A finite float; raises Rejected for anything else. Arrays of one element and numpy scalars are accepted, texts are not."""
     try:
         found = math.nan if isinstance(value, (str, bytes)) else float(_element(value))
     except (TypeError, ValueError, OverflowError, RuntimeError):
@@ -69,7 +70,7 @@ def number(value: Any, what: str) -> float:
 
 
 def integer(value: Any, what: str) -> int:
-    """A step or id; raises Rejected for what is not an integer or has more than 64 bits."""
+    """A step or id; raises Rejected for something other than an integer of at most 64 bits."""
     try:
         found = int(_element(value))
     except (TypeError, ValueError, OverflowError, RuntimeError):
@@ -80,7 +81,7 @@ def integer(value: Any, what: str) -> int:
 
 
 def _element(value: Any) -> Any:
-    """The number in an array or tensor of one element, of any shape; anything else unchanged."""
+    """The number in an array or tensor of one element, of any shape; other values unchanged."""
     if isinstance(value, (int, float)) or getattr(getattr(value, 'dtype', None), 'kind', 'f') not in 'biuf':
         return value
     item = getattr(value, 'item', None)
@@ -88,10 +89,10 @@ def _element(value: Any) -> Any:
 
 
 def jpeg(value: Any, what: str) -> memoryview:
-    """The bytes of a JPEG, unchanged, or the pixels of an image, encoded. Raises Rejected for anything else.
+    """The bytes of a JPEG, unchanged, or an image encoded as JPEG. Raises Rejected for anything else.
 
-    Pixels are uint8 of the shape (height, width), or (height, width, 3 or 4) in the order red, green, blue (and alpha, which a
-    JPEG does not have), as in ``mlflow.log_image``: a numpy array, a Pillow image or another object that numpy reads.
+    An image is an array of uint8 in the shape (height, width) or (height, width, 3 or 4), in the order red, green, blue (and
+    alpha, which is dropped), as in ``mlflow.log_image``: a numpy array, a Pillow image or another object that numpy can read.
     """
     try:
         view = memoryview(value)
@@ -130,16 +131,16 @@ def _encoded(value: Any, what: str) -> bytes:
 
 
 def text(value: object, limit: int = MAX_TEXT) -> str:
-    """Any value as text that every database accepts: no NUL (PostgreSQL), no lone surrogates, at most ``limit`` characters."""
+    """Any value as a text that every database accepts: no NUL (PostgreSQL), no lone surrogates, at most ``limit`` characters."""
     try:
         found = str(value)
-    except Exception:  # noqa: BLE001 - an agent's class may raise anything, and Python does for a number of 5,000 digits
+    except Exception:  # noqa: BLE001 - an agent's class may raise anything, and Python does for a number with 5,000 digits
         found = f'<{type(value).__name__}>'
     return found.replace('\0', '\N{REPLACEMENT CHARACTER}').encode('utf-8', 'replace').decode('utf-8')[:limit]
 
 
 def artifact_folder(path: object) -> str:
-    """A folder below the run's artifacts, '' for its root; raises Rejected for one that leads elsewhere."""
+    """A folder below the run's artifacts, '' for their root; raises Rejected for a path that leads out of them."""
     if path is None or path == '':
         return ''
     if not isinstance(path, str) or posixpath.normpath(path) != path or len(path) > MAX_KEY or '\0' in path:
@@ -150,10 +151,10 @@ def artifact_folder(path: object) -> str:
 
 
 def artifact_name(name: str, odd: re.Pattern[str] = _ODD) -> str:
-    """The name under which a run can have a file: unchanged, if MLflow's server and clients list it and download it as that.
+    """The name of a file in a run: unchanged if MLflow's server and clients list and download it under this name.
 
-    Otherwise ``=XX`` replaces each byte that they do not accept (``map#1.png`` is ``map=231.png``), ``=`` before two such digits
-    among them, so that two names never become one. A name of more than 240 bytes is cut and has a hash.
+    Otherwise ``=XX`` replaces each byte that they do not accept (``map#1.png`` becomes ``map=231.png``), and ``=`` before two hex
+    digits, so that two names never become the same. A name of more than 240 bytes is cut and gets a hash.
     """
     found = _SCHEME.sub(r'\1=3A', odd.sub(lambda match: _escaped(match[0]), name))
     if len(found.encode()) <= MAX_NAME_BYTES:
@@ -170,7 +171,7 @@ def _escaped(letters: str) -> str:
 
 
 def _bytes(name: str) -> bytes:
-    """As in the file system; lone surrogates become question marks."""
+    """The name's bytes in the file system; lone surrogates become question marks."""
     try:
         return name.encode('utf-8', 'surrogateescape')
     except UnicodeEncodeError:
@@ -178,7 +179,7 @@ def _bytes(name: str) -> bytes:
 
 
 def plain(value: Any, depth: int = 4) -> Any:
-    """The value as JSON; what JSON cannot represent becomes text."""
+    """The value as JSON; values that JSON cannot represent become text."""
     if value is None or (isinstance(value, int) and value.bit_length() <= MAX_BITS):
         return value
     if isinstance(value, float):
@@ -192,10 +193,10 @@ def plain(value: Any, depth: int = 4) -> Any:
 
 
 def bounded(value: Any) -> Any:
-    """The value unchanged; raises Rejected if it is too large for a record."""
+    """Return the value unchanged; raises Rejected if it is too large for a record."""
     size = len(json.dumps(value))
     if size > MAX_TEXT:
-        raise Rejected('too_large', f'an event of {size} characters: log_artifact takes a file')
+        raise Rejected('too_large', f'an event has {size} characters, more than {MAX_TEXT}: use log_artifact')
     return value
 
 
@@ -208,5 +209,5 @@ def boolean(value: object) -> bool:
 
 
 def _is_plain(path: str) -> bool:
-    """Whether it stays unchanged, and below its folder, as a file's path."""
+    """Whether it is a normalized path that stays below its folder."""
     return posixpath.normpath(path) == path and path != '.' and not path.startswith(('..', '/'))

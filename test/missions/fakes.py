@@ -70,7 +70,7 @@ class FakeSpooler:
     """What was spooled, each content once, as the spool's index sees to it."""
 
     objects: list[DataObject] = field(default_factory=list)
-    owes: bool = False
+    has_unsent: bool = False
 
     def add(self, objects: Sequence[DataObject]) -> None:
         known = {(item.bucket, item.key, item.body) for item in self.objects}
@@ -99,12 +99,12 @@ class FakeSpooler:
         return [f'{item.bucket}/{item.key}' for item in self.objects]
 
 
-class FakeDrawing:
-    """No pictures, at once."""
+class FakePictures:
+    """Creates no pictures, immediately."""
 
     busy = False
 
-    def of(self, folder: MissionFolder, title: str) -> dict[str, str]:
+    def make(self, folder: MissionFolder, title: str) -> dict[str, str]:
         return {}
 
     def close(self) -> None:

@@ -17,16 +17,16 @@ from shadowhound_data_logger.missions.folder import new_folder
 def test_a_mission_is_active_from_start_to_end(tmp_path: Path) -> None:
     """It is found by its journal's lock; its end's time is the one that the agent recorded."""
     finder = MissionFinder(tmp_path, 'thor')
-    assert finder.look() is None
+    assert finder.active() is None
     with journalling(tmp_path) as logger:
         mission_id = logger.start_mission('patrol', 'go')
-        found = finder.look()
+        found = finder.active()
         assert found is not None
         assert (found.id, found.mission_type, found.has(found.start_ns), found.has(found.start_ns - 1)) == (
             mission_id, 'patrol', True, False,
         )  # fmt: skip
         logger.end_mission(True, 1.0, 1.0)
-        until(lambda: finder.look() is None, 'the end of the mission')  # the journal is let go of by another thread
+        until(lambda: finder.active() is None, 'the end of the mission')  # the journal is let go of by another thread
     over = ended(found)
     assert over.end_ns == (journal.last(found.folder.journal))['t']
     assert over.has(over.end_ns or 0)
@@ -37,8 +37,8 @@ def test_only_its_own_robot_is_looked_for(tmp_path: Path) -> None:
     """Several robots may share a home."""
     with journalling(tmp_path, robot='tachi') as logger:
         logger.start_mission('patrol', 'go')
-        assert MissionFinder(tmp_path, 'thor').look() is None
-        assert MissionFinder(tmp_path, 'tachi').look() is not None
+        assert MissionFinder(tmp_path, 'thor').active() is None
+        assert MissionFinder(tmp_path, 'tachi').active() is not None
 
 
 def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
@@ -48,9 +48,9 @@ def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
         older = first.start_mission('z', '')
         with journalling(tmp_path) as second:
             newer = second.start_mission('a', '')
-            found = finder.look()
+            found = finder.active()
             assert (found and found.id) == newer
-        found = finder.look()
+        found = finder.active()
         assert (found and found.id) == older
 
 
@@ -58,15 +58,15 @@ def test_a_mission_that_is_being_made_is_not_over(tmp_path: Path) -> None:
     """Between the folder, the journal, the lock and the first record it is looked at again."""
     finder = MissionFinder(tmp_path, 'thor')
     folder = new_folder(tmp_path, 'patrol', 1)
-    assert finder.look() is None
+    assert finder.active() is None
     writer = journal.Journal(folder.journal)
     writer.create()
-    assert finder.look() is None
+    assert finder.active() is None
     writer.append({'k': 'start', 't': 1, 'type': 'patrol', 'command': '', 'robot': 'thor'})
-    found = finder.look()
+    found = finder.active()
     assert (found and found.id) == folder.mission_id
     writer.close()
-    assert finder.look() is None
+    assert finder.active() is None
 
 
 def test_what_is_over_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,8 +75,8 @@ def test_what_is_over_costs_one_stat(tmp_path: Path, monkeypatch: pytest.MonkeyP
         with journalling(tmp_path) as logger:
             logger.start_mission('patrol', '')
     finder = MissionFinder(tmp_path, 'thor')
-    finder.look()
-    finder.look()
+    finder.active()
+    finder.active()
     monkeypatch.setattr(os, 'open', lambda *_: pytest.fail('a file was opened'))
     monkeypatch.setattr(os, 'scandir', lambda *_: pytest.fail('the folder was listed'))
-    assert finder.look() is None
+    assert finder.active() is None

@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 import pytest
-from missions.fakes import FakeDrawing, FakeTracking
+from missions.fakes import FakePictures, FakeTracking
 from spool.making import rows
 
 from shadowhound_data_logger import MissionDataLogger
@@ -58,7 +58,7 @@ def test_a_busy_index_delays_the_delivery_and_no_call(tmp_path: Path, monkeypatc
     with closing(Spool(settings.spool_path, settings.spool, clock, 'thor')) as spool:
         spool.open()
     now_s = [0.0]
-    replay = Replay(tmp_path, FakeTracking(), Spooler(settings, clock), FakeDrawing(), monotonic=lambda: now_s[0],
+    replay = Replay(tmp_path, FakeTracking(), Spooler(settings, clock), FakePictures(), monotonic=lambda: now_s[0],
                     rng=random.Random(1))  # type: ignore[arg-type]  # fmt: skip
     with closing(MissionDataLogger(home=tmp_path, replay=False, start_timeout_s=0.0)) as logger:
         logger.start_mission('patrol', '')

@@ -66,12 +66,12 @@ def test_the_sender_stays_until_the_last_row_is_written(tmp_path: Path, is_haste
             spooler.add([item.content for item in objects_of(frame, start, folder, Run('abc', '1', 'x'))])
             for _ in range(3):
                 spooler.drain()
-        assert (spooler.pending(), rows(), spooler.owes) == (0, 1, True)
+        assert (spooler.pending(), rows(), spooler.has_unsent) == (0, 1, True)
         if is_hastened:
             spooler.expedite()
         now[0] += SOON_S if is_hastened else settings.catalog.period_s
         for _ in range(2):
             spooler.drain()
-        assert (spooler.pending(), rows(), spooler.owes) == (0, 2, False)
+        assert (spooler.pending(), rows(), spooler.has_unsent) == (0, 2, False)
     finally:
         spooler.close()

@@ -92,7 +92,7 @@ def test_without_an_interpreter_missions_are_journaled(
     logger.log_metric('a', 1.0)
     logger.end_mission(True, 1, 1)
     for _ in range(3):
-        logger._replayer.look()
+        logger._replayer.supervise()
     report = logger.close()
     assert [record['k'] for record in journal(tmp_path / 'home')] == ['start', 'metrics', 'end']
     warnings = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
@@ -116,7 +116,7 @@ def test_an_interpreter_that_cannot_import_us_is_not_tried_again(
         until(lambda: 'cannot import' in caplog.text, 'it is said')
         assert logger._replayer is not None
         for _ in range(3):
-            logger._replayer.look()
+            logger._replayer.supervise()
     finally:
         logger.close()
     assert caplog.text.count('not sent') == 1
@@ -129,7 +129,7 @@ def is_holding(pid: int) -> bool:
     return state == 'S' and int(fields[15]) == os.nice(0) + child.NICE
 
 
-@pytest.mark.parametrize('by', ['wake', 'release', 'HOLD_S'])
+@pytest.mark.parametrize('by', ['wake', 'release', 'LOAD_DELAY_S'])
 def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str) -> None:
     """Or its agent is gone, or a second has passed: the CPU is left to the first mission's request for a run."""
     fake, loaded = tmp_path / 'package/shadowhound_data_logger/missions', tmp_path / 'loaded'
@@ -138,11 +138,11 @@ def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, 
         (folder / '__init__.py').touch()
     (fake / 'replay.py').write_text(f'open({str(loaded)!r}, "w")\ndef main(): pass\n')
     monkeypatch.setattr(child, 'PACKAGE', str(fake.parents[1]))
-    monkeypatch.setattr(child, 'HOLD_S', 0.0 if by == 'HOLD_S' else 3600.0)
+    monkeypatch.setattr(child, 'LOAD_DELAY_S', 0.0 if by == 'LOAD_DELAY_S' else 3600.0)
     replayer = child.Replayer(home, 'x', {})
     replayer.start()
     assert replayer._process is not None
-    if by != 'HOLD_S':
+    if by != 'LOAD_DELAY_S':
         pid = replayer._process.pid
         until(lambda: is_holding(pid), 'it waits')
         assert not loaded.exists()

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from clocks import NOON_NS, Clocks
-from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
+from missions.fakes import FakePictures, FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
 from shadowhound_data_logger.core.dating import Dating
-from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
-from shadowhound_data_logger.missions.dating import WAITS, give_date
+from shadowhound_data_logger.missions.active import ActiveMission, MissionFinder, ended
+from shadowhound_data_logger.missions.dating import NO_DATE, assign_date
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.missions.odometer import Pose
@@ -64,7 +64,9 @@ def test_a_mission_takes_as_long_as_it_does(tmp_path: Path, clocks: Clocks, step
 
 def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpooler, **offsets: int) -> Replay:
     dating = Dating(clocks, 600.0, lambda: {name.replace('_', '-'): offset for name, offset in offsets.items()})
-    return Replay(home, tracking, spooler, FakeDrawing(), settle=lambda folder: give_date(folder, dating), rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(
+        home, tracking, spooler, FakePictures(), settle=lambda folder: assign_date(folder, dating), rng=random.Random(1)
+    )  # type: ignore[arg-type]
 
 
 def check(tracking: FakeTracking, spooler: FakeSpooler, folder: MissionFolder) -> None:
@@ -84,13 +86,13 @@ def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
     folder, tracking, spooler = fly(tmp_path, clocks), FakeTracking(), FakeSpooler()
     replay = sender(tmp_path, clocks, tracking, spooler)
     assert not replay.step()
-    assert replay.owes
-    assert (tracking.runs, report(folder).last_error) == ({}, WAITS)
+    assert replay.has_unsent
+    assert (tracking.runs, report(folder).last_error) == ({}, NO_DATE)
     clocks.set(NOON_NS)
     while replay.step():
         pass
     check(tracking, spooler, folder)
-    assert not replay.owes
+    assert not replay.has_unsent
     found = overview(folder)
     assert found
     assert (found.started, found.last_error) == ('2025-10-18T11:59:50.000000Z', '')
@@ -155,9 +157,9 @@ def test_the_node_s_part_is_dated_as_well(tmp_path: Path, clocks: Clocks) -> Non
     """Poses of before and after the clock was set are one path, and steps are seconds since the start all the way."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        found = MissionFinder(tmp_path, 'thor').look()
+        found = MissionFinder(tmp_path, 'thor').active()
         assert found
-        mission = Active(found.folder, found.mission_type, found.start_ns, clock=clocks)
+        mission = ActiveMission(found.folder, found.mission_type, found.start_ns, clock=clocks)
         node_log = NodeLog(mission, SECOND, 5.0)
         node_log.open()
         for second in range(4):

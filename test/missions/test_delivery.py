@@ -14,7 +14,7 @@ from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder, missions
 from shadowhound_data_logger.missions.journal import Journal, read
 from shadowhound_data_logger.missions.overview import report
-from shadowhound_data_logger.missions.pictures import Pictures, nothing
+from shadowhound_data_logger.missions.pictures import MakePictures, no_pictures
 from shadowhound_data_logger.missions.state import Point
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
@@ -44,7 +44,9 @@ def work(delivery: Delivery) -> bool:
     return delivery.complete() or not any(worked)
 
 
-def deliver(folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler, pictures: Pictures = nothing) -> Delivery:
+def deliver(
+    folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler, pictures: MakePictures = no_pictures
+) -> Delivery:
     delivery = Delivery(folder, tracking, spooler, pictures)  # type: ignore[arg-type]
     for _ in range(1000):
         if work(delivery) and (delivery.sent.complete or not delivery.sent.ended):

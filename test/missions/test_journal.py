@@ -58,7 +58,7 @@ def test_a_record_after_a_full_disk_is_whole(journal: Journal, monkeypatch: pyte
     journal.append({'a': 1})
     write = os.write
     monkeypatch.setattr(os, 'write', lambda descriptor, data: write(descriptor, data[:7]))
-    with pytest.raises(OSError, match='only a part'):
+    with pytest.raises(OSError, match='only partly written'):
         journal.append({'b': 2})
     monkeypatch.undo()
     journal.append({'c': 3})

@@ -14,9 +14,9 @@ from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.missions.copies import SPARES
+from shadowhound_data_logger.missions.copies import PREALLOCATED
 from shadowhound_data_logger.missions.folder import MISSIONS, missions
-from shadowhound_data_logger.missions.recorder import Mission
+from shadowhound_data_logger.missions.mission import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 
@@ -49,7 +49,7 @@ def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
     """A child that has the mission itself in hand: neither the files made ahead nor new ones are written."""
     with journalling(tmp_path) as logger, logger.mission('patrol', '') as mission:
         files = mission.folder.files
-        until(lambda: len(list(files.iterdir())) == SPARES, 'files are made ahead')
+        until(lambda: len(list(files.iterdir())) == PREALLOCATED, 'files are made ahead')
         child = multiprocessing.get_context('fork').Process(target=_frame_in_a_fork, args=(mission, Path(__file__)))
         child.start()
         child.join(60)
@@ -121,13 +121,13 @@ def test_frames_have_files_that_were_made_ahead(tmp_path: Path) -> None:
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         (folder,) = missions(tmp_path)
-        until(lambda: len(list(folder.files.iterdir())) == SPARES, 'files are made ahead')
-        for number in range(3 * SPARES):
+        until(lambda: len(list(folder.files.iterdir())) == PREALLOCATED, 'files are made ahead')
+        for number in range(3 * PREALLOCATED):
             logger.log_camera_frame(JPEG + bytes([number]), number)
     frames = {
         record['id']: (folder.files / record['file']).read_bytes() for record in journal(tmp_path) if record['k'] == 'frame'
     }
-    assert frames == {number: JPEG + bytes([number]) for number in range(3 * SPARES)}
+    assert frames == {number: JPEG + bytes([number]) for number in range(3 * PREALLOCATED)}
     assert len(list(folder.files.iterdir())) == len(frames)
 
 

@@ -15,7 +15,7 @@ from missions.fakes import journal, journalling, journals
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.missions import copies
 from shadowhound_data_logger.missions.folder import MISSIONS, missions
-from shadowhound_data_logger.missions.recorder import Mission
+from shadowhound_data_logger.missions.mission import Mission
 
 JPEG = b'\xff\xd8 a picture \xff\xd9'
 
@@ -62,7 +62,7 @@ def test_without_a_mission_calls_warn_once(tmp_path: Path, caplog: pytest.LogCap
             logger.log_event('a')
             logger.log_artifact('/nowhere')
             logger.end_mission(True, 1, 1)
-    assert len([record for record in caplog.records if 'without a mission' in record.message]) == 7
+    assert len([record for record in caplog.records if 'without an active mission' in record.message]) == 7
     assert journals(tmp_path) == []
 
 

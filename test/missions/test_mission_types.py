@@ -21,7 +21,7 @@ from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import Settings, UploadSettings
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.formats.rows.parts import read_rows
-from shadowhound_data_logger.missions import recorder
+from shadowhound_data_logger.missions import mission, recorder
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.journal import read
@@ -46,7 +46,8 @@ def environ(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
 @pytest.fixture
 def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[MissionFolder]:
     """A mission of each type, all of one second, each with a trajectory of its own."""
-    monkeypatch.setattr(recorder, 'now_ns', lambda _: NOON_NS)
+    for module in (mission, recorder):
+        monkeypatch.setattr(module, 'now_ns', lambda _: NOON_NS)
     for given in TYPES:
         csv = tmp_path / 't.csv'
         csv.write_text(f'timestamp,x,y,yaw\n{given}\n')

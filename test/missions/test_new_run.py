@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 from e2e.wire import HANG, PASS, REFUSE, Wire
-from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
+from missions.fakes import FakePictures, FakeSpooler, FakeTracking, journalling
 from missions.server import Server, complete, until
 from stores.certificates import Authority
 from stores.tls_front import behind_tls
 
 from shadowhound_data_logger import MissionDataLogger
-from shadowhound_data_logger.missions import journal, new_run, recorder
+from shadowhound_data_logger.missions import journal, mission, new_run
 from shadowhound_data_logger.missions.child import Replayer
-from shadowhound_data_logger.missions.delivery import AGENT_S, Delivery
+from shadowhound_data_logger.missions.delivery import RUN_CREATION_TIMEOUT_S, Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.new_run import NewRun, RunRequests
 from shadowhound_data_logger.missions.replay import Replay
@@ -231,7 +231,7 @@ def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, 
     elif how == 'killed':
         os.close(new._descriptor)
     else:
-        clock.seconds = AGENT_S + 1.0
+        clock.seconds = RUN_CREATION_TIMEOUT_S + 1.0
     assert delivery.track()
     assert list(tracking.runs) == [folder.mission_id]
     if how == 'hung':
@@ -241,13 +241,13 @@ def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, 
 def test_the_sender_stays_for_the_agent_s_request(tmp_path: Path, folder: MissionFolder) -> None:
     """The agent may have closed its logger meanwhile: what its request leaves is still to be sent."""
     new, tracking = NewRun(folder), FakeTracking()
-    replay = Replay(tmp_path, tracking, FakeSpooler(), FakeDrawing())  # type: ignore[arg-type]
+    replay = Replay(tmp_path, tracking, FakeSpooler(), FakePictures())  # type: ignore[arg-type]
     replay.step()
-    assert replay.owes
+    assert replay.has_unsent
     new.settle()
     while replay.step():
         pass
-    assert not replay.owes
+    assert not replay.has_unsent
     assert folder.sent().complete
 
 
@@ -269,7 +269,7 @@ def test_a_file_system_that_locks_no_folders(tmp_path: Path, monkeypatch: pytest
     (found,) = missions(tmp_path)
     assert [(line.record or {})['k'] for line in found.lines()] == ['start', 'end']
     delivery = Delivery(found, FakeTracking(), FakeSpooler())  # type: ignore[arg-type]
-    assert not delivery._agent_makes_run()
+    assert not delivery._agent_creates_run()
 
 
 def test_a_fork_does_not_hold_the_mission(folder: MissionFolder) -> None:
@@ -288,7 +288,7 @@ def test_a_mission_without_a_date_has_no_run(tmp_path: Path, monkeypatch: pytest
     asked: list[object] = []
     monkeypatch.setattr(RunRequests, 'prepare', lambda _: None)
     monkeypatch.setattr(RunRequests, 'create', lambda *arguments: asked.append(arguments))
-    monkeypatch.setattr(recorder, 'now_ns', lambda _: 10**9)
+    monkeypatch.setattr(mission, 'now_ns', lambda _: 10**9)
     monkeypatch.setattr(Replayer, 'start', lambda _: None)
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0, tracking_uri='http://127.0.0.1:9')
     logger.start_mission('patrol', '')
@@ -305,4 +305,4 @@ def test_a_mission_without_a_date_has_no_run(tmp_path: Path, monkeypatch: pytest
 ])  # fmt: skip
 def test_only_servers_that_take_plain_requests_are_asked(environ: dict[str, str], can: bool) -> None:
     """The rest is left to MLflow's own client."""
-    assert RunRequests.can_ask(environ) is can
+    assert RunRequests.is_supported(environ) is can

@@ -10,8 +10,8 @@ from missions.fakes import FakeSpooler, FakeTracking, journalling
 
 from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.errors import TrackingError
-from shadowhound_data_logger.missions.active import Active, MissionFinder, ended
-from shadowhound_data_logger.missions.delivery import NODE_S, Delivery
+from shadowhound_data_logger.missions.active import ActiveMission, MissionFinder, ended
+from shadowhound_data_logger.missions.delivery import NODE_CLOSE_TIMEOUT_S, Delivery
 from shadowhound_data_logger.missions.folder import MissionFolder
 from shadowhound_data_logger.missions.node_log import Frame, NodeLog, Reading
 from shadowhound_data_logger.missions.odometer import Pose
@@ -22,7 +22,7 @@ JPEG = b'\xff\xd8 of the node \xff\xd9'
 
 def join(home: Path, *, seconds: int = 5, step_ns: int = 1000) -> NodeLog:
     """A node that has seen a robot for a while."""
-    mission = MissionFinder(home, 'thor').look()
+    mission = MissionFinder(home, 'thor').active()
     assert mission
     node_log = NodeLog(mission, step_ns, 5e9)
     node_log.open()
@@ -31,7 +31,7 @@ def join(home: Path, *, seconds: int = 5, step_ns: int = 1000) -> NodeLog:
         node_log.add(Reading(stamp_ns, 'battery_pct', 90.0 - number))
         node_log.add(Pose(stamp_ns, float(number), 0.0, 0.0))
     node_log.add(Frame(mission.start_ns, JPEG))
-    node_log.write(all_of_it=True)
+    node_log.write(is_final=True)
     return node_log
 
 
@@ -54,7 +54,7 @@ def newest(tracking: FakeTracking) -> dict[str, float]:
     return {point.key: point.value for point in sorted(tracking.points, key=lambda point: (point.step, point.time_ms))}
 
 
-def flown(home: Path, distance_m: float = 0.0) -> Active:
+def flown(home: Path, distance_m: float = 0.0) -> ActiveMission:
     """A mission whose agent only starts and ends."""
     with journalling(home) as logger:
         logger.start_mission('patrol', 'go')
@@ -118,7 +118,7 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
     tracking = FakeTracking()
     delivery = Delivery(node_log.mission.folder, tracking, FakeSpooler(), monotonic=lambda: now[0])  # type: ignore[arg-type]
     assert not any(work(delivery) for _ in range(20))
-    now[0] = NODE_S + 1
+    now[0] = NODE_CLOSE_TIMEOUT_S + 1
     assert not any(work(delivery) for _ in range(20))
     assert len(tracking.finished) == 1
     node_log.add(Reading(node_log.mission.start_ns + 1, 'late', 1.0))
@@ -152,7 +152,7 @@ def test_a_dead_agents_mission_ends_with_the_nodes_last_word(tmp_path: Path) -> 
     logger = MissionDataLogger(home=tmp_path, replay=False, start_timeout_s=0.0)
     logger.start_mission('patrol', '')
     node_log = join(tmp_path, seconds=4, step_ns=SECOND)
-    logger._mission._journal.close()  # type: ignore[union-attr]  # as a death does
+    logger._mission._recorder._journal.close()  # type: ignore[union-attr]  # as a death does
     node_log.close()
     tracking = FakeTracking()
     assert deliver(node_log.mission.folder, tracking, FakeSpooler())

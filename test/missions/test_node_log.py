@@ -12,8 +12,8 @@ import pytest
 from missions.fakes import journalling
 
 from shadowhound_data_logger.missions import copies, journal
-from shadowhound_data_logger.missions.active import Active, MissionFinder
-from shadowhound_data_logger.missions.node_log import FIRST_FRAME, MOST_FLOOR_POINTS, Cloud, Floor, Frame, NodeLog, Reading
+from shadowhound_data_logger.missions.active import ActiveMission, MissionFinder
+from shadowhound_data_logger.missions.node_log import FIRST_FRAME, MAX_FLOOR_POINTS, Cloud, FloorPlan, Frame, NodeLog, Reading
 from shadowhound_data_logger.missions.odometer import Pose
 
 SECOND = 10**9
@@ -21,35 +21,35 @@ JPEG = b'\xff\xd8 picture \xff\xd9'
 
 
 @pytest.fixture
-def mission(tmp_path: Path) -> Iterator[Active]:
+def mission(tmp_path: Path) -> Iterator[ActiveMission]:
     """An active one."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
-        found = MissionFinder(tmp_path, 'thor').look()
+        found = MissionFinder(tmp_path, 'thor').active()
         assert found
         yield found
 
 
-def opened(mission: Active) -> NodeLog:
+def opened(mission: ActiveMission) -> NodeLog:
     made = NodeLog(mission, SECOND, 5.0)
     made.open()
     return made
 
 
-def records(mission: Active) -> list[dict[str, Any]]:
+def records(mission: ActiveMission) -> list[dict[str, Any]]:
     return [dict(line.record or {}) for line in journal.read(mission.folder.node.journal)]
 
 
-def walk(mission: Active, seconds: range) -> list[Pose]:
+def walk(mission: ActiveMission, seconds: range) -> list[Pose]:
     """One metre a second."""
     return [Pose(mission.start_ns + second * SECOND, float(second), 0.0, 0.5) for second in seconds]
 
 
-def distances(mission: Active) -> list[float]:
+def distances(mission: ActiveMission) -> list[float]:
     return [record['m']['distance_traveled_m'] for record in records(mission) if 'distance_traveled_m' in record.get('m', {})]
 
 
-def test_poses_of_several_threads_come_into_order(mission: Active) -> None:
+def test_poses_of_several_threads_come_into_order(mission: ActiveMission) -> None:
     """Whichever encoder is faster: no way is counted twice and none is lost."""
     node_log, poses = opened(mission), walk(mission, range(60))
     rng = random.Random(1)
@@ -63,16 +63,16 @@ def test_poses_of_several_threads_come_into_order(mission: Active) -> None:
     assert written == [[pose.stamp_ns, pose.x, pose.y, pose.yaw, pose.z] for pose in poses]
 
 
-def test_what_is_of_another_time_is_left_out(mission: Active) -> None:
+def test_what_is_of_another_time_is_left_out(mission: ActiveMission) -> None:
     """Before the start, and at the end after the end."""
     node_log = opened(mission)
     for second in (-1, 1, 9):
         node_log.add(Reading(mission.start_ns + second * SECOND, 'battery_pct', float(second)))
-    node_log.close(Active(mission.folder, 'patrol', mission.start_ns, mission.start_ns + 5 * SECOND))
+    node_log.close(ActiveMission(mission.folder, 'patrol', mission.start_ns, mission.start_ns + 5 * SECOND))
     assert [(record['m'], record['s']) for record in records(mission)] == [({'battery_pct': 1.0}, 1)]
 
 
-def test_a_second_node_goes_on_where_the_first_was_killed(mission: Active) -> None:
+def test_a_second_node_goes_on_where_the_first_was_killed(mission: ActiveMission) -> None:
     """Distance and frames are counted on, and a torn record costs itself alone."""
     first = opened(mission)
     for fact in (*walk(mission, range(5)), Frame(mission.start_ns, JPEG)):
@@ -91,7 +91,7 @@ def test_a_second_node_goes_on_where_the_first_was_killed(mission: Active) -> No
     assert records(mission).count({}) == 1
 
 
-def test_two_nodes_do_not_write_one_journal(mission: Active) -> None:
+def test_two_nodes_do_not_write_one_journal(mission: ActiveMission) -> None:
     """The second is refused for as long as the first has it."""
     first = opened(mission)
     with pytest.raises(BlockingIOError):
@@ -100,7 +100,7 @@ def test_two_nodes_do_not_write_one_journal(mission: Active) -> None:
     opened(mission).close()
 
 
-def test_the_floor_is_what_the_lidar_saw(mission: Active) -> None:
+def test_the_floor_is_what_the_lidar_saw(mission: ActiveMission) -> None:
     """Neither ground nor ceiling nor another frame's points, and a node that comes later adds to it."""
     cloud = np.array([[1, 2, 0.5], [3, 4, 0.0], [5, 6, 2.0], [np.nan, 1, 1]], np.float32)
     for second in range(2):
@@ -115,15 +115,17 @@ def test_the_floor_is_what_the_lidar_saw(mission: Active) -> None:
 @pytest.mark.long('a second of CPU or more')
 def test_the_floor_stays_small() -> None:
     """However long the mission is; what remains is of all of it."""
-    floor, rng = Floor(), np.random.default_rng(1)
+    floor, rng = FloorPlan(), np.random.default_rng(1)
     for second in range(500):
         floor.add(np.column_stack([np.full(20_000, second), rng.random(20_000), np.ones(20_000)]).astype(np.float32))
     kept = np.concatenate(floor._parts)
-    assert len(kept) <= MOST_FLOOR_POINTS
+    assert len(kept) <= MAX_FLOOR_POINTS
     assert set(kept[:, 0].tolist()) == set(map(float, range(500)))
 
 
-def test_a_full_disk_costs_a_warning(mission: Active, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_costs_a_warning(
+    mission: ActiveMission, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """It is said once, and nothing is raised."""
 
     def full(*_: object) -> None:
@@ -138,7 +140,7 @@ def test_a_full_disk_costs_a_warning(mission: Active, monkeypatch: pytest.Monkey
     assert caplog.text.count('no space') == 1
 
 
-def test_little_room_costs_frames_alone(mission: Active, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_little_room_costs_frames_alone(mission: ActiveMission, monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes after one in the same second is journalled all the same."""
     node_log = opened(mission)
     monkeypatch.setattr(copies, 'MIN_FREE_BYTES', 1 << 60)

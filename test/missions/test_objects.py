@@ -91,13 +91,13 @@ def test_what_is_held_gets_the_run_s_name(tmp_path: Path, spooler: Spooler, fold
 def test_without_a_node_it_is_delivered(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
     """The folder store has all of it, and the drain is free again afterwards."""
     spooler.add(objects(folder, RUN))
-    assert spooler.owes
+    assert spooler.has_unsent
     spooler.drain()
     assert set(spooled(tmp_path).values()) == {'delivered'}
-    assert spooler.owes, 'their rows of the catalogue'
+    assert spooler.has_unsent, 'their rows of the catalogue'
     spooler.drain()
     assert (tmp_path / 'store/sensor-data/thor/missions/abc/camera/frame_000007.jpg').read_bytes() == b'\xff\xd8one'
-    assert not spooler.owes
+    assert not spooler.has_unsent
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False) as free:
         assert free
 
@@ -108,7 +108,7 @@ def test_beside_a_node_it_is_the_node_s(tmp_path: Path, spooler: Spooler, folder
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False):
         spooler.drain()
     assert set(spooled(tmp_path).values()) == {'pending'}
-    assert not spooler.owes
+    assert not spooler.has_unsent
 
 
 def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:

@@ -62,14 +62,14 @@ def test_nothing_is_sent_yet(folder: MissionFolder) -> None:
 @pytest.mark.usefixtures('sender')
 def test_its_pictures_are_being_made(folder: MissionFolder) -> None:
     """With every record in the run and no error, which said nothing before."""
-    delivery = new(folder, pictures=lambda *_: None)
+    delivery = new(folder, make_pictures=lambda *_: None)
     for _ in range(10):
         delivery.track()
         delivery.attach()
         delivery.spool()
     found = said(folder)
     assert (found.unsent, found.last_error) == (0, '')
-    assert found.waiting_for == 'its pictures and its summary, which are being made'
+    assert found.waiting_for == 'its pictures and its summary, which are being created'
     assert 'wait longer' in found.remedy
 
 
@@ -83,7 +83,7 @@ def test_the_node_has_not_finished(folder: MissionFolder) -> None:
         stack.callback(node.close)
         found = said(folder)
     assert 'the node' in found.waiting_for
-    assert 'stopped' in found.remedy
+    assert 'check that the node runs' in found.remedy
 
 
 @pytest.mark.usefixtures('sender')

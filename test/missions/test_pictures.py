@@ -16,7 +16,7 @@ from PIL import Image
 from shadowhound_data_logger.missions import pictures
 from shadowhound_data_logger.missions.folder import MissionFolder, missions, read_json
 from shadowhound_data_logger.missions.journal import Journal
-from shadowhound_data_logger.missions.pictures import NAMES, Drawing, make, material_of, read_path
+from shadowhound_data_logger.missions.pictures import NAMES, PictureProcess, make, picture_data, read_path
 
 WIDTH = 800
 
@@ -88,11 +88,11 @@ def test_the_node_s_data_stand_in(tmp_path: Path) -> None:
     (folder.node.files / 'a.jpg').write_bytes(jpeg(1))
     node = Journal(folder.node.journal)
     node.create()
-    start_ns = material_of(folder).start_ns
+    start_ns = picture_data(folder).start_ns
     node.append({'k': 'frame', 't': start_ns + 10**9, 'id': 4, 'file': 'a.jpg', 'artifact': True})
     node.append({'k': 'metrics', 't': start_ns + 10**9, 's': 0, 'm': {'battery_pct': 1.0, 'temperature_c': 2.0}})
     node.close()
-    found = material_of(folder)
+    found = picture_data(folder)
     assert [frame[1:] for frame in found.frames] == [(4, folder.node.files / 'a.jpg')]
     assert [value for _, value in found.states['battery_pct']] == [90.0, 89.0, 88.0]
 
@@ -128,12 +128,12 @@ def test_a_speed_is_no_noise() -> None:
 def test_a_process_draws(tmp_path: Path) -> None:
     """Nobody waits for it; its notes stay, and a later sender does not draw again."""
     folder = fly(tmp_path, rows=path())
-    here = Drawing()
-    assert here.of(folder, 'patrol_1') is None
+    here = PictureProcess()
+    assert here.make(folder, 'patrol_1') is None
     assert here.busy
-    assert until(lambda: here.of(folder, 'patrol_1'), 'the pictures are made') == dict.fromkeys(NAMES, '')
+    assert until(lambda: here.make(folder, 'patrol_1'), 'the pictures are made') == dict.fromkeys(NAMES, '')
     assert not here.busy
-    assert Drawing().of(folder, 'patrol_1') == dict.fromkeys(NAMES, '')
+    assert PictureProcess().make(folder, 'patrol_1') == dict.fromkeys(NAMES, '')
     assert all((folder.files / name).is_file() for name in NAMES)
 
 
@@ -145,13 +145,13 @@ def test_a_process_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     monkeypatch.setattr(pictures, 'PROGRAM', program)
     now = [0.0]
-    here = Drawing(monotonic=lambda: now[0])
+    here = PictureProcess(monotonic=lambda: now[0])
     folder = fly(tmp_path / 'a', frames=0, states=0)
-    assert here.of(folder, 'patrol_1') is None
+    assert here.make(folder, 'patrol_1') is None
     now[0] = pictures.DEADLINE_S + 1
-    notes = until(lambda: here.of(folder, 'patrol_1'), 'it is given up')
+    notes = until(lambda: here.make(folder, 'patrol_1'), 'it is given up')
     assert set(notes) == set(NAMES)
-    assert 'the process that makes them exited with' in notes['battery.png']
+    assert 'the process that creates the pictures exited with' in notes['battery.png']
     assert not here.busy
 
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from missions.fakes import FakeDrawing, FakeSpooler, FakeTracking, journalling
+from missions.fakes import FakePictures, FakeSpooler, FakeTracking, journalling
 from missions.server import until
 
 from shadowhound_data_logger import MissionDataLogger
@@ -23,7 +23,16 @@ from shadowhound_data_logger.core.errors import TrackingUnavailable
 from shadowhound_data_logger.missions.delivery import Delivery
 from shadowhound_data_logger.missions.folder import MISSIONS, MissionFolder, Run, missions, read_json
 from shadowhound_data_logger.missions.overview import report
-from shadowhound_data_logger.missions.replay import KEEP_S, LINGER_S, Gate, Parent, Replay, Successor, open_tracking, run
+from shadowhound_data_logger.missions.replay import (
+    LINGER_S,
+    RETENTION_S,
+    AgentProcess,
+    Replay,
+    RetryGate,
+    SuccessorWatch,
+    open_tracking,
+    run,
+)
 
 
 class Now:
@@ -38,7 +47,7 @@ class Now:
 
 def new_replay(home: Path, tracking: FakeTracking, now: Now | None = None) -> Replay:
     (home / MISSIONS).mkdir(parents=True, exist_ok=True)
-    return Replay(home, tracking, FakeSpooler(), FakeDrawing(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
+    return Replay(home, tracking, FakeSpooler(), FakePictures(), monotonic=now or Now(), rng=random.Random(1))  # type: ignore[arg-type]
 
 
 def fly(home: Path, mission_type: str = 'patrol') -> str:
@@ -58,7 +67,7 @@ def test_all_missions_are_sent(tmp_path: Path) -> None:
     while replay.step():
         pass
     assert [folder.sent().complete for folder in missions(tmp_path)] == [True] * 3
-    assert (len(tracking.runs), replay.owes) == (3, False)
+    assert (len(tracking.runs), replay.has_unsent) == (3, False)
 
 
 @pytest.mark.long('an hour of a simulated outage')
@@ -75,14 +84,14 @@ def test_an_outage_is_probed_ever_more_rarely(tmp_path: Path) -> None:
         now.seconds += 1.0
     assert 60 < len(asked) < 300
     assert max(later - sooner for sooner, later in pairwise(asked)) <= 61
-    assert replay.owes
+    assert replay.has_unsent
     newest = max(missions(tmp_path), key=lambda folder: folder.mission_id)
     assert (report(newest).last_error, report(newest).remedy) == ('away (wait)', 'wait')
     away = False
     replay.retry_now()
     while replay.step():
         pass
-    assert not replay.owes
+    assert not replay.has_unsent
     assert read_json(tmp_path / MISSIONS / 'replay.json')['errors'] == {}
     assert report(newest).complete
 
@@ -137,7 +146,7 @@ def test_a_mission_that_arrived_long_ago_goes(tmp_path: Path) -> None:
     unsent = fly(tmp_path)
     (tmp_path / MISSIONS / unsent / 'sent.json').write_text('{}')
     for mission_id in (old, unsent):
-        os.utime(tmp_path / MISSIONS / mission_id / 'sent.json', (0, time.time() - KEEP_S - 60))
+        os.utime(tmp_path / MISSIONS / mission_id / 'sent.json', (0, time.time() - RETENTION_S - 60))
     new_replay(tmp_path, FakeTracking(fail=lambda _: True)).step()
     assert {folder.mission_id for folder in missions(tmp_path)} == {young, unsent}
 
@@ -169,7 +178,7 @@ def test_a_deleted_run_is_told(tmp_path: Path) -> None:
 def test_pauses_grow_to_a_minute_and_end_with_a_success() -> None:
     """Full jitter: between nothing and the cap, which doubles."""
     now = Now()
-    gate = Gate(now, random.Random(2))
+    gate = RetryGate(now, random.Random(2))
     longest = 0.0
     for _ in range(200):
         gate.failed(OSError('away'))
@@ -193,7 +202,7 @@ def test_it_ends_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     )
     reader, writer = os.pipe()
     os.close(writer)
-    parent = Parent(reader)
+    parent = AgentProcess(reader)
     parent.wait(0.0)
     assert parent.gone
     run(new_replay(tmp_path, FakeTracking(fail=lambda _: True), now), parent, lambda: False)
@@ -207,7 +216,7 @@ def test_it_ends_after_its_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_byte_wakes_it() -> None:
     """And the end of its input is that of the agent."""
     reader, writer = os.pipe()
-    parent = Parent(reader)
+    parent = AgentProcess(reader)
     os.write(writer, b'\n')
     assert parent.wait(60.0)
     assert not parent.wait(0.0)
@@ -235,17 +244,17 @@ def test_one_whose_agent_is_gone_makes_way_for_another(tmp_path: Path) -> None:
     """As soon as somebody waits; while its own agent lives it does not, and a request that hangs ends with its process."""
     waiting, ends = tmp_path / 'replay.waiting', threading.Event()
     reader, writer = os.pipe()
-    parent = Parent(reader)
-    successor = Successor(waiting, parent, lambda _: ends.set())
+    parent = AgentProcess(reader)
+    successor = SuccessorWatch(waiting, parent, lambda _: ends.set())
     successor.start()
     try:
         with flock(waiting, shared=True):
             fly(tmp_path)
             replay, looks = new_replay(tmp_path, FakeTracking(fail=lambda _: True)), iter([False, False, True])
-            run(replay, parent, lambda: successor.waits or next(looks))
-            assert not successor.waits
+            run(replay, parent, lambda: successor.is_waiting or next(looks))
+            assert not successor.is_waiting
             os.close(writer)
-            run(replay, parent, lambda: successor.waits)
+            run(replay, parent, lambda: successor.is_waiting)
             assert ends.wait(60.0)
     finally:
         successor.stop()
@@ -275,7 +284,7 @@ def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path:
 
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sender that dies is replaced after a pause, it is not a zombie meanwhile, and none is left after its logger."""
-    monkeypatch.setattr('shadowhound_data_logger.missions.child.AGAIN_S', 0.1)
+    monkeypatch.setattr('shadowhound_data_logger.missions.child.RESTART_PAUSE_S', 0.1)
     monkeypatch.setattr('shadowhound_data_logger.missions.child.interpreter', lambda: '/bin/false')
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
     try:
@@ -350,8 +359,8 @@ def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> No
         return True
 
     (tmp_path / MISSIONS).mkdir(exist_ok=True)
-    replay = Replay(tmp_path, FakeTracking(), FakeSpooler(), FakeDrawing(), settle=settle)  # type: ignore[arg-type]
+    replay = Replay(tmp_path, FakeTracking(), FakeSpooler(), FakePictures(), settle=settle)  # type: ignore[arg-type]
     while replay.step():
         pass
     assert {folder.mission_id: folder.sent().complete for folder in missions(tmp_path)} == {rotten: False, whole: True}
-    assert replay.owes
+    assert replay.has_unsent

@@ -103,7 +103,7 @@ def test_what_the_agent_logged_stands_where_it_states_nothing(
         mission = logger._mission
         assert mission is not None
         mission.end(True, stated)
-        logger._leave(mission)
+        logger._detach(mission)
     tracking = FakeTracking()
     deliver(next(missions(tmp_path)), tracking)
     newest = max((point for point in tracking.points if point.key == 'distance_m'), key=lambda point: (point.step, point.time_ms))

@@ -17,7 +17,7 @@ from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.missions.folder import MissionSent, Run, missions
 from shadowhound_data_logger.missions.pictures import make
-from shadowhound_data_logger.missions.state import MOST_POLICIES, MissionState, summary_of
+from shadowhound_data_logger.missions.state import MAX_POLICIES, MissionState, summary_of
 from shadowhound_data_logger.policies.folder import PolicyFolder
 
 OLD, NEW = 'go2_patrol@6#fedcba9876543210', 'go2_patrol@7#0123456789abcdef'
@@ -98,9 +98,9 @@ def test_a_rollback_within_a_mission_is_in_all_that_is_said_of_it(tmp_path: Path
 def test_one_that_changes_without_end_is_bounded(tmp_path: Path) -> None:
     story = MissionState()
     story.add({'k': 'start', 't': 0, 'type': 'patrol', 'command': '', 'robot': 'thor', 'policy': NEW})
-    for number in range(10 * MOST_POLICIES):
+    for number in range(10 * MAX_POLICIES):
         story.add({'k': 'policy', 't': number, 'policy': (OLD, NEW)[number % 2]})
-    assert len(story.policies) == MOST_POLICIES
+    assert len(story.policies) == MAX_POLICIES
     assert story.final_params()['policies'].startswith(f'{NEW}, {OLD}, {NEW}')
 
 
@@ -115,7 +115,7 @@ def test_a_full_disk_delays_what_is_noted(tmp_path: Path, logger: MissionDataLog
         raise OSError(28, 'No space left on device')
 
     with monkeypatch.context() as patch:
-        patch.setattr(mission._journal, 'append', full)
+        patch.setattr(mission._recorder._journal, 'append', full)
         activate(tmp_path, OLD)
         mission.sync()
     logger.end_mission(True, 1.0, 2.0)

@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject
 from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.missions.active import THIS_MACHINE, Active, MissionFinder, ended
+from shadowhound_data_logger.missions.active import THIS_MACHINE, ActiveMission, MissionFinder, ended
 from shadowhound_data_logger.missions.dating import now_ns
 from shadowhound_data_logger.missions.node_log import NodeLog
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
@@ -58,9 +58,9 @@ class MissionWatch:
         self._tell = tell
         self._finder = MissionFinder(settings.home, settings.robot)
         self._policies = PolicyFolder(settings.home)
-        self._mission: Active | None = None
+        self._mission: ActiveMission | None = None
         self._marks: Mapping[str, str] = {}
-        self._last: tuple[Active, Mapping[str, str]] | None = None
+        self._last: tuple[ActiveMission, Mapping[str, str]] | None = None
         self._log: NodeLog | None = None
         self._due_s = 0.0
         self._wake = threading.Event()
@@ -113,7 +113,7 @@ class MissionWatch:
     # -- the thread ------------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        found, before = self._finder.look(), self._mission
+        found, before = self._finder.active(), self._mission
         if (found and found.id) != (before and before.id):
             if before is not None:
                 self._leave(before)
@@ -126,7 +126,7 @@ class MissionWatch:
             self._log.write()
         self._wake.wait(LOOK_S)
 
-    def _join(self, mission: Active) -> None:
+    def _join(self, mission: ActiveMission) -> None:
         """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
         self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: mission.mission_type}
         self._find_run(mission)
@@ -144,7 +144,7 @@ class MissionWatch:
         log.info('mission %s is active', mission.id)
         self._tell(self.status())
 
-    def _leave(self, mission: Active) -> None:
+    def _leave(self, mission: ActiveMission) -> None:
         """Close what is open, so that all of the mission is encoded, and let go of its journal."""
         noticed_ns = now_ns(THIS_MACHINE)
         self._mission = over = ended(mission)
@@ -164,7 +164,7 @@ class MissionWatch:
             return self._intake.flush(FLUSH_S, partial(self._sampler.set_idle, idle=idle))
         return self._intake.flush(FLUSH_S)
 
-    def _find_run(self, mission: Active) -> bool:
+    def _find_run(self, mission: ActiveMission) -> bool:
         run = mission.folder.run()
         if run is not None:
             self._marks = {**self._marks, words.RUN_ID: run.run_id}
