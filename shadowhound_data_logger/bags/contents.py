@@ -28,7 +28,7 @@ from shadowhound_data_logger.formats.mcap.format import CDR, ROS2
 from shadowhound_data_logger.formats.mcap.index import McapIndex, read_index, read_profile, read_summary
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, read_whole
-from shadowhound_data_logger.formats.mcap.rosbag2_metadata import in_numbers
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import qos_in_numbers
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 
 THREADS: Final = 8
@@ -435,7 +435,7 @@ def _channel(fields: Sequence[Any], known: Mapping[str, tuple[str, str]]) -> Cha
     if not definition or encoding not in {'ros2msg', 'ros2idl'}:  # rosbag2 has the encoding "unknown" as well
         encoding, definition, found = describe(kind)
         type_hash = type_hash or found
-    return Channel(topic, kind, encoding, definition, type_hash, in_numbers(qos), message_encoding)
+    return Channel(topic, kind, encoding, definition, type_hash, qos_in_numbers(qos), message_encoding)
 
 
 def check_tables(path: Path) -> None:

@@ -17,7 +17,7 @@ from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.untrusted import check_size, from_yaml
-from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo, counted
+from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo, count_by_channel
 
 MAX_QOS_BYTES: Final = 64 << 10
 """Of one topic's profiles: some 200 publishers."""
@@ -97,10 +97,10 @@ def of_metadata(content: bytes, name: str, there: Container[str] = ()) -> Descri
 def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed: Description | None) -> Description:
     """From what the files hold, by name, and what the metadata claims of the bag as a whole.
 
-    Files that are absent or damaged are not counted.
+    Files that are absent or damaged are not count_by_channel.
     """
     topics: dict[tuple[str, str], DescribedTopic] = {}
-    for channel, count in counted(each for one in infos.values() for each in one.channels.items()).items():
+    for channel, count in count_by_channel(each for one in infos.values() for each in one.channels.items()).items():
         name, qos = (channel.topic, channel.type), profiles(channel.qos)
         known = topics.setdefault(name, DescribedTopic(*name, 0, (), channel.type_hash))
         topics[name] = replace(

@@ -14,7 +14,7 @@ from typing import Final
 from shadowhound_data_logger.bags.naming import BAGS, BUCKET, prefix_of
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
-from shadowhound_data_logger.formats.mcap.writer import OPEN
+from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
@@ -41,7 +41,7 @@ class UnsentFile:
     @property
     def is_open(self) -> bool:
         """Whether it is still being written."""
-        return self.name.endswith(OPEN)
+        return self.name.endswith(OPEN_SUFFIX)
 
 
 def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
@@ -64,7 +64,7 @@ def given_up(home: Path, robot: str) -> Counter[str]:
 
 def _recording(folder: Path) -> Iterator[UnsentFile]:
     for path in sorted(folder.glob('*/*')):
-        if path.name.endswith(('.mcap', f'.mcap{OPEN}')):
+        if path.name.endswith(('.mcap', f'.mcap{OPEN_SUFFIX}')):
             try:
                 yield UnsentFile(path.parent.name, path.name, RECORDING, path.stat().st_size, path=path)
             except FileNotFoundError:

@@ -30,7 +30,7 @@ from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.recovery import recover
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
-from shadowhound_data_logger.formats.mcap.writer import OPEN, SliceWriter
+from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX, SliceWriter
 from shadowhound_data_logger.spool.retention import NO_ROOM
 
 log = logging.getLogger(__name__)
@@ -198,7 +198,7 @@ class Recording:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.abort()
-            writer.path.with_name(writer.path.name + OPEN).replace(writer.path.with_name(writer.path.name + ENDED))
+            writer.path.with_name(writer.path.name + OPEN_SUFFIX).replace(writer.path.with_name(writer.path.name + ENDED))
 
     # -- slices ----------------------------------------------------------------------------------------------------
 
@@ -222,7 +222,7 @@ class Recording:
             return False
         path = self.state.folder / slice_file(self.state.folder.name, self.number + 1)
         try:
-            path.with_name(path.name + OPEN).unlink(missing_ok=True)  # what a try that failed has left
+            path.with_name(path.name + OPEN_SUFFIX).unlink(missing_ok=True)  # what a try that failed has left
             writer = SliceWriter(path, compression=self._settings.compression, ros_distro=ros_distro())
             try:
                 writer.add_metadata(RECORD, self.state.record(self._place.spool.owner, self.number + 1))
@@ -246,7 +246,7 @@ class Recording:
         writer, self._writer = self._writer, None
         assert writer is not None
         writer.abort()
-        self._broken.append((writer.path.with_name(writer.path.name + OPEN), self._written, _reason(error)))
+        self._broken.append((writer.path.with_name(writer.path.name + OPEN_SUFFIX), self._written, _reason(error)))
         self._written = Counter()
         self._refuse(_reason(error), str(error))
 
@@ -255,7 +255,7 @@ class Recording:
         while self._broken:
             path, written, reason = self._broken[0]
             try:
-                final = path.with_name(path.name.removesuffix(OPEN))
+                final = path.with_name(path.name.removesuffix(OPEN_SUFFIX))
                 info = recover(path, ros_distro=ros_distro()) if path.exists() else None
             except OSError as error:
                 self._refuse(_reason(error), str(error))

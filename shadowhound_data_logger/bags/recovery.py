@@ -37,7 +37,7 @@ from shadowhound_data_logger.formats.mcap.index import read_index, read_metadata
 from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.formats.mcap.recovery import read_info, recover
-from shadowhound_data_logger.formats.mcap.writer import OPEN
+from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.span import MAX_RANGES, NumberRun
 
@@ -195,7 +195,7 @@ class BagRecovery:
     def _complete(self, state: BagState) -> bool:
         """False for one that waits for its date."""
         self._keep(state)
-        for path in self._slices(state, OPEN):
+        for path in self._slices(state, OPEN_SUFFIX):
             self._recover(state, path)
         if not self._place.settle(state):
             return False

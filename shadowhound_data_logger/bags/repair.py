@@ -32,7 +32,7 @@ from shadowhound_data_logger.formats.mcap.ranges import LocalFile, read_whole
 from shadowhound_data_logger.formats.mcap.repair import Loss, McapRepair, examine, repair
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
-from shadowhound_data_logger.formats.mcap.writer import OPEN
+from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
 
 REPAIRED: Final = '_repaired'
 """Appended to the name of the bag or file, unless another output is requested."""
@@ -114,7 +114,7 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
         raise _taken(out)
     files = {name: each for name, each in files_of(path).items() if not name.endswith(UNFINISHED)}
     claimed, raw, remarks = _metadata(files)
-    open_slices = [name for name in files if name.endswith(MCAP + OPEN) and name.removesuffix(OPEN) not in files]
+    open_slices = [name for name in files if name.endswith(MCAP + OPEN_SUFFIX) and name.removesuffix(OPEN_SUFFIX) not in files]
     names = sorted({*slices_of(list(files), claimed), *open_slices}, key=natural)
     if not names:
         raise no_bag(path)
@@ -183,7 +183,7 @@ def _beside(path: Path) -> Path:
 def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
     """What is wrong with a file, without writing anything."""
     look = _look(path)
-    size, is_open = look[0], name.endswith(OPEN)
+    size, is_open = look[0], name.endswith(OPEN_SUFFIX)
     if name.endswith((SQLITE, PACKED)):
         try:
             info = opened(LocalFile(path)).check()
@@ -200,7 +200,7 @@ def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
             info = None if report.is_damaged else found.info
         except BagDamaged as error:
             info, report = None, FileRepair(name, size, None, lost_messages=None, failed=error.what)
-    return _Found(name, path, name.removesuffix(OPEN), report, info, look=look)
+    return _Found(name, path, name.removesuffix(OPEN_SUFFIX), report, info, look=look)
 
 
 def _look(path: Path) -> tuple[int, int]:

@@ -39,8 +39,8 @@ from shadowhound_data_logger.core.errors import BagDamaged, NameRefused
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceRow
 from shadowhound_data_logger.core.untrusted import from_json
-from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo, counted
-from shadowhound_data_logger.formats.mcap.writer import OPEN
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo, count_by_channel
+from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
 from shadowhound_data_logger.spool.accounts import BAG, EVENT
 
 log = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class BagState:
 
     def add_slice(self, info: SliceInfo) -> RecordingRows:
         """A slice was closed."""
-        channels = counted(
+        channels = count_by_channel(
             (self._channels.setdefault(_kind(channel), replace(channel, definition='')), count)
             for channel, count in info.channels.items()
         )
@@ -194,7 +194,7 @@ class BagState:
 
     def remove(self) -> None:
         """All is durable in the spool, which may be about to remove the slices it linked. Raises OSError."""
-        for suffix in (OPEN, ENDED):
+        for suffix in (OPEN_SUFFIX, ENDED):
             for path in self.folder.glob(f'*{suffix}'):
                 path.unlink(missing_ok=True)
         for file in self.slices:

@@ -199,7 +199,7 @@ def test_a_torn_file_of_a_split_bag(tmp_path: Path) -> None:
     for verb in (['info'], ['verify'], ['cut', '--to', str(tmp_path / 'cli')]):
         ran = CliRunner().invoke(bag, [*verb, f'{folder}/'], standalone_mode=False)
         assert (ran.return_value, 'b_1.mcap' in ran.output) == (1, True)
-        assert ' '.join(ran.output.split()).count('b_1.mcap has no end of an MCAP file') == 1
+        assert ' '.join(ran.output.split()).count('b_1.mcap is truncated: the end of the MCAP file is missing') == 1
 
 
 def test_a_message_at_0_that_the_statistics_do_not_have(tmp_path: Path) -> None:

@@ -115,14 +115,14 @@ DAMAGED = {
     'channel redefined': ([SCHEMA, CHANNEL, message(1), Channel(1, '/other', 'cdr', {}, 1)], 'defined twice'),
     'schema redefined': ([SCHEMA, CHANNEL, message(1), Schema(1, b'int32 data', STRING[1], STRING[0])], 'defined twice'),
     'schema 0': ([Schema(0, b'', '', '')], 'schema 0'),
-    'no schema': ([CHANNEL, message(1)], 'without their schema|does not define before'),
-    'no channel': ([SCHEMA, message(1)], 'does not define before'),
-    'channel after its message': ([SCHEMA, message(1), CHANNEL], 'does not define before'),
+    'no schema': ([CHANNEL, message(1)], 'without their schema|before the definition'),
+    'no channel': ([SCHEMA, message(1)], 'before the definition'),
+    'channel after its message': ([SCHEMA, message(1), CHANNEL], 'before the definition'),
     'wrong CRC': ([chunk(SCHEMA, CHANNEL, message(1), crc=7)], 'CRC-32'),
     'unknown compression': ([Chunk('br', b'x', 1, 1, 0, 9)], "'br'"),
     'short message': ([SCHEMA, CHANNEL, raw(Opcode.MESSAGE, b'1234')], 'message of 4 bytes'),
     'zeros': ([SCHEMA, CHANNEL, message(1), bytes(18)], 'zeros'),
-    'torn record': ([SCHEMA, CHANNEL, message(1), struct.pack('<BQ', 5, 1 << 40)], 'torn record'),
+    'torn record': ([SCHEMA, CHANNEL, message(1), struct.pack('<BQ', 5, 1 << 40)], 'truncated record'),
 }
 
 

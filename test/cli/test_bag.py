@@ -236,7 +236,7 @@ def test_repair(tmp_path: Path) -> None:
     torn.write_bytes(torn.read_bytes()[:-100_000])
     found = run(tmp_path, 'repair', folder)
     assert found.return_value == 1
-    for text in (f'{NAME}_repaired: ', '1 of them damaged', 'a chunk that is torn', 'rebuilt: the summary and the footer'):
+    for text in (f'{NAME}_repaired: ', '1 of them damaged', 'a truncated chunk', 'rebuilt: the summary and the footer'):
         assert text in found.output
     assert run(tmp_path, 'verify', f'{folder}_repaired', '--deep').return_value == 0
     told = said(run(tmp_path, 'repair', folder, '--to', tmp_path / 'other', '--json'))

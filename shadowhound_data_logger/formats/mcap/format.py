@@ -1,4 +1,4 @@
-"""MCAP as rosbag2 writes it: the bytes of its records, without files. The format is https://mcap.dev/spec."""
+"""MCAP as rosbag2 writes it: the bytes of its records, without file access. The format: https://mcap.dev/spec."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from shadowhound_data_logger.formats.mcap.slice_info import Channel, Damage, SliceInfo, counted
+from shadowhound_data_logger.formats.mcap.slice_info import Channel, Damage, SliceInfo, count_by_channel
 
 MAGIC: Final = b'\x89MCAP0\r\n'
 LIBRARY: Final = 'shadowhound_data_logger'
@@ -21,26 +21,26 @@ MESSAGE: Final = struct.Struct('<BQHIQQ')
 """A message up to its data: opcode and length, channel, sequence, log time, publish time."""
 MESSAGE_FIELDS: Final = MESSAGE.size - RECORD.size
 CHUNK: Final = struct.Struct('<QQQI')
-"""Start, end, uncompressed size, CRC; then follow the name of the compression and the data."""
+"""Start, end, uncompressed size, CRC; the name of the compression and the data follow."""
 _STATISTICS: Final = struct.Struct('<QHIIIIQQ')
 _FOOTER: Final = struct.Struct('<QQI')
 _PLACE: Final = struct.Struct('<HQ')
 _COUNTED: Final = struct.Struct('<HI')
 ROS2: Final = 'ros2'
-"""The profile in the header of a file that rosbag2 can read."""
+"""The profile in the header of files that rosbag2 can read."""
 CDR: Final = 'cdr'
 REPEATED: Final = 'shadowhound_repeated'
-"""In the metadata of a channel: see ``Channel.repeated``."""
+"""Key in the metadata of a channel: see ``Channel.repeated``."""
 
 
 def record(op: int, *parts: bytes) -> bytes:
-    """One record, its length in front."""
+    """One record with its opcode and length."""
     body = b''.join(parts)
     return RECORD.pack(op, len(body)) + body
 
 
 def text(value: str) -> bytes:
-    """A string, its length in front. What is not UTF-8 (a lone surrogate) is replaced."""
+    """A string with its length. Characters that UTF-8 cannot encode (lone surrogates) are replaced."""
     encoded = value.encode(errors='replace')
     return struct.pack('<I', len(encoded)) + encoded
 
@@ -52,7 +52,7 @@ def mapping(values: Mapping[str, str]) -> bytes:
 
 
 def definition_bytes(definition: str) -> bytes:
-    """The bytes of a schema, which ``Schemas`` decoded losslessly even if they are not text."""
+    """The bytes of a schema; ``Schemas`` decodes losslessly even if they are not text."""
     try:
         return definition.encode(errors='surrogateescape')
     except UnicodeEncodeError:
@@ -60,13 +60,13 @@ def definition_bytes(definition: str) -> bytes:
 
 
 def head(profile: str = ROS2) -> bytes:
-    """What a slice begins with: the same for all that the node records, so that recovery knows where the records begin."""
+    """The start of a slice. It is the same in all slices that the node records, so recovery knows where the records start."""
     return MAGIC + record(Opcode.HEADER, text(profile), text(LIBRARY))
 
 
 @dataclass(slots=True)
 class ChannelTrack:
-    """A channel while its slice is written: messages of whole chunks, and the index of the open chunk (time, offset, ...)."""
+    """A channel of an open slice: the message count of complete chunks, and the index of the open chunk (time, offset, ...)."""
 
     number: int
     channel: Channel
@@ -75,13 +75,13 @@ class ChannelTrack:
 
 
 def span(tracks: Sequence[ChannelTrack]) -> tuple[int, int]:
-    """The first and the last log time in the open chunk, which has messages in each of these tracks."""
+    """The first and the last log time in the open chunk, which must have messages in each of these tracks."""
     return min(min(track.index[::2]) for track in tracks), max(max(track.index[::2]) for track in tracks)
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkPacking:
-    """How a chunk's records lie in the file."""
+    """The compression and sizes of a chunk's records."""
 
     compression: str
     compressed: int
@@ -90,26 +90,26 @@ class ChunkPacking:
 
 @dataclass(slots=True)
 class Contents:
-    """What a slice holds so far; becomes the summary at its end. Owned by the thread that writes the slice."""
+    """The contents of a slice so far, which become its summary. Owned by the thread that writes the slice."""
 
     tracks: dict[int, ChannelTrack] = field(default_factory=dict)
     schemas: dict[int, bytes] = field(default_factory=dict)
-    """Record by schema id."""
+    """Schema records by id."""
     declared: dict[int, bytes] = field(default_factory=dict)
-    """Record of each channel."""
+    """Channel records by id."""
     chunks: list[bytes] = field(default_factory=list)
-    """Chunk index records, in the order of the file."""
+    """Chunk index records in file order."""
     metadata: list[bytes] = field(default_factory=list)
-    """Metadata index records, the same."""
+    """Metadata index records in file order."""
     attachments: list[bytes] = field(default_factory=list)
-    """Attachment index records, the same."""
+    """Attachment index records in file order."""
     messages: int = 0
     t_start_ns: int = 0
     t_end_ns: int = 0
     _schema_ids: dict[tuple[str, str, str], int] = field(default_factory=dict)
 
     def declare(self, channel: Channel) -> tuple[ChannelTrack, bytes]:
-        """A channel of its own, with the records that must precede its first message."""
+        """Add a channel; returns its track, and the records that must precede its first message."""
         schema, records = (channel.type, channel.encoding, channel.definition), b''
         number = self._schema_ids.get(schema) if any(schema) else 0
         if number is None:
@@ -118,16 +118,16 @@ class Contents:
             fields = struct.pack('<H', number), text(channel.type), text(channel.encoding), struct.pack('<I', len(data))
             self.schemas[number] = records = record(Opcode.SCHEMA, *fields, data)
         track = ChannelTrack(len(self.tracks) + 1, channel)
-        said = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
-        said = {name: value for name, value in said.items() if value}
-        said |= {**dict(channel.metadata), **({REPEATED: 'true'} if channel.repeated else {})}
+        metadata = {'offered_qos_profiles': channel.qos, 'topic_type_hash': channel.type_hash}
+        metadata = {name: value for name, value in metadata.items() if value}
+        metadata |= {**dict(channel.metadata), **({REPEATED: 'true'} if channel.repeated else {})}
         names = text(channel.topic), text(channel.message_encoding)
-        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), *names, mapping(said))
+        declared = record(Opcode.CHANNEL, struct.pack('<HH', track.number, number), *names, mapping(metadata))
         self.tracks[track.number], self.declared[track.number] = track, declared
         return track, records + declared
 
-    def chunk(self, at: int, packed: ChunkPacking, tracks: Sequence[ChannelTrack]) -> bytes:
-        """Take in a chunk that begins at the offset ``at``: the message index records that follow it, one for each track."""
+    def add_chunk(self, at: int, packed: ChunkPacking, tracks: Sequence[ChannelTrack]) -> bytes:
+        """Add a chunk that starts at the offset ``at``; returns the message index records after it, one for each track."""
         start, end = span(tracks) if tracks else (0, 0)
         length = RECORD.size + CHUNK.size + 4 + len(packed.compression) + 8 + packed.compressed
         indexes, offsets, messages = bytearray(), bytearray(), self.messages
@@ -148,30 +148,30 @@ class Contents:
         return bytes(indexes)
 
     def extend(self, start: int, end: int) -> None:
-        """Include the log times of messages that are about to be counted."""
+        """Include the log times of messages that are about to be count_by_channel."""
         self.t_start_ns, self.t_end_ns = (min(self.t_start_ns, start), max(self.t_end_ns, end)) if self.messages else (start, end)
 
     def add_metadata(self, at: int, length: int, name: str) -> None:
-        """Take in a metadata record that begins at the offset ``at``; ``length`` is that of the whole record."""
+        """Add a metadata record that starts at the offset ``at``; ``length`` is that of the whole record."""
         self.metadata.append(record(Opcode.METADATA_INDEX, struct.pack('<QQ', at, length), text(name)))
 
     def info(self, path: Path, size: int = 0, sha256: str = '', damage: Damage | None = None) -> SliceInfo:
-        """What is known of the slice, its channels in the order in which they were declared."""
-        channels = counted((track.channel, track.count) for track in self.tracks.values())
+        """The description of the slice, with its channels in the order of their declarations."""
+        channels = count_by_channel((track.channel, track.count) for track in self.tracks.values())
         return SliceInfo(path, size, sha256, self.t_start_ns, self.t_end_ns, self.messages, channels, damage)
 
     def add_attachment(self, at: int, length: int, name: str, media_type: str, size: int, times: tuple[int, int]) -> None:
-        """Take in an attachment record; ``size`` is that of its content, ``times`` are log and creation time."""
+        """Add an attachment record; ``size`` is that of its content, ``times`` are log time and creation time."""
         numbers = struct.pack('<QQQQQ', at, length, *times, size)
         self.attachments.append(record(Opcode.ATTACHMENT_INDEX, numbers, text(name), text(media_type)))
 
     def ending(self, at: int, metadata: str | None) -> bytes:
-        """All that follows the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
-        said = b''
+        """Everything after the last chunk, which ends at the offset ``at``: rosbag2's metadata, the summary, the footer."""
+        data = b''
         if metadata is not None:
-            said = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
-            self.add_metadata(at, len(said), 'rosbag2')
-        data = said + record(Opcode.DATA_END, struct.pack('<I', 0))
+            data = record(Opcode.METADATA, text('rosbag2'), mapping({'serialized_metadata': metadata}))
+            self.add_metadata(at, len(data), 'rosbag2')
+        data += record(Opcode.DATA_END, struct.pack('<I', 0))
         groups = {
             Opcode.SCHEMA: b''.join(self.schemas.values()),
             Opcode.CHANNEL: b''.join(self.declared.values()),
@@ -191,7 +191,7 @@ class Contents:
         return data + tail + struct.pack('<I', zlib.crc32(tail)) + MAGIC
 
     def _statistics(self) -> bytes:
-        counted = b''.join(_PLACE.pack(number, track.count) for number, track in self.tracks.items())
+        counts = b''.join(_PLACE.pack(number, track.count) for number, track in self.tracks.items())
         numbers = self.messages, len(self.schemas), len(self.tracks), len(self.attachments), len(self.metadata), len(self.chunks)
         body = _STATISTICS.pack(*numbers, self.t_start_ns, self.t_end_ns)
-        return record(Opcode.STATISTICS, body, struct.pack('<I', len(counted)), counted)
+        return record(Opcode.STATISTICS, body, struct.pack('<I', len(counts)), counts)

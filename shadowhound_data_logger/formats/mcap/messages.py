@@ -1,6 +1,6 @@
-"""The messages of an MCAP file, with both stamps, in the order in which they were written; only the chunks needed are read.
+"""Reads the messages of an MCAP file, with both stamps, in file order; reads only the chunks that are needed.
 
-Every chunk that is opened is checked against its CRC-32, where the writer left one.
+The CRC-32 of every chunk that is read is checked, if it has one.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from shadowhound_data_logger.formats.mcap.ranges import Ranged
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 
 SPAN_BYTES: Final = 8 << 20
-"""Neighbouring chunks are read with one request up to this size."""
+"""Adjacent chunks are read with one request up to this size."""
 GAP_BYTES: Final = 256 << 10
-"""So much that nobody asked for costs less than another request."""
+"""Up to this many unneeded bytes are cheaper than another request."""
 READ_AHEAD: Final = 4
-"""Spans that are read at the same time, while the first of them is unpacked."""
+"""Requests in flight while the first one is unpacked."""
 
 
 class RecordedMessage(NamedTuple):
-    """One message as it was recorded."""
+    """One recorded message."""
 
     channel: Channel
     log_ns: int
-    """When it was received: the time that rosbag2 and its players go by."""
+    """When it was received: the time that rosbag2 and its players use."""
     publish_ns: int
     sequence: int
     cdr: bytes
@@ -49,7 +49,7 @@ class RecordedMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MessageFilter:
-    """Which messages: from ``start_ns``, before ``end_ns``, of the channels that ``channel`` says yes to."""
+    """Selects messages from ``start_ns``, before ``end_ns``, of the channels for which ``channel`` returns True."""
 
     start_ns: int
     end_ns: int
@@ -57,7 +57,7 @@ class MessageFilter:
 
 
 def read_messages(source: Ranged, index: McapIndex, wanted: MessageFilter) -> Iterator[RecordedMessage]:
-    """Raises BagDamaged for a chunk that is not what its writer wrote."""
+    """Raises BagDamaged for a damaged chunk."""
     channels = {number: channel for number, channel in index.channels.items() if wanted.channel(channel)}
     chunks = [
         chunk for chunk in (scan(source, index.data_end).chunks if index.chunks is None else index.chunks) or ()
@@ -72,7 +72,7 @@ def read_messages(source: Ranged, index: McapIndex, wanted: MessageFilter) -> It
 
 
 def _records(source: Ranged, chunk: Chunk, content: memoryview) -> memoryview:
-    """Those of a chunk, or those outside chunks as they are."""
+    """The records in a chunk, or consecutive records outside chunks."""
     if not chunk.is_chunk:
         return content
     kind, length = RECORD.unpack_from(content) if len(content) >= RECORD.size else (0, 0)
@@ -91,7 +91,7 @@ def _messages(content: memoryview, channels: dict[int, Channel], wanted: Message
 
 
 def _read_chunks(source: Ranged, chunks: Sequence[Chunk]) -> Iterator[tuple[Chunk, memoryview]]:
-    """Each chunk's record, neighbors together, a few requests ahead."""
+    """Each chunk's record. Reads adjacent chunks together, a few requests ahead."""
     reading: deque[tuple[list[Chunk], Future[bytes]]] = deque()
     waiting = deque(_spans(chunks))
     pool = ThreadPoolExecutor(READ_AHEAD, 'bag-read')

@@ -1,4 +1,4 @@
-"""Files that are read in pieces, on the disk or in a store. Counts what was read."""
+"""Reads byte ranges of files on the disk or in a store, and counts requests and bytes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 
 class Ranged(Protocol):
-    """A file of ``size`` bytes."""
+    """A file of ``size`` bytes that is read by range."""
 
     @property
     def name(self) -> str:
@@ -23,7 +23,7 @@ class Ranged(Protocol):
     def size(self) -> int: ...
 
     def read(self, start: int, length: int) -> bytes:
-        """Exactly these bytes. Raises BagDamaged where the file does not have them, StoreError where it cannot be asked."""
+        """Exactly these bytes. Raises BagDamaged if the file does not have them, StoreError if the store cannot be read."""
 
 
 class Meter:
@@ -41,7 +41,7 @@ class Meter:
 
 
 class LocalFile:
-    """A file on the disk. Raises BagDamaged for one that cannot be opened."""
+    """A file on the disk. Raises BagDamaged if it cannot be opened."""
 
     def __init__(self, path: Path, meter: Meter | None = None) -> None:
         self.path = path
@@ -62,11 +62,11 @@ class LocalFile:
         except OSError as error:
             raise BagDamaged(f'{self.path} cannot be read: {error.strerror}', path=str(self.path)) from error
         self._meter.add(len(found))
-        return whole(found, length, self.name, start)
+        return check_length(found, length, self.name, start)
 
 
 class StoredFile:
-    """An object of a store, of a size that is known already."""
+    """An object in a store, whose size is already known."""
 
     def __init__(self, store: ObjectStore, bucket: str, key: str, size: int, meter: Meter | None = None) -> None:
         self.size = size
@@ -84,25 +84,25 @@ class StoredFile:
             return b''
         (found,) = self._store.ranges(self._bucket, self._key, [(start, start + length)])
         self._meter.add(len(found))
-        return whole(found, length, self.name, start)
+        return check_length(found, length, self.name, start)
 
 
 def read_whole(source: Ranged) -> bytes:
-    """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, before it is read."""
+    """The content of a manifest or metadata.yaml. Raises BagDamaged before reading a file that is too large for one."""
     check_document(source.name, source.size)
     return source.read(0, source.size)
 
 
 def check_document(name: str, size: int) -> None:
-    """Raises BagDamaged."""
+    """Raises BagDamaged if a file is too large for a manifest or metadata.yaml."""
     try:
         check_size(size, MOST_DOCUMENT_BYTES)
     except ValueError as error:
         raise BagDamaged(f'{name} is neither a manifest nor metadata: {error}', path=name) from error
 
 
-def whole(found: bytes, length: int, name: str, start: int) -> bytes:
-    """The bytes, if they are as many as were asked for; raises BagDamaged."""
+def check_length(found: bytes, length: int, name: str, start: int) -> bytes:
+    """The bytes, if their number is that requested; otherwise raises BagDamaged."""
     if len(found) != length:
-        raise BagDamaged(f'{name} ends early: of {length} bytes at {start} there are {len(found)}', path=name)
+        raise BagDamaged(f'{name} is truncated: it has {len(found)} of {length} bytes at {start}', path=name)
     return found

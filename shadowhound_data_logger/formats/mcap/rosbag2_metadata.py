@@ -1,7 +1,7 @@
-"""``metadata.yaml`` as rosbag2 writes it: what ``ros2 bag info`` and ``ros2 bag play`` read before any slice.
+"""``metadata.yaml`` as rosbag2 writes it: ``ros2 bag info`` and ``ros2 bag play`` read it before any slice.
 
-Version 8 of the format, QoS in numbers: the newest that Humble reads too (9 made QoS a sequence, on which Humble's reader
-fails); Jazzy and Kilted tell the two forms apart. Source: rosbag2_storage, metadata_io.cpp of Humble, yaml.hpp of Jazzy.
+Version 8 of the format, with numeric QoS policies, is the newest that Humble can read (its reader fails on the QoS sequence of
+version 9); Jazzy and Kilted read both. Source: rosbag2_storage, metadata_io.cpp of Humble, yaml.hpp of Jazzy.
 """
 
 from __future__ import annotations
@@ -19,31 +19,30 @@ VERSION: Final = 8
 STORAGE: Final = 'mcap'
 _INFINITE_NS: Final = (1 << 63) - 1
 WIDTH: Final = 1 << 30
-"""Of a line: none is folded."""
-
+"""Maximum line length, large enough that no line is folded."""
 _POLICIES: Final = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
     'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
     'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown', 'best_available'),
 }
-"""The words of version 9, each in the place of its number (rmw/types.h)."""
-_IN_WORDS: Final = re.compile(rf'\b({"|".join(_POLICIES)})\W{{0,4}}:\W{{0,4}}[a-z]')
+"""The policy names of version 9; their indexes are the numbers of version 8 (rmw/types.h)."""
+_QOS_IN_WORDS: Final = re.compile(rf'\b({"|".join(_POLICIES)})\W{{0,4}}:\W{{0,4}}[a-z]')
 MAX_CACHED_BYTES: Final = 4096
 
 
 def metadata_yaml(slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None) -> bytes:
-    """The whole file for a bag of these slices, in their order; ``ros_distro`` is empty where it is not known."""
-    said = bagfile_information(slices, ros_distro=ros_distro, custom_data=custom_data)
-    return to_yaml({'rosbag2_bagfile_information': said}).encode()
+    """The file for a bag with these slices, in this order; ``ros_distro`` is empty if unknown."""
+    information = bagfile_information(slices, ros_distro=ros_distro, custom_data=custom_data)
+    return to_yaml({'rosbag2_bagfile_information': information}).encode()
 
 
 def bagfile_information(
     slices: Sequence[SliceInfo], *, ros_distro: str, custom_data: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """What rosbag2 calls BagMetadata. A topic with messages of two types appears once with each.
+    """rosbag2's BagMetadata. A topic with messages of two types is listed with each type.
 
-    Of several channels with one topic and type, as merged files have them, the QoS profiles are listed one after the other.
+    If several channels have the same topic and type, as in merged files, their QoS profiles are concatenated.
     """
     start = min((one.t_start_ns for one in slices if one.messages), default=0)
     end = max((one.t_end_ns for one in slices if one.messages), default=0)
@@ -72,19 +71,19 @@ def bagfile_information(
 
 
 def offered_qos(profiles: Iterable[Any]) -> str:
-    """The QoS of a topic's publishers (rclpy's QoSProfile, or what looks like one) as rosbag2 keeps it with the topic."""
+    """The QoS of a topic's publishers (rclpy's QoSProfile or similar) in the form in which rosbag2 stores it with the topic."""
     described = [_profile(profile) for profile in profiles]
     return to_yaml(described).rstrip('\n') if described else ''
 
 
-def in_numbers(qos: str) -> str:
-    """A topic's offered QoS profiles, which bags of Jazzy and Kilted keep in words, as version 8 does; all else stays."""
-    if not _IN_WORDS.search(qos):  # as we write them, and Humble
+def qos_in_numbers(qos: str) -> str:
+    """A topic's offered QoS profiles with the policy names of Jazzy and Kilted replaced by the numbers of version 8."""
+    if not _QOS_IN_WORDS.search(qos):  # written by us or by Humble
         return qos
-    return _in_numbers(qos) if len(qos) > MAX_CACHED_BYTES else _cached_in_numbers(qos)
+    return _convert_qos(qos) if len(qos) > MAX_CACHED_BYTES else _convert_qos_cached(qos)
 
 
-def _in_numbers(qos: str) -> str:
+def _convert_qos(qos: str) -> str:
     try:
         profiles = from_yaml(qos)
     except ValueError:
@@ -95,8 +94,8 @@ def _in_numbers(qos: str) -> str:
     return to_yaml(numbered).rstrip('\n')
 
 
-_cached_in_numbers = functools.lru_cache(256)(_in_numbers)
-"""Parsing takes 3 ms, and the topics of a bag have few profiles that differ."""
+_convert_qos_cached = functools.lru_cache(256)(_convert_qos)
+"""Cached because parsing takes 3 ms and the topics of a bag share few different profiles."""
 
 
 def _number(policy: object, value: Any) -> Any:
@@ -105,8 +104,8 @@ def _number(policy: object, value: Any) -> Any:
 
 
 def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Mappings, sequences, strings and integers as block YAML; strings in double quotes, so that none is misread."""
-    from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not
+    """Mappings, sequences, strings and integers as block YAML; strings are quoted so that readers keep their type."""
+    from ruamel.yaml import YAML  # noqa: PLC0415 - takes 0.1 s, and most callers do not need it
 
     yaml, stream = YAML(), io.StringIO()
     yaml.width = WIDTH
@@ -146,7 +145,7 @@ def _topics(slices: Sequence[SliceInfo]) -> list[dict[str, Any]]:
 
 
 def _merged(profiles: Iterable[str]) -> str:
-    """Those of each channel once; block sequences of YAML follow one another as one."""
+    """The different profiles of all channels; block sequences of YAML are joined by concatenation."""
     found = list(dict.fromkeys(qos for qos in profiles if qos))
     if len(found) > 1 and all(qos.startswith('- ') for qos in found):
         return '\n'.join(qos.rstrip('\n') for qos in found)
@@ -168,6 +167,6 @@ def _profile(profile: Any) -> dict[str, Any]:
 
 
 def _duration(nanoseconds: int) -> dict[str, int]:
-    """A duration of 0 means that none was set, which rosbag2 writes as rmw's infinity: both mean the default."""
+    """A duration of 0 means unset, which rosbag2 writes as rmw's infinity; both mean the default."""
     seconds, rest = divmod(nanoseconds or _INFINITE_NS, 10**9)
     return {'sec': seconds, 'nsec': rest}

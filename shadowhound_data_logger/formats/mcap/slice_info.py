@@ -1,4 +1,4 @@
-"""What a finished slice holds: its channels with their message counts, its times, and what recovery lost."""
+"""The description of a finished slice: its channels with their message counts, its times, and what recovery lost."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic with one type: everything that a reader needs to decode its messages.
+    """One topic with one type, and everything that a reader needs to decode its messages.
 
     ``type`` is the ROS name (``sensor_msgs/msg/Imu``), or the name of another recorder's schema. ``encoding`` is the format of
     ``definition``: ``ros2msg`` or ``ros2idl``, or another recorder's (``protobuf``, ``jsonschema``); all three are empty if the
     type is unknown. A definition that is not text keeps its bytes (``surrogateescape``). ``type_hash`` is ``RIHS01_...``, empty
-    where the distribution has none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, its policies in numbers
-    as Humble reads them, empty if unknown. ``message_encoding`` is the format of the messages. ``metadata`` is the rest of the
-    channel's metadata in the file.
+    if the distribution has none (Humble). ``qos`` is the YAML that rosbag2 calls offered_qos_profiles, with numeric policies,
+    which Humble can read; empty if unknown. ``message_encoding`` is the format of the messages. ``metadata`` is the rest of
+    the channel's metadata in the file.
     """
 
     topic: str
@@ -28,12 +28,12 @@ class Channel:
     message_encoding: str = 'cdr'
     metadata: tuple[tuple[str, str], ...] = ()
     repeated: bool = False
-    """Whether its messages repeat latched messages of earlier slices, so that this slice can be played on its own. They have a
-    channel of their own in addition to that of the topic's other messages."""
+    """Whether its messages repeat latched messages of earlier slices, so that this slice can be played on its own. The topic's
+    other messages have a separate channel."""
 
 
-def counted(channels: Iterable[tuple[Channel, int]]) -> dict[Channel, int]:
-    """The messages of each channel; channels that differ only in their number in the file are one."""
+def count_by_channel(channels: Iterable[tuple[Channel, int]]) -> dict[Channel, int]:
+    """The message count of each channel; channels that differ only in their number in the file are one."""
     found: dict[Channel, int] = {}
     for channel, count in channels:
         found[channel] = found.get(channel, 0) + count
@@ -42,10 +42,10 @@ def counted(channels: Iterable[tuple[Channel, int]]) -> dict[Channel, int]:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What recovery had to leave out of a slice that was not closed.
+    """What recovery could not keep of a slice that was not closed.
 
-    ``tail_bytes`` were written but made no whole chunk; ``chunks`` lie in the middle, broken, and are skipped by readers;
-    ``messages`` is how many of both together are known to be lost, at least. What had not reached the disk leaves no trace.
+    ``tail_bytes`` is the size of an incomplete chunk at the end; ``chunks`` is the number of damaged chunks before it, which
+    readers skip; ``messages`` is the minimum number of messages lost in both. Data that had not reached the disk is not counted.
     """
 
     tail_bytes: int
@@ -72,17 +72,17 @@ class SliceInfo:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages by topic, for what is counted by topic alone: the ledger."""
+        """Message counts by topic, as the ledger needs them."""
         return _by_topic(self.channels.items())
 
     @property
     def repeated(self) -> dict[str, int]:
-        """Those of ``counts`` that are on repeated channels, where there are any."""
+        """Message counts by topic on repeated channels, without zeros."""
         return _by_topic((channel, count) for channel, count in self.channels.items() if channel.repeated and count)
 
     @property
     def recorded(self) -> dict[str, int]:
-        """By topic, the messages that were received while the slice was written: all but the repeated ones."""
+        """Message counts by topic without the repeated ones: messages received while the slice was written."""
         repeated = self.repeated
         return {topic: count - repeated.get(topic, 0) for topic, count in self.counts.items()}
 

@@ -1,4 +1,4 @@
-"""Writes one slice of a bag: an MCAP file as rosbag2 writes it, whole on disk up to the last ``sync`` whatever happens then."""
+"""Writes one slice of a bag: an MCAP file in rosbag2's layout, which survives any crash up to the last ``sync``."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from shadowhound_data_logger.formats.mcap.format import (
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import bagfile_information, to_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 
-OPEN: Final = '.open'
-"""Ends the name of a slice that is being written."""
+OPEN_SUFFIX: Final = '.open'
+"""Suffix of the name of a slice that is being written."""
 DEFAULT_CHUNK_BYTES: Final = 1 << 20
 _MESSAGE: Final = int(Opcode.MESSAGE)
 
 
 class SliceWriter:
-    """Writes one slice, so that a crash costs only what was not synced.
+    """Writes one slice, so that a crash loses only messages that were not synced.
 
-    New; ``write`` and ``sync`` any number of times; ``close`` or ``abort`` once. One thread at a time.
+    Lifecycle: new; ``write`` and ``sync`` any number of times; ``close`` or ``abort`` once. One thread at a time.
 
-    The file is ``<path>.open`` until ``close`` gives it its name. Disk errors are OSErrors; after one, only ``abort`` is left,
-    and recovery makes a whole slice of what was written before.
+    The file is ``<path>.open`` until ``close`` renames it. Disk errors are OSErrors; after one, only ``abort`` is allowed, and
+    recovery makes a complete slice of what was written before.
     """
 
     def __init__(
         self, path: Path, *, compression: str = 'zstd', chunk_bytes: int = DEFAULT_CHUNK_BYTES, ros_distro: str = '',
         mode: int = 0o600, profile: str = ROS2,
     ) -> None:  # fmt: skip
-        """``mode``: the permissions of the file, before the umask. ``profile``: for a copy, that of the original."""
+        """``mode``: permissions of the file, before the umask. ``profile``: a copy has the profile of the original."""
         self.path = path
         self._ros_distro = ros_distro
         if compression not in _COMPRESSORS:
@@ -61,41 +61,41 @@ class SliceWriter:
         self._chunk_bytes = chunk_bytes
         self._contents = Contents()
         self._last: dict[str, tuple[Channel, ChannelTrack]] = {}
-        """The channel of the last message, by topic: looking up a channel takes longer."""
+        """The channel of the last message, by topic: this lookup is faster than hashing a channel."""
         self._tracks: dict[Channel, ChannelTrack] = {}
         self._chunk = bytearray(chunk_bytes)
         self._view = memoryview(self._chunk)
         self._used = 0
         self._declared = b''
-        """Written before the chunk, not into it: when that one is damaged, those after it still have their channels."""
+        """Written before the chunk, not into it: if the chunk is damaged, later chunks still have their channels."""
         self._digest = hashlib.sha256()
         if path.exists():
-            raise FileExistsError(f'{path} is there already')
-        self._open_path = path.with_name(path.name + OPEN)
+            raise FileExistsError(f'{path} already exists')
+        self._open_path = path.with_name(path.name + OPEN_SUFFIX)
         self._file = os.open(self._open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
         self._written = 0
         try:
             self._append(head(profile))
-            sync(path.parent)  # a file that was synced is lost all the same while its folder does not know it
+            sync(path.parent)  # a power cut loses even a synced file if its directory entry was not synced
         except OSError:
             self.abort()
             raise
 
     @property
     def size(self) -> int:
-        """Bytes in the file and in the open chunk, before compression."""
+        """Bytes in the file, plus bytes in the open chunk before compression."""
         return self._written + self._used
 
     def write(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, cdr: bytes) -> None:
-        """Add a message that was received, a copy of ``cdr``.
+        """Add a received message; copies ``cdr``.
 
-        Stamps are Unix nanoseconds; if the publisher's is unknown (0 or less), it is the log time, as MCAP requires.
+        Stamps are Unix nanoseconds; if the publisher's is unknown (0 or less), the log time is used, as MCAP requires.
         """
         log_ns = max(log_ns, 0)
         self.copy(channel, log_ns, publish_ns if publish_ns > 0 else log_ns, sequence, cdr)
 
     def copy(self, channel: Channel, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message of another file with its times unchanged: unsigned, 64 bits."""
+        """Add a message from another file with its times (uint64) unchanged."""
         last = self._last.get(channel.topic)
         track = last[1] if last is not None and last[0] is channel else self._track(channel)
         length, at = len(data), self._used
@@ -110,23 +110,23 @@ class SliceWriter:
         self._used = after
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a metadata record after all that was written; on disk with the next ``sync``."""
+        """Append a metadata record; it is on the disk after the next ``sync``."""
         self._end_chunk()
-        said = record(Opcode.METADATA, text(name), mapping(values))
-        self._contents.add_metadata(self._written, len(said), name)
-        self._append(said)
+        metadata = record(Opcode.METADATA, text(name), mapping(values))
+        self._contents.add_metadata(self._written, len(metadata), name)
+        self._append(metadata)
 
     def sync(self) -> None:
-        """End the chunk and wait until the disk has it."""
+        """End the chunk and wait until it is on the disk."""
         self._end_chunk()
         os.fdatasync(self._file)
 
     def close(self) -> SliceInfo:
-        """End the file and give it its name; it is on disk when this returns."""
+        """Complete and rename the file; it is on the disk when this returns."""
         self._end_chunk()
         contents = self._contents
-        said = bagfile_information([contents.info(self.path)], ros_distro=self._ros_distro)
-        self._append(contents.ending(self._written, to_yaml(said)))
+        metadata = bagfile_information([contents.info(self.path)], ros_distro=self._ros_distro)
+        self._append(contents.ending(self._written, to_yaml(metadata)))
         os.fsync(self._file)
         os.close(self._file)
         self._file = -1
@@ -135,7 +135,7 @@ class SliceWriter:
         return contents.info(self.path, self._written, self._digest.hexdigest())
 
     def abort(self) -> None:
-        """Let go of the file as it is, for recovery; the open chunk is lost. No effect after ``close``."""
+        """Close the file without completing it, for recovery; the open chunk is lost. No effect after ``close``."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -150,7 +150,7 @@ class SliceWriter:
         return track
 
     def _make_room(self, size: int) -> int:
-        """End the chunk; a message larger than a chunk may be becomes one by itself."""
+        """End the chunk; a message larger than the maximum chunk gets a separate one."""
         self._end_chunk()
         if size > len(self._chunk):
             self._chunk = bytearray(size)
@@ -167,7 +167,7 @@ class SliceWriter:
             data, compression = raw, ''
         fields = CHUNK.pack(*span(tracks), len(raw), zlib.crc32(raw)) + text(compression) + struct.pack('<Q', len(data))
         at = self._written + len(self._declared)
-        indexes = self._contents.chunk(at, ChunkPacking(compression, len(data), len(raw)), tracks)
+        indexes = self._contents.add_chunk(at, ChunkPacking(compression, len(data), len(raw)), tracks)
         declared, self._declared = self._declared, b''
         self._used = 0
         self._append(declared + RECORD.pack(Opcode.CHUNK, len(fields) + len(data)) + fields, data, indexes)

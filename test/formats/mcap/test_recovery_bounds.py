@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from profiles import examples
 
-from shadowhound_data_logger.formats.mcap import salvage
+from shadowhound_data_logger.formats.mcap import damage_scan, record_finder, recovery
 from shadowhound_data_logger.formats.mcap.format import CHUNK, Contents, head, record, text
 from shadowhound_data_logger.formats.mcap.recovery import recover
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
@@ -114,7 +114,8 @@ def test_a_chunk_as_large_as_its_file(tmp_path: Path) -> None:
 
 def test_a_summary_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Endless tiny chunks or an endless schema are cut off; endless broken records take no memory."""
-    monkeypatch.setattr(salvage, 'MOST_SUMMARY_BYTES', 3000)
+    for module in (damage_scan, record_finder, recovery):
+        monkeypatch.setattr(module, 'MAX_SUMMARY_BYTES', 3000)
     writer = SliceWriter(tmp_path / 'bag_1.mcap', compression='none')
     written = fill(writer, messages(90), sync_every=1)
     writer.abort()

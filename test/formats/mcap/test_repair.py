@@ -235,7 +235,7 @@ def test_a_torn_chunk_gives_what_can_be_unpacked(tmp_path: Path, compression: Co
     assert 400 < len(held) < 600
     assert held == messages(path)[: len(held)]
     (loss,) = found.losses
-    assert (loss.what, loss.messages, found.lost_messages, found.is_cut) == ('a chunk that is torn', None, None, True)
+    assert (loss.what, loss.messages, found.lost_messages, found.is_cut) == ('a truncated chunk', None, None, True)
     assert (loss.from_ns, loss.to_ns) == (NOON_NS, NOON_NS + 999)
 
 

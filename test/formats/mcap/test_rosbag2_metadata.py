@@ -13,7 +13,7 @@ from bags.slices import TALK
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowhound_data_logger.formats.mcap.rosbag2_metadata import in_numbers, metadata_yaml, offered_qos, to_yaml
+from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml, offered_qos, qos_in_numbers, to_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 
 OTHER = Channel('/späti', 'std_msgs/msg/Empty', '', '', '', '')
@@ -114,11 +114,11 @@ IN_WORDS = """- history: unknown
 
 def test_qos_in_words_becomes_numbers() -> None:
     """Those of rmw/types.h, with all else as it was; numbers stay, and so does what is not a QoS at all."""
-    first, second = yaml.safe_load(in_numbers(IN_WORDS))
+    first, second = yaml.safe_load(qos_in_numbers(IN_WORDS))
     assert first == yaml.safe_load(IN_WORDS)[0] | {'history': 3, 'reliability': 1, 'durability': 1, 'liveliness': 3}
     assert second == {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 2, 'liveliness': 1}
     numbers = offered_qos([profile()])
-    assert yaml.safe_load(in_numbers('- {"durability": "volatile"}  # reliability: reliable')) == [{'durability': 2}]
+    assert yaml.safe_load(qos_in_numbers('- {"durability": "volatile"}  # reliability: reliable')) == [{'durability': 2}]
     for text in (
         numbers,
         '',
@@ -127,7 +127,7 @@ def test_qos_in_words_becomes_numbers() -> None:
         '\x00',
         '- &a {history: *a}',
     ):
-        assert in_numbers(text) == text
+        assert qos_in_numbers(text) == text
 
 
 @pytest.mark.ros
