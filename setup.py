@@ -20,6 +20,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
         ('share/' + PACKAGE, ['package.xml']),
+        ('share/bash-completion/completions', ['resource/completion/shadowhound-data']),
         ('share/' + PACKAGE + '/launch_configs', sorted(str(path) for path in Path('launch_configs').glob('*.*'))),
     ],
     zip_safe=False,

@@ -71,6 +71,15 @@ With `--json` (and `--format json`) an error is one line of JSON on standard err
 A name that does not exist in the store (robot, sensor, topic, field, mission, mission type, policy, label, bag) is a
 usage error. If all names exist and nothing matches, the answer is empty and the exit code is 0.
 
+## Completion in the shell
+The package installs completion for bash: `share/bash-completion/completions/shadowhound-data` in its prefix. If your shell does
+not find it there, put one of these lines into `~/.bashrc`; the second also works in a virtual environment:
+
+    source $(ros2 pkg prefix shadowhound_data_logger)/share/bash-completion/completions/shadowhound-data
+    eval "$(_SHADOWHOUND_DATA_COMPLETE=bash_source shadowhound-data)"
+
+Verbs, options and choices are completed. For zsh and fish, click has `zsh_source` and `fish_source`.
+
 ## Exit codes
 The same for every verb; the node exits with 0, 1 or 2 in the same sense.
 
