@@ -1,7 +1,7 @@
 # Every target makes the environment first (see scripts/setup); with nothing to do that takes milliseconds.
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor sbom audit tower tower-secrets clean
+.PHONY: help setup test test-long test-matrix torture check format demo bench docs lock vendor sbom audit tower tower-secrets unitree clean
 
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
@@ -12,6 +12,9 @@ help: ## this list
 
 setup: ## make the environment (.venv, go2_interfaces); PYTHON=... names the interpreter
 	@PYTHON="$(PYTHON)" scripts/setup
+
+unitree: setup ## build unitree_go, the messages of a Unitree robot's own topics, into the environment: some minutes, once
+	scripts/unitree
 
 test: setup ## run all tests; PYTEST_ARGS="-k spool -x" is handed on
 	PYTHONDONTWRITEBYTECODE= scripts/with-env pytest -n auto --no-loadscope-reorder $(PYTEST_ARGS)

@@ -16,7 +16,16 @@ setup(
     maintainer_email='maintainers@shadowhound.invalid',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
-    package_data={PACKAGE: ['py.typed', 'spool/schema.sql', 'live/page/*.*', 'live/page/vendor/*.*']},
+    package_data={
+        PACKAGE: [
+            'py.typed',
+            'spool/schema.sql',
+            'live/page/*.*',
+            'live/page/vendor/*.*',
+            'formats/interfaces/*/msg/*.msg',
+            'formats/interfaces/*/LICENSE',
+        ]
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + PACKAGE]),
         ('share/' + PACKAGE, ['package.xml']),

@@ -1,6 +1,7 @@
-"""Launches the data logger with its parameter file, in a namespace if asked to, and starts it again when it crashes.
+"""Launches the data logger, one node per robot, and starts a node again when it crashes.
 
 ros2 launch shadowhound_data_logger sensor_logger.launch.py namespace:=tachi params_file:=/path/to/my.yaml live:=true
+ros2 launch shadowhound_data_logger sensor_logger.launch.py robots:=robot0,robot1
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from launch.actions import (
     DeclareLaunchArgument,
     ExecuteProcess,
     LogInfo,
+    OpaqueFunction,
     RegisterEventHandler,
     SetEnvironmentVariable,
     TimerAction,
@@ -46,13 +48,21 @@ def profile() -> list[Action]:
     return [SetEnvironmentVariable(variable, str(FOLDER / 'fastdds_shm.xml'))]
 
 
-def logger() -> list[Action]:
-    """The node, and what to do when it ends."""
+def loggers(context: LaunchContext) -> list[Action]:
+    """A node per robot: in each namespace of ``robots``, or one in ``namespace``."""
+    robots = [name.strip() for name in LaunchConfiguration('robots').perform(context).split(',') if name.strip()]
+    namespaces = robots or [LaunchConfiguration('namespace').perform(context)]
+    file = LaunchConfiguration('params_file').perform(context)
+    return [action for namespace in namespaces for action in logger(namespace, [file] if file else [])]
+
+
+def logger(namespace: str, parameters: list[str]) -> list[Action]:
+    """The node of a namespace, and what to do when it ends."""
     node = Node(  # without a name: the node has one, and launch would warn of a second one at each restart
         package='shadowhound_data_logger',
         executable='sensor_logger_node',
-        namespace=LaunchConfiguration('namespace'),
-        parameters=[LaunchConfiguration('params_file')],
+        namespace=namespace,
+        parameters=parameters,
         output='screen',
         emulate_tty=True,
     )
@@ -61,7 +71,7 @@ def logger() -> list[Action]:
         if event.returncode in FINAL or context.is_shutdown:
             return []
         again = LogInfo(msg=f'sensor_logger_node ended with {event.returncode}: it starts again in {RESTART_AFTER_S:g} s')
-        return [again, TimerAction(period=RESTART_AFTER_S, actions=logger())]
+        return [again, TimerAction(period=RESTART_AFTER_S, actions=logger(namespace, parameters))]
 
     return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)), node]
 
@@ -92,13 +102,14 @@ def generate_launch_description() -> LaunchDescription:
     """What `ros2 launch` asks for."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument('params_file', default_value=str(FOLDER / 'go2.yaml'), description='The parameter file.'),
-            DeclareLaunchArgument('namespace', default_value='', description='Namespace of the robot, for several robots.'),
+            DeclareLaunchArgument('params_file', default_value='', description='The parameter file.'),
+            DeclareLaunchArgument('namespace', default_value='', description='Namespace of the robot.'),
+            DeclareLaunchArgument('robots', default_value='', description='Namespaces of several robots: a node for each.'),
             DeclareLaunchArgument('live', default_value='false', description='Serve the live page too.'),
             DeclareLaunchArgument('live_bind', default_value='127.0.0.1', description='Where it listens.'),
             DeclareLaunchArgument('policy', default_value='', description='Follow the registry for this policy.'),
             *profile(),
-            *logger(),
+            OpaqueFunction(function=loggers),
             live_page(),
             policies(),
         ]

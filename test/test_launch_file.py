@@ -19,9 +19,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:The 'LaunchConfigurationEquals':
 FILE = Path(__file__).parents[1] / 'launch_configs' / 'sensor_logger.launch.py'
 
 
-def commands(given: Mapping[str, str]) -> list[list[str]]:
-    """What it starts beside the node, with these arguments of ``ros2 launch``."""
-    from launch.actions import ExecuteProcess
+def commands(given: Mapping[str, str], nodes: int = 1) -> list[list[str]]:
+    """What it starts beside so many nodes, with these arguments of ``ros2 launch``."""
+    from launch.actions import ExecuteProcess, OpaqueFunction
     from launch.utilities import perform_substitutions
 
     description = runpy.run_path(str(FILE))['generate_launch_description']()
@@ -29,10 +29,14 @@ def commands(given: Mapping[str, str]) -> list[list[str]]:
     context.launch_configurations.update(given)
     for argument in description.get_launch_arguments():
         argument.execute(context)
-    processes = [each for each in description.entities if isinstance(each, ExecuteProcess)]
+    entities = [*description.entities]
+    for each in description.entities:
+        if isinstance(each, OpaqueFunction):
+            entities += each.execute(context) or []
+    processes = [each for each in entities if isinstance(each, ExecuteProcess)]
     chosen = [each for each in processes if each.condition is None or each.condition.evaluate(context)]
     found = [[perform_substitutions(context, list(part)) for part in each.cmd] for each in chosen]
-    assert sum('sensor_logger_node' in program for program, *_ in found) == 1
+    assert sum('sensor_logger_node' in program for program, *_ in found) == nodes
     return [command for command in found if 'sensor_logger_node' not in command[0]]
 
 
@@ -57,6 +61,11 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_without_being_asked_to_it_starts_the_node_alone(given: dict[str, str]) -> None:
     """No page, and nothing that follows policies."""
     assert commands(given) == []
+
+
+def test_a_node_per_robot() -> None:
+    """With one command."""
+    assert commands({'robots': 'robot0, robot1'}, nodes=2) == []
 
 
 def test_it_starts_the_live_page_where_it_is_asked_to(home: Path) -> None:

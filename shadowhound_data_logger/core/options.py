@@ -313,23 +313,35 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'key': '{robot}/camera_info/{date}/{time}_front.{ext}', 'priority': 2,
     },
     'lidar': {
-        'topics': ('point_cloud2',), 'types': (POINT_CLOUD,), 'format': 'pcd',
+        'topics': ('point_cloud2', 'utlidar/cloud'), 'types': (POINT_CLOUD, POINT_CLOUD), 'format': 'pcd',
         'key': '{robot}/lidar/{date}/{time}_scan.{ext}', 'priority': 7,
     },
     'imu': {
-        'topics': ('imu',), 'types': ('go2_interfaces/msg/IMU|sensor_msgs/msg/Imu',), 'rate_hz': 0.0, 'batch_s': 1.0,
-        'priority': 4,
+        'topics': ('imu', 'utlidar/imu'), 'types': ('go2_interfaces/msg/IMU|sensor_msgs/msg/Imu', 'sensor_msgs/msg/Imu'),
+        'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
     },
-    'odom': {'topics': ('odom',), 'types': ('nav_msgs/msg/Odometry',), 'priority': 3},
+    'odom': {
+        'topics': ('odom', 'utlidar/robot_odom'), 'types': ('nav_msgs/msg/Odometry', 'nav_msgs/msg/Odometry'), 'priority': 3,
+    },
     'states': {
-        'topics': ('go2_states',), 'types': ('go2_interfaces/msg/Go2State',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 3,
+        'topics': ('go2_states', 'sportmodestate'), 'types': ('go2_interfaces/msg/Go2State', 'unitree_go/msg/SportModeState'),
+        'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 3,
     },
     'joints': {
         'topics': ('joint_states',), 'types': ('sensor_msgs/msg/JointState',), 'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4,
     },
     'lowstate': {
-        'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState',), 'batch_s': 10.0, 'priority': 3,
+        'topics': ('lowstate',), 'types': ('go2_interfaces/msg/LowState|unitree_go/msg/LowState|unitree_hg/msg/LowState',),
+        'batch_s': 10.0, 'priority': 3,
         'statistics': ('imu_state', 'bms_state.soc', 'bms_state.current', 'foot_force', 'power_v', 'power_a', 'temperature_ntc1'),
+    },
+    'remote': {
+        'topics': ('wirelesscontroller',), 'types': ('unitree_go/msg/WirelessController',), 'rate_hz': 0.0, 'batch_s': 1.0,
+        'priority': 4,
+    },
+    'video': {
+        'topics': ('frontvideostream',), 'types': ('unitree_go/msg/Go2FrontVideoData',), 'format': 'tar', 'rate_hz': 0.0,
+        'batch_s': 1.0, 'priority': 6,
     },
     'cmd_vel': {
         'enabled': False, 'topics': ('cmd_vel',), 'types': ('geometry_msgs/msg/Twist',), 'rate_hz': 0.0, 'batch_s': 1.0,

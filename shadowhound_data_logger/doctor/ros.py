@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.type_rules import is_of_go2
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
@@ -61,6 +62,8 @@ TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 ENOUGH: Final = 4
 """Messages that have to be expected within the window for a rate to mean something."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
+DRIVER: Final = 'go2_interfaces'
+"""Expected while nothing is published at all: the driver may start later."""
 
 
 def check(context: Context) -> Iterator[Result]:
@@ -79,7 +82,6 @@ def check(context: Context) -> Iterator[Result]:
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
 
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
-    yield from _types(sensors)
     with _profiled(listener), ros_watch.node(namespace=context.namespace) as node:
         resolved = {topic: node.resolve_topic_name(topic) for sensor in sensors for topic in sensor.topics}
         names = list(dict.fromkeys(resolved.values()))
@@ -88,6 +90,8 @@ def check(context: Context) -> Iterator[Result]:
         types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
         others = [] if heard else list(ros_watch.published(node))
+    packages = {each.type.partition('/')[0] for publishers in found.values() for each in publishers}
+    yield from _types(sensors, packages if heard else packages | {DRIVER})
     if not heard:
         yield from _nobody(context, names, listener, others)
         return
@@ -111,15 +115,16 @@ def _profiled(listener: Middleware | None, domain: int | None = None) -> Abstrac
     return (listener if domain is None else replace(listener, domain=domain)).profiled(os.environ)
 
 
-def _types(sensors: Sequence[SensorSettings]) -> Iterator[Result]:
-    """Of the types that the settings expect."""
+def _types(sensors: Sequence[SensorSettings], packages: Collection[str]) -> Iterator[Result]:
+    """Of the types that the settings expect; of those of a Unitree robot only if they are of one of these packages."""
     from shadowhound_data_logger.ros.reader import unavailable  # noqa: PLC0415 - rclpy
 
     missing: dict[str, dict[str, str]] = {}
     for names in sorted({alternatives(name) for sensor in sensors for name in sensor.types if name}):
         reasons = {name: unavailable(name) for name in names}
-        if all(reasons.values()):
-            missing.setdefault(names[0].partition('/')[0], {})[names[0]] = reasons[names[0]]
+        is_needed = [name for name in names if not is_of_go2(name) or name.partition('/')[0] in packages]
+        if is_needed and all(reasons.values()):
+            missing.setdefault(is_needed[0].partition('/')[0], {})[is_needed[0]] = reasons[is_needed[0]]
     for package, by_type in missing.items():
         yield error(
             'ros.types',

@@ -4,7 +4,7 @@ The definitions are read from the ``share/`` folders of the sourced workspaces, 
 local_message_definition_source.cpp): the ``.msg`` of the type and of every type it uses. If one of them has no ``.msg``, all are
 read from ``.idl``, without ``#include`` lines: every included section follows anyway, and ``rosbags`` cannot open a bag with such
 a line. The hash (REP-2016) is in the ``.json`` that rosidl installs since Iron; Humble has none. If no workspace is sourced, the
-type store of ``rosbags`` has the common types.
+type store of ``rosbags`` has the common types, and ``interfaces/`` those of Unitree's robots.
 
 The messages of a service's event topic and of an action's topics have types too, such as ``std_srvs/srv/Trigger_Event`` and
 ``nav2_msgs/action/NavigateToPose_FeedbackMessage``, but no files: rosidl derives them from the service or action
@@ -25,6 +25,8 @@ from typing import Final
 
 log = logging.getLogger(__name__)
 
+VENDORED: Final = Path(__file__).with_name('interfaces')
+"""Message packages as in ``share/``: go2_interfaces, unitree_go and unitree_hg."""
 SEPARATOR: Final = '=' * 80
 _TYPE: Final = re.compile(r'([A-Za-z0-9_]+)/(?:(msg|srv|action)/)?([A-Za-z0-9_]+)', re.ASCII)
 _MSG_FIELD: Final = re.compile(r'(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+')
@@ -101,9 +103,10 @@ def _split_name(type_name: str) -> tuple[str, str, str, str]:
 
 def _find_file(prefixes: Iterable[str | Path], type_name: str, extension: str) -> Path:
     package, kind, name, _ = _split_name(type_name)
-    for prefix in prefixes:
-        path = Path(prefix, 'share', package, kind, f'{name}.{extension}')
-        if str(prefix) and path.is_file():
+    folders = [Path(prefix, 'share') for prefix in prefixes if str(prefix)]
+    for folder in (*folders, VENDORED):
+        path = folder / package / kind / f'{name}.{extension}'
+        if path.is_file():
             return path
     raise FileNotFoundError(f'{type_name} has no .{extension}')
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -85,6 +86,8 @@ _TYPE: Final = re.compile(
 )
 """https://design.ros2.org/articles/interface_definition.html; of services and actions the parts that are messages."""
 _KINDS: Final = {'msg': 'messages', 'srv': 'services', 'action': 'actions'}
+SHIPPED: Final = frozenset({'go2_interfaces', 'unitree_go', 'unitree_hg'})
+"""Message packages in ``interfaces/``."""
 MAX_PUBLISHERS: Final = 1000
 """Senders that a subscription knows by name at once."""
 UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'})
@@ -142,6 +145,15 @@ def _is_installed(package: str, kind: str) -> bool:
     except (ImportError, ValueError):
         return False
     return spec is not None and PathFinder.find_spec(f'{package}.{kind}', spec.submodule_search_locations or ()) is not None
+
+
+def install_hint(type_name: str) -> str:
+    """How to install the package of a type, after the reason why it is unavailable."""
+    package = type_name.partition('/')[0]
+    if package in SHIPPED:
+        return f'; build it from interfaces/ of shadowhound_data_logger: colcon build --base-paths interfaces/{package}'
+    distro = os.environ.get('ROS_DISTRO', '$ROS_DISTRO')
+    return f'; sudo apt install ros-{distro}-{package.replace("_", "-")}, or source the workspace that has it'
 
 
 @lru_cache

@@ -58,7 +58,11 @@ class StateSource:
 
 
 class LowStateSource:
-    """``lowstate`` at the rate of the robot's low-frequency topic (``rt/lf/lowstate``), with the battery."""
+    """``lowstate`` at the rate of the robot's low-frequency topic (``rt/lf/lowstate``), with the battery.
+
+    The driver does not publish it: it comes from the robot itself, to whoever is in its DDS network. There its type is
+    ``unitree_go/msg/LowState``, which has the same fields.
+    """
 
     rate_hz = 20.0
     topics = (SimulatedTopic('lowstate', LowState),)
@@ -89,9 +93,9 @@ class LowStateSource:
         yield low
 
 
-def go2_sources(world: World) -> list[SimulatedSensor]:
+def go2_sources(world: World, *, lowstate: bool = True) -> list[SimulatedSensor]:
     """The sensors that only a machine with go2_interfaces can publish."""
-    return [ImuSource(world), StateSource(world), LowStateSource(world)]
+    return [ImuSource(world), StateSource(world), *([LowStateSource(world)] if lowstate else [])]
 
 
 def _fill_imu(message: Any, reading: Imu) -> None:

@@ -53,6 +53,8 @@ class SimSettings:
     """Publish ``camera/image_raw``."""
     compressed: bool = True
     """Publish ``camera/compressed``."""
+    connection: str = field(default='cyclonedds', metadata={'choices': ('cyclonedds', 'webrtc')})
+    """How the driver is connected: over WebRTC there is no ``lowstate``, and so no battery."""
     obey: bool = False
     """Walk as ``cmd_vel`` (geometry_msgs/Twist) says, instead of on the patrol."""
 
@@ -72,9 +74,11 @@ def _checked(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -
     if isinstance(default, float) and type(value) is int:
         value = float(value)
     if type(value) is not type(default):
-        kind = {bool: 'true or false', int: 'a whole number', float: 'a number'}[type(default)]
+        kind = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}[type(default)]
         raise SettingError(name, value, kind)
-    if metadata and not metadata['low'] <= value <= metadata['high']:
+    if 'choices' in metadata and value not in metadata['choices']:
+        raise SettingError(name, value, ' or '.join(metadata['choices']))
+    if 'low' in metadata and not metadata['low'] <= value <= metadata['high']:
         raise SettingError(name, value, f'a number, {metadata["low"]:g} to {metadata["high"]:g}')
     return value
 
@@ -212,7 +216,7 @@ def _sources(settings: SimSettings, driven: Driven | None) -> list[SimulatedSens
     except ImportError as error:
         _say(f'runs without imu, go2_states and lowstate, because go2_interfaces is missing ({error})')
         return common
-    return [*go2_sources(world), *common]
+    return [*go2_sources(world, lowstate=settings.connection == 'cyclonedds'), *common]
 
 
 def _publisher(node: Node, topic: SimulatedTopic) -> Publisher:

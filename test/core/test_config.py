@@ -31,7 +31,8 @@ def test_nothing_has_to_be_set() -> None:
     assert settings.spool_path == settings.home / 'spool'
     assert (settings.store.endpoint_url, settings.store.directory) == (None, settings.home / 'store')
     assert [sensor.name for sensor in settings.sensors] == [
-        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'cmd_vel', 'voxel_map',
+        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'remote', 'video', 'cmd_vel',
+        'voxel_map',
     ]  # fmt: skip
     assert (settings.spool.max_bytes, settings.spool.min_free_bytes) == (20 * GIBI, 2 * GIBI)
     assert settings.shutdown.drain_s == 3.0
@@ -74,7 +75,7 @@ def test_a_robot_name_of_the_shell_is_told_as_that() -> None:
     ('camera.enabled', 1, 'true or false'), ('camera.format', 'gif', 'jpeg, png, pcd, json, cdr, zip, tar'),
     ('camera.topics', 'a', 'a list of strings'),
     ('camera.topics', [], 'at least one topic'), ('camera.topics', [''], 'at least one topic'), ('camera.topics', [5], 'a list'),
-    ('imu.types', ['a', 'b'], 'at most one type'), ('camera.batch_s', 1.0, '0 with format'),
+    ('imu.types', ['a', 'b', 'c'], 'at most one type'), ('camera.batch_s', 1.0, '0 with format'),
     ('voxel_map.batch_s', 1.0, '0 with format'),
     ('camera.bucket', '../x', 'letters'),
     ('camera.key', '{robot}/front.jpg', '{date} and {time}'), ('camera.priority', 10, '0 to 9'),

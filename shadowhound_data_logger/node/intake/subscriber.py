@@ -29,7 +29,15 @@ from shadowhound_data_logger.node.intake.consumers import Consumer
 from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.ros.endpoints import POLL_S, Endpoint, HistoryDepth, Plan, alternatives, logged_type, plans
-from shadowhound_data_logger.ros.reader import PolledGroup, Reader, SubscriptionRefused, endpoints, node_of, unavailable
+from shadowhound_data_logger.ros.reader import (
+    PolledGroup,
+    Reader,
+    SubscriptionRefused,
+    endpoints,
+    install_hint,
+    node_of,
+    unavailable,
+)
 from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE, Accounts
 
 log = logging.getLogger(__name__)
@@ -230,7 +238,7 @@ class Subscriber:
             self.has_latched = any(publisher.transient_local for publisher in publishers)
         self._senders.look([publisher.gid for publisher in publishers], now_s)
         self._look_at_others(type_name, found, now_s)
-        if not type_name or not self._is_available(type_name):
+        if not type_name or not self._is_available(type_name, is_published=bool(publishers)):
             return
         if type_name != self._type:
             self._retype(type_name, now_s)
@@ -342,12 +350,16 @@ class Subscriber:
             return False
         return True
 
-    def _is_available(self, type_name: str) -> bool:
-        """Whether messages of the type can be received here; asked before anything is begun or counted for them."""
-        self._unavailable = unavailable(type_name)
+    def _is_available(self, type_name: str, *, is_published: bool) -> bool:
+        """Whether messages of the type can be received here; asked before anything is begun or counted for them.
+
+        While they are not published, that they cannot be is no problem: the default settings name types of other robots.
+        """
+        why = unavailable(type_name)
+        self._unavailable = why if is_published else ''
         if self._unavailable:
-            self._tell(type_name, f'{self._chosen} is not logged: {self._unavailable}')
-        return not self._unavailable
+            self._tell(type_name, f'{self._chosen} is not logged: {why}{install_hint(type_name)}')
+        return not why
 
     def _retype(self, type_name: str, now_s: float) -> None:
         """Begin with a topic that is new, or of another type than before."""

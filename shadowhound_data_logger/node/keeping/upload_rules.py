@@ -96,7 +96,11 @@ class UploadRules:
             if holds is (name in self._closed):
                 log.info('%s %s: %s', name, 'holds' if holds else 'does not hold', why)
         self._closed = closed
-        self.stuck = {name: text for name in closed if (text := self._stuck(name, now_s))}
+        stuck = {name: text for name in closed if (text := self._stuck(name, now_s))}
+        for name, text in stuck.items():
+            if self.stuck.get(name) != text:
+                log.warning('%s', text)
+        self.stuck = stuck
         return closed
 
     def _stuck(self, rule: str, now_s: float) -> str:
