@@ -58,6 +58,15 @@ def test_a_message_is_kept_when_its_content_changes(*, has_header: bool) -> None
     assert gate.keep(0, cdr), 'what comes back is a change as well'
 
 
+def test_a_latched_message_is_kept_once() -> None:
+    """What is sent again to a node that was restarted has the stamp of the newest durable sample; another content is new."""
+    gate = OnChange(has_header=False, last_kept_ns=7 * SECOND)
+    assert [gate.keep(stamp * SECOND, content) for stamp, content in ((7, b'0000a'), (8, b'0000a'), (9, b'0000b'))] == [
+        False, False, True,
+    ]  # fmt: skip
+    assert OnChange(has_header=False, last_kept_ns=7 * SECOND).keep(8 * SECOND, b'0000a')
+
+
 def test_the_settings_choose_the_gate() -> None:
     """0 Hz keeps every message, on_change goes before the rate."""
 

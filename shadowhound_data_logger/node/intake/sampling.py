@@ -77,15 +77,20 @@ class FirstOfPeriod:
 
 
 class OnChange:
-    """Keeps a message whose content, but for the stamp of its header, differs from the last one kept."""
+    """Keeps a message whose content, but for the stamp of its header, differs from the last one kept.
 
-    def __init__(self, *, has_header: bool) -> None:
+    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with it is that one, sent again to whoever
+    subscribes, as latched messages are.
+    """
+
+    def __init__(self, *, has_header: bool, last_kept_ns: int = 0) -> None:
         self._start = STAMP_END if has_header else 4
         self._last: int | None = None
+        self._last_kept_ns = last_kept_ns
 
-    def keep(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
+    def keep(self, stamp_ns: int, cdr: bytes) -> bool:
         content = crc32(memoryview(cdr)[self._start :])
-        changed = content != self._last
+        changed = content != self._last and not (self._last is None and 0 < stamp_ns == self._last_kept_ns)
         self._last = content
         return changed
 
@@ -93,7 +98,7 @@ class OnChange:
 def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> KeepRule:
     """The rule of a sensor's settings."""
     if sensor.on_change:
-        return OnChange(has_header=has_header)
+        return OnChange(has_header=has_header, last_kept_ns=last_kept_ns)
     if sensor.rate_hz:
         return FirstOfPeriod(round(SECOND / sensor.rate_hz), last_kept_ns)
     return EveryMessage()
