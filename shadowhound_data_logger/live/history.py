@@ -13,8 +13,10 @@ import re
 import resource
 import shlex
 import sys
+import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import closing, suppress
@@ -38,7 +40,7 @@ from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP, CLOCKS, SAME_NS
 from shadowhound_data_logger.core.untrusted import check_pixels, visible
 from shadowhound_data_logger.formats.mcap.index import McapIndex, read_summary
-from shadowhound_data_logger.formats.mcap.messages import MessageFilter, read_messages
+from shadowhound_data_logger.formats.mcap.messages import MessageFilter, RecordedMessage, read_messages
 from shadowhound_data_logger.formats.mcap.ranges import Ranged
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.formats.statistics import INFINITE
@@ -47,14 +49,16 @@ from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.live.kept import KeptSource, SpoolKept, StoreKept, offers
 from shadowhound_data_logger.live.kinds import FULL, KINDS, LiveItem, clouds, frames, points_items, series, table_item
 from shadowhound_data_logger.live.past import (
+    BAG_SENSOR,
     FRESH_S,
+    LONGEST_BATCH_NS,
     PastContents,
-    PastDay,
     PastObject,
     PastSource,
+    Run,
     SpoolPast,
     StorePast,
-    dates_between,
+    consecutive,
 )
 from shadowhound_data_logger.stores import open_store
 
@@ -63,7 +67,9 @@ MAX_SPAN_NS: Final = 50 * 3600 * SECOND
 RUNS: Final = 800
 """A timeline is told this fine; and what follows within ``RHYTHM_NS`` is one run however fine it is."""
 RHYTHM_NS: Final = 5 * SECOND // 2
-LONGEST_BATCH_NS: Final = 15 * SECOND
+LATE_NS: Final = 30 * SECOND
+"""What is delivered later than this after it was recorded is marked on the timeline."""
+INFINITE_MS: Final = float('inf')
 STALE_NS: Final = 10 * SECOND
 """What is older at a moment is not shown for it."""
 SERIES_NS: Final = 10 * SECOND
@@ -71,10 +77,19 @@ SERIES_NS: Final = 10 * SECOND
 PATH_NS: Final = 600 * SECOND
 AROUND_NS: Final = 5 * SECOND
 """Of a moment, on either side: what its commands ask for."""
-LABELS_S: Final = 1.0
-"""A timeline waits so long for the labels in the store."""
+LABELS_S: Final = 0.1
+"""A timeline waits so long for the labels in the store; the page asks again for those that took longer."""
+READING_LABELS: Final = 'the labels in the store are still being read'
 IN_BAG_NS: Final = 3 * SECOND // 2
 """So much before a moment is read of a bag."""
+BAG_BLOCK_NS: Final = SECOND // 2
+"""Of a bag so much is read together."""
+MAX_BAG_BYTES: Final = 64 << 20
+"""Of messages of bags that are kept."""
+MESSAGE_BYTES: Final = 300
+"""What a message takes besides its content."""
+AHEAD_NS: Final = 2 * SECOND
+"""While moments follow one another, so much after the last one is read before it is asked for."""
 MOST_TEXT: Final = 160
 MAX_MARKS: Final = 500
 MAX_OFFSETS: Final = 8
@@ -100,6 +115,9 @@ class PastReader:
         self._pool = ThreadPoolExecutor(8, 'past')
         self._index = lru_cache(maxsize=16)(self._read_index)
         self._labels = PastLabels(self._pool)
+        self._blocks = BagBlocks()
+        self._shown: tuple[str, int, str] = ('', 0, '')
+        self._ahead: Future[None] | None = None
 
     def close(self) -> None:
         self._pool.shutdown()
@@ -112,24 +130,26 @@ class PastReader:
             return {'robots': self._source.robots()}, b''
         if not isinstance(robot, str) or not is_name(robot):
             raise ValueError('robot is the name of a robot')
-        if do == 'days':
-            return {'days': self._source.days(robot)}, b''
-        if do == 'timeline':
-            return self.timeline(robot, int(asked['from']) * 1_000_000, int(asked['to']) * 1_000_000, _clock(asked)), b''
         if do == 'moment':
             return self.moment(robot, int(asked['at']) * 1_000_000, _clock(asked))
-        if do == 'label':
-            if robot not in self._source.robots():
-                raise LabelRefused(f'there is no robot {robot!r} here')
-            return {'id': self._labels.add(robot, asked)}, b''
-        if do == 'kept':
-            begin_ns, end_ns = _times(asked)
-            return {'kept': {sensor: each.to_json() for sensor, each in offers(self._kept, robot, begin_ns, end_ns).items()}}, b''
-        if do == 'requests':
-            return self.requests(robot), b''
-        if do == 'pull':
-            return self.pull(robot, asked), b''
-        raise ValueError('do is robots, days, timeline, moment, label, kept, requests or pull')
+        answers: dict[str, Callable[[], dict[str, Any]]] = {
+            'days': lambda: {'days': self._source.days(robot)},
+            'timeline': lambda: self.timeline(robot, *_times(asked), _clock(asked), is_fitted=bool(asked.get('fit'))),
+            'range': lambda: self.range(robot, *_times(asked), _clock(asked)),
+            'label': lambda: self.label(robot, asked),
+            'kept': lambda: {'kept': {name: each.to_json() for name, each in offers(self._kept, robot, *_times(asked)).items()}},
+            'requests': lambda: self.requests(robot),
+            'pull': lambda: self.pull(robot, asked),
+        }  # fmt: skip
+        if do not in answers:
+            raise ValueError(f'do is robots, moment, {", ".join(answers)}')
+        return answers[do](), b''
+
+    def label(self, robot: str, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """Raises LabelRefused, LakeError, SettingError, StoreError."""
+        if robot not in self._source.robots():
+            raise LabelRefused(f'there is no robot {robot!r} here')
+        return {'id': self._labels.add(robot, asked)}
 
     # -- what is kept on the robot ---------------------------------------------------------------------------------
 
@@ -164,57 +184,89 @@ class PastReader:
 
     # -- a time ----------------------------------------------------------------------------------------------------
 
-    def timeline(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
+    def timeline(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP, *, is_fitted: bool = False) -> dict[str, Any]:
         """What was recorded between two times, the gaps, and what happened; ``by`` which of the two times of messages.
 
-        Missions, bags, events and labels have the robot's own time, which is that of arrival.
-        ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone; ``marks``: [kind, name, from, to, text];
+        Missions, bags, events and labels have the robot's own time, which is that of arrival. ``is_fitted``: only of the part in
+        which something was recorded. ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone;
+        ``marks``: [kind, name, from, to, text]; ``deliveries``: [from, to, delivered or null] of what was not delivered soon;
         times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
         """
-        if not 0 < end_ns - begin_ns <= MAX_SPAN_NS:
-            raise ValueError(f'a timeline has at most {MAX_SPAN_NS // SECOND // 3600} hours')
-        days = [self._source.day(robot, date, by) for date in dates_between(begin_ns - LONGEST_BATCH_NS, end_ns)]
+        grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
+        runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
+        bags = list(self._marks_of_bags(robot, begin_ns, end_ns, by))
+        kept = self._kept_runs(robot, begin_ns, end_ns, by)
+        if is_fitted and (begins := [*(run.begin_ns for run in runs), *(one[1] for one in kept)]):
+            ends = [*(run.end_ns for run in runs), *(one[2] for one in kept)]
+            spare_ns = max(SECOND, (max(ends) - min(begins)) // 40)
+            begin_ns, end_ns = max(begin_ns, min(begins) - spare_ns), min(end_ns, max(ends) + spare_ns)
+            grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
+            runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
         found = {**self._source.gaps(robot, begin_ns, end_ns, by), 'by': by}
-        found['recorded'] = [
-            [_text(topic), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)]
-            for topic, from_ns, to_ns in _runs(days, begin_ns, end_ns)
+        found['recorded'] = [_row(name, from_ns, to_ns, begin_ns, end_ns) for name, from_ns, to_ns in _joined(runs, grain_ns)]
+        found['kept'] = [_row(*one, begin_ns, end_ns) for one in kept]
+        found['deliveries'] = [
+            [round(from_ns / 1e6), round(to_ns / 1e6), None if settled_ns is None else round(settled_ns / 1e6)]
+            for from_ns, to_ns, settled_ns in _deliveries(runs, grain_ns, time.time_ns())
         ]  # fmt: skip
         labels, lacking = self._labels.marks(robot)
-        marks = sorted([*self._marks_of_missions(days), *self._marks_of_bags(days), *labels], key=lambda mark: mark[2])
+        missions = [('mission', one.id, one.begin_ns, one.end_ns, one.type)
+                    for one in self._source.missions(robot, begin_ns, end_ns, by)]  # fmt: skip
+        marks = sorted([*missions, *bags, *labels], key=lambda mark: mark[2])
         inside = [mark for mark in marks if mark[3] >= begin_ns and mark[2] <= end_ns][:MAX_MARKS]
         found['marks'] = [
             [kind, _text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1), _text(text)]
             for kind, name, from_ns, to_ns, text in inside
         ]  # fmt: skip
-        rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
-        kept = [(row['topic'] or row['sensor'] or '', *_kept_times(row, by)) for row in rows if row['where'] == ON_ROBOT]
-        found['kept'] = [[_text(name), round(from_ns / 1e6, 1), round(to_ns / 1e6, 1)] for name, from_ns, to_ns in
-                         _spans(kept, begin_ns, end_ns)]  # fmt: skip
-        found['problem'] = _text(next((day.problem for day in days if day.problem), lacking), 400)
-        found['commands'] = commands(robot, begin_ns, end_ns, [mark[1] for mark in inside if mark[0] == 'bag'], by)
+        found['labels'] = 'reading' if lacking == READING_LABELS else ''
+        found['problem'] = _text(self._source.problem(robot, begin_ns, end_ns, by) or ('' if found['labels'] else lacking), 400)
         return found
 
-    @staticmethod
-    def _marks_of_missions(days: Sequence[PastDay]) -> Iterator[tuple[str, str, int, int, str]]:
-        spans: dict[str, tuple[str, int, int]] = {}
-        for day in days:
-            for name, kind, begin_ns, end_ns in day.missions:
-                known = spans.get(name, (kind, begin_ns, end_ns))
-                spans[name] = known[0] or kind, min(known[1], begin_ns), max(known[2], end_ns)
-        for name, (kind, begin_ns, end_ns) in spans.items():
-            yield 'mission', name, begin_ns, end_ns, kind
+    def _runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str) -> list[Run]:
+        names: dict[str, None] = {}
+        found = []
+        for run in self._source.runs(robot, begin_ns, end_ns, grain_ns, by):
+            if run.end_ns >= begin_ns and (run.name in names or len(names) < MAX_TOPICS):
+                names[run.name] = None
+                found.append(run)
+        return found
 
-    def _marks_of_bags(self, days: Sequence[PastDay]) -> Iterator[tuple[str, str, int, int, str]]:
-        for day in days:
-            told = self._pool.map(self._contents.manifest, day.bag_files.values())
-            for (bag, files), manifest in zip(day.bag_files.items(), told, strict=True):
-                slices = manifest.slices if manifest is not None else ()
-                begin_ns = min((one.t_start_ns for one in slices), default=min(one.begin_ns for one in files))
-                end_ns = max((one.t_end_ns for one in slices), default=max(one.end_ns for one in files))
-                yield 'bag', bag, begin_ns, end_ns, '' if manifest is None else manifest.state
-                for trigger in manifest.event.triggers if manifest is not None and manifest.event is not None else ():
-                    text = f'{trigger.by}: {trigger.detail}' if trigger.detail else trigger.by
-                    yield 'event', trigger.name, trigger.at_ns, trigger.at_ns, text
+    def _kept_runs(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[tuple[str, int, int]]:
+        rows = [] if self._kept.is_recorded else self._kept.rows(robot, begin_ns, end_ns)
+        kept = [(row['topic'] or row['sensor'] or '', *_kept_times(row, by)) for row in rows if row['where'] == ON_ROBOT]
+        return list(_spans(kept, begin_ns, end_ns))
+
+    def range(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
+        """What there is of a time, and the commands that get it. Raises ValueError, DataLoggerError.
+
+        ``bags``: [name, bytes of what covers the time], of those from which the time can be cut.
+        """
+        near = self._source.between(robot, begin_ns - PATH_NS, min(end_ns, begin_ns + PATH_NS), by)
+        late = _offsets(near) if by == BY_STAMP else [0]
+        bags = {}
+        for late_ns in late:
+            for bag, files in self._source.bag_files(robot, begin_ns + late_ns, end_ns + late_ns, by).items():
+                if covering := _slices(files, self._contents.manifest(files), end_ns + late_ns, end_ns - begin_ns):
+                    bags[bag] = sum(one.size for one in covering)
+        kept = {sensor: each for sensor, each in offers(self._kept, robot, begin_ns, end_ns).items() if each.objects}
+        missions = [one.id for one in self._source.missions(robot, begin_ns, end_ns, by)]
+        return {
+            'from': begin_ns / 1e6, 'to': end_ns / 1e6,
+            'bags': [[_text(bag), size] for bag, size in bags.items() if is_name(bag)],
+            'commands': commands(robot, begin_ns, end_ns, list(bags), by, (min(late), max(late)), missions, is_kept=bool(kept)),
+        }  # fmt: skip
+
+    def _marks_of_bags(self, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Mark]:
+        bags = self._source.bag_files(robot, begin_ns, end_ns, by)
+        told = self._pool.map(self._contents.manifest, bags.values())
+        for (bag, files), manifest in zip(bags.items(), told, strict=True):
+            slices = manifest.slices if manifest is not None else ()
+            first_ns = min((one.t_start_ns for one in slices), default=min(one.begin_ns for one in files))
+            last_ns = max((one.t_end_ns for one in slices), default=max(one.end_ns for one in files))
+            yield 'bag', bag, first_ns, last_ns, '' if manifest is None else manifest.state
+            for trigger in manifest.event.triggers if manifest is not None and manifest.event is not None else ():
+                text = f'{trigger.by}: {trigger.detail}' if trigger.detail else trigger.by
+                yield 'event', trigger.name, trigger.at_ns, trigger.at_ns, text
 
     # -- a moment --------------------------------------------------------------------------------------------------
 
@@ -224,20 +276,21 @@ class PastReader:
         ``by`` says by which of their two times messages are of the moment, and their age is measured. The head has ``shown``:
         [topic, kind, ms before the moment, where it was read]. Raises DataLoggerError.
         """
-        days = [self._source.day(robot, date, by) for date in dates_between(at_ns - PATH_NS, at_ns + 1)]
-        near = [one for day in days for one in day.between(at_ns - LONGEST_BATCH_NS, at_ns + 1)]
-        shown: dict[str, tuple[LiveItem, str]] = {}
+        walked = self._source.between(robot, at_ns - PATH_NS, at_ns + 1, by)
+        near = [one for one in walked if one.begin_ns >= at_ns - LONGEST_BATCH_NS]
         late = _offsets(near) if by == BY_STAMP else [0]
-        dates = sorted({date for late_ns in late for date in dates_between(at_ns + late_ns - PATH_NS, at_ns + late_ns + 1)})
-        bag_files = [pair for date in dates for pair in self._source.day(robot, date, by).bag_files.items()]
-        for item, where in (*self._of_objects(near, at_ns, by), *self._of_bags(bag_files, at_ns, by, late)):
+        bag_files = {bag: files for late_ns in late for bag, files in
+                     self._source.bag_files(robot, at_ns + late_ns - PATH_NS, at_ns + late_ns + 1, by).items()}  # fmt: skip
+        shown = self._of_objects(near, at_ns, by)
+        for item, where in self._of_bags(list(bag_files.values()), at_ns, by, late):
             known = shown.get(item.topic)
-            if known is None or (item.head or {})['at'] > (known[0].head or {})['at'] + 1:
+            if known is None:
                 shown[item.topic] = item, where
-        walked = [one for day in days for one in day.between(at_ns - PATH_NS, at_ns + 1)]
+            elif (item.head or {})['at'] > (known[0].head or {})['at'] + 1:
+                shown[item.topic] = _after(known[0], item), where
         poses = [((one.begin_ns + one.end_ns) // 2, one.pose) for one in walked if one.pose]
         items = [*(item for item, _ in shown.values()), *_track(poses)]
-        covering = [bag for bag, files in bag_files
+        covering = [bag for bag, files in bag_files.items()
                     if any(_slices(files, self._contents.manifest(files), at_ns + late_ns) for late_ns in late)]  # fmt: skip
         last = max((one for one in near if one.mission_id), key=lambda one: one.begin_ns, default=None)
         head = {
@@ -246,9 +299,33 @@ class PastReader:
             'shown': [[_text(item.topic), item.kind, round(at_ns / 1e6 - (item.head or {})['at'], 1), _text(where, 300)]
                       for item, where in shown.values()],
         }  # fmt: skip
+        self._read_ahead(robot, at_ns, by, list(bag_files.values()), late)
         return head, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
 
-    def _of_objects(self, near: Sequence[PastObject], at_ns: int, by: str) -> list[tuple[LiveItem, str]]:
+    def _read_ahead(self, robot: str, at_ns: int, by: str, bags: Sequence[Sequence[PastObject]], late: Sequence[int]) -> None:
+        """Of what plays or is scrubbed forward, the contents that come next, while the page shows this moment."""
+        last_robot, last_ns, last_by = self._shown
+        self._shown = robot, at_ns, by
+        is_next = (robot, by) == (last_robot, last_by) and 0 < at_ns - last_ns <= AHEAD_NS
+        if not is_next or (self._ahead is not None and not self._ahead.done()):
+            return
+        objects = [one for one in self._source.between(robot, at_ns + 1, at_ns + AHEAD_NS, by) if one.sensor != BAG_SENSOR]
+
+        def read() -> None:
+            for one in objects[:MAX_TOPICS]:
+                with suppress(DataLoggerError, *_BROKEN):
+                    self._contents.get(one)
+            for files in bags:
+                for one in _slices(files, self._contents.manifest(files), at_ns + late[0] + AHEAD_NS, AHEAD_NS):
+                    with suppress(DataLoggerError, *_BROKEN):
+                        source, index = self._index(one)
+                        if index is not None:
+                            begin_ns = at_ns + late[0]
+                            deque(self._blocks.messages(one.key, source, index, begin_ns, begin_ns + AHEAD_NS, 0), maxlen=0)
+
+        self._ahead = self._pool.submit(read)
+
+    def _of_objects(self, near: Sequence[PastObject], at_ns: int, by: str) -> dict[str, tuple[LiveItem, str]]:
         chosen: dict[str, list[PastObject]] = {}
         for one in near:
             if '/rosbags/' not in one.key and '/missions/' not in one.key:
@@ -256,7 +333,7 @@ class PastReader:
                 if topic in chosen or len(chosen) < MAX_TOPICS:
                     chosen.setdefault(topic, []).append(one)
         found = self._pool.map(lambda pair: self._of_topic(pair[0], pair[1], at_ns, by), chosen.items())
-        return [item for item in found if item is not None]
+        return {item[0].topic: item for item in found if item is not None}
 
     def _of_topic(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
         """The newest of a topic that can be read."""
@@ -305,11 +382,11 @@ class PastReader:
 
     # -- bags ------------------------------------------------------------------------------------------------------
 
-    def _of_bags(self, bag_files: Sequence[tuple[str, Sequence[PastObject]]], at_ns: int, by: str,
+    def _of_bags(self, bag_files: Sequence[Sequence[PastObject]], at_ns: int, by: str,
                  late: Sequence[int]) -> list[tuple[LiveItem, str]]:  # fmt: skip
         """Messages of a moment. Bags are sorted by arrival: with these offsets that is so much after the stamp."""
         found: list[tuple[LiveItem, str]] = []
-        for _, files in bag_files:
+        for files in bag_files:
             manifest = self._contents.manifest(files)
             slices = {one.key: one for late_ns in late for one in _slices(files, manifest, at_ns + late_ns)}
             for one in slices.values():
@@ -326,13 +403,18 @@ class PastReader:
         while waiting:
             late_ns = waiting.pop(0)
             read.add(late_ns)
-            for message in read_messages(source, index, _around(at_ns + late_ns, by)):
+            slack_ns = SAME_NS if by == BY_STAMP else 0  # offsets that differ by less are the same
+            until_ns = at_ns + late_ns + slack_ns + 1
+            for message in self._blocks.messages(
+                one.key, source, index, until_ns - IN_BAG_NS - 2 * slack_ns, until_ns, SERIES_NS
+            ):
                 is_by_stamp, offset_ns = by == BY_STAMP, message.log_ns - message.publish_ns
                 if is_by_stamp and len(read) + len(waiting) < MAX_OFFSETS and _is_new(offset_ns, (*read, *waiting)):
                     waiting.append(offset_ns)
                 message_ns = message.publish_ns if is_by_stamp else message.log_ns
                 name = message.channel.topic, message.channel.type
-                if at_ns - IN_BAG_NS <= message_ns <= at_ns and (name in came or len(came) < MAX_TOPICS):
+                least_ns = at_ns - (IN_BAG_NS if KINDS[name[1]].is_bulk else SERIES_NS)
+                if least_ns <= message_ns <= at_ns and (name in came or len(came) < MAX_TOPICS):
                     of = came.setdefault(name, {})
                     of[message_ns] = message.cdr
                     if KINDS[name[1]].is_bulk or len(of) > MAX_MESSAGES:
@@ -357,6 +439,48 @@ class PastReader:
         """A file without a complete summary, which the node does not write, is not searched."""
         source = self._contents.ranged(one)
         return source, read_summary(source)
+
+
+class BagBlocks:
+    """Messages of bags, read in blocks of time: moments that follow one another read only what is new. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._blocks: OrderedDict[tuple[str, int], list[RecordedMessage]] = OrderedDict()
+        self._size = 0
+
+    def messages(
+        self, key: str, source: Ranged, index: McapIndex, begin_ns: int, end_ns: int, before_ns: int
+    ) -> Iterator[RecordedMessage]:
+        """Of a time, and of ``before_ns`` before its end as far as that is here already. Raises BagDamaged, StoreError."""
+        first, last = begin_ns // BAG_BLOCK_NS, (end_ns - 1) // BAG_BLOCK_NS
+        with self._lock:
+            lacking = [number for number in range(first, last + 1) if (key, number) not in self._blocks]
+        for low, high in consecutive(lacking):
+            self._read(key, source, index, low, high)
+        with self._lock:
+            earlier = first
+            while (key, earlier - 1) in self._blocks and earlier * BAG_BLOCK_NS > end_ns - before_ns:
+                earlier -= 1
+            blocks = [self._blocks[key, number] for number in range(earlier, last + 1) if (key, number) in self._blocks]
+        for block in blocks:
+            yield from (message for message in block if message.log_ns < end_ns)
+
+    def _read(self, key: str, source: Ranged, index: McapIndex, low: int, high: int) -> None:
+        found: dict[int, list[RecordedMessage]] = {number: [] for number in range(low, high + 1)}
+        wanted = MessageFilter(low * BAG_BLOCK_NS, (high + 1) * BAG_BLOCK_NS, lambda channel: channel.type in KINDS)
+        for message in read_messages(source, index, wanted):
+            found[message.log_ns // BAG_BLOCK_NS].append(message)
+        with self._lock:
+            for number, messages in found.items():
+                self._size += _size(messages) - _size(self._blocks.pop((key, number), ()))
+                self._blocks[key, number] = messages
+            while self._size > MAX_BAG_BYTES and len(self._blocks) > len(found):
+                self._size -= _size(self._blocks.popitem(last=False)[1])
+
+
+def _size(messages: Sequence[RecordedMessage]) -> int:
+    return sum(len(message.cdr) + MESSAGE_BYTES for message in messages)
 
 
 class PullRefused(DataLoggerError):
@@ -391,7 +515,7 @@ class PastLabels:
         try:
             self._known[robot] = reading.result(LABELS_S)
         except NotYet:
-            return self._known.get(robot, []), 'the labels in the store are still being read'
+            return self._known.get(robot, []), READING_LABELS
         except (DataLoggerError, *_BROKEN) as error:
             return self._known.get(robot, []), f'the labels in the store cannot be read: {error}'
         return self._known[robot], ''
@@ -433,8 +557,9 @@ _BROKEN: Final = (ValueError, LookupError, TypeError, AttributeError, Arithmetic
 """What comes of content that is not what its name says."""
 
 
-def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: str = BY_STAMP,
-             late_ns: tuple[int, int] = (0, 0)) -> list[list[str]]:  # fmt: skip
+def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: str = BY_STAMP,  # noqa: PLR0913 - parts of commands
+             late_ns: tuple[int, int] = (0, 0), missions: Sequence[str] = (), *,
+             is_kept: bool = False) -> list[list[str]]:  # fmt: skip
     """[what, command line] for this time, to be pasted into a shell: names of a store are quoted.
 
     Bags are cut by arrival, which is at least and at most ``late_ns`` after the stamps.
@@ -449,15 +574,15 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: st
         ['bag cut', f'shadowhound-data bag cut {shlex.quote(bag)} {of} --start {start} --end {end} --to cut']
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
+    exports = [
+        ['export', f'shadowhound-data export lerobot {shlex.quote(mission)} {of} --mission {shlex.quote(mission)} --by {by}']
+        for mission in [mission for mission in dict.fromkeys(missions) if is_name(mission)][:MAX_CUTS]
+    ]
     if by == BY_RECEIVED:
-        return [['query', f'shadowhound-data query {span} --by {by}'], *cuts]
-    return [['query', f'shadowhound-data query {span}'], ['fetch', f'shadowhound-data fetch {span} --to data'], *cuts]
-
-
-def _around(log_ns: int, by: str) -> MessageFilter:
-    """The messages of a bag that may be of a moment; offsets that differ by less than ``SAME_NS`` are the same."""
-    slack_ns = SAME_NS if by == BY_STAMP else 0
-    return MessageFilter(log_ns - IN_BAG_NS - slack_ns, log_ns + slack_ns + 1, lambda channel: channel.type in KINDS)
+        return [['query', f'shadowhound-data query {span} --by {by}'], *cuts, *exports]
+    pulls = [['pull', f'shadowhound-data pull {span}']] if is_kept else []
+    fetch = ['fetch', f'shadowhound-data fetch {span} --to data']
+    return [['query', f'shadowhound-data query {span}'], fetch, *cuts, *exports, *pulls]
 
 
 def _is_new(offset_ns: int, known: Iterable[int]) -> bool:
@@ -511,31 +636,64 @@ def _spans(found: Sequence[tuple[str, int, int]], begin_ns: int, end_ns: int) ->
     yield from ((name, max(begin_ns, from_ns), min(end_ns, to_ns)) for name, (from_ns, to_ns) in spans.items())
 
 
-def _slices(files: Sequence[PastObject], manifest: Manifest | None, at_ns: int) -> list[PastObject]:
-    """The files of a bag that may have messages of a moment."""
+def _slices(files: Sequence[PastObject], manifest: Manifest | None, at_ns: int, before_ns: int = IN_BAG_NS) -> list[PastObject]:
+    """The files of a bag that may have messages of a moment, or of the time before it."""
     spans = {} if manifest is None else {one.file: (one.t_start_ns, one.t_end_ns) for one in manifest.slices}
     found = []
     for one in files:
         begin_ns, end_ns = spans.get(one.key.rpartition('/')[2], (one.begin_ns, one.end_ns))
-        if one.key.endswith('.mcap') and begin_ns <= at_ns and end_ns >= at_ns - IN_BAG_NS:
+        if one.key.endswith('.mcap') and begin_ns <= at_ns and end_ns >= at_ns - before_ns:
             found.append(one)
-    return found[:4]
+    return found[:4] if before_ns == IN_BAG_NS else found
 
 
-def _runs(days: Sequence[PastDay], begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-    """(topic, from, to) of the times in which objects follow one another."""
-    grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
-    for day in days:
-        inside = (day.begins < end_ns) & (day.ends >= begin_ns)
-        codes, begins, ends = day.codes[inside], day.begins[inside], day.ends[inside]
-        for code, name in list(enumerate(day.names))[:MAX_TOPICS]:
-            chosen = codes == code
-            if not name or name == 'bag' or not chosen.any():
-                continue
-            starts, reached = begins[chosen], np.maximum.accumulate(ends[chosen])
-            breaks = np.flatnonzero(starts[1:] - reached[:-1] > grain_ns) + 1
-            for low, high in zip((0, *breaks.tolist()), (*breaks.tolist(), len(starts)), strict=True):
-                yield name, max(begin_ns, int(starts[low])), min(end_ns, int(reached[high - 1]))
+def _joined(runs: Sequence[Run], grain_ns: int) -> list[tuple[str, int, int]]:
+    """(topic, from, to) of those that follow one another."""
+    found: list[tuple[str, int, int]] = []
+    for name, begin_ns, end_ns, *_ in runs:
+        last = found[-1] if found else ('', 0, 0)
+        if last[0] == name and begin_ns - last[2] <= grain_ns:
+            found[-1] = name, last[1], max(last[2], end_ns)
+        else:
+            found.append((name, begin_ns, end_ns))
+    return found
+
+
+def _row(name: str, from_ns: int, to_ns: int, begin_ns: int, end_ns: int) -> list[Any]:
+    """For the page: within the time that is shown."""
+    return [_text(name), round(max(from_ns, begin_ns) / 1e6, 1), round(min(to_ns, end_ns) / 1e6, 1)]
+
+
+def _deliveries(runs: Sequence[Run], grain_ns: int, now_ns: int) -> Iterator[tuple[int, int, int | None]]:
+    """(from, to, delivered) of times whose objects left the spool late; None while some of them wait."""
+    steps: dict[int, list[Any]] = {}
+    for run in runs:
+        step = steps.setdefault(run.begin_ns // grain_ns, [run.begin_ns, run.end_ns, 0, False])
+        step[:] = min(step[0], run.begin_ns), max(step[1], run.end_ns), max(step[2], run.settled_ns or 0), step[3] or run.waits
+    last: list[Any] | None = None
+    for _, (begin_ns, end_ns, settled_ns, waits) in sorted(steps.items()):
+        is_late = (now_ns if waits else settled_ns) - end_ns > LATE_NS
+        if last is not None and (not is_late or last[3] != waits):
+            yield last[0], last[1], None if last[3] else last[2]
+            last = None
+        if is_late:
+            last = last or [begin_ns, end_ns, settled_ns, waits]
+            last[1:3] = max(last[1], end_ns), max(last[2], settled_ns)
+    if last is not None:
+        yield last[0], last[1], None if last[3] else last[2]
+
+
+def _after(before: LiveItem, item: LiveItem) -> LiveItem:
+    """A series of a bag, with what the objects have of the time before it: a plot keeps its range."""
+    head, old = item.head or {}, before.head or {}
+    if 'rows' not in head or old.get('names') != head.get('names'):
+        return item
+    rows, count, width = head['rows'], old['rows'], len(head['names'])
+    first_ms = float(np.frombuffer(item.body, '<f8', rows)[0]) if rows else INFINITE_MS
+    times = np.frombuffer(before.body, '<f8', count)
+    left = int(np.searchsorted(times, first_ms))
+    body = times[:left].tobytes() + item.body[: 8 * rows] + before.body[8 * count :][: 4 * width * left] + item.body[8 * rows :]
+    return LiveItem(item.topic, item.kind, head={**head, 'rows': rows + left}, body=body)
 
 
 def _track(poses: Sequence[tuple[int, tuple[float, float, float]]]) -> Iterator[LiveItem]:

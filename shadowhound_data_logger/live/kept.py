@@ -96,12 +96,14 @@ class SpoolKept:
     def rows(self, robot: str, begin_ns: int, end_ns: int) -> list[Mapping[str, Any]]:
         """Those that are kept. Raises SpoolError."""
         want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
-        found = self._read(lambda index: list(index.overview.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns)))
+        found = self._read(
+            lambda index: list(index.overview.recorded(robot, begin_ns - LONGEST_SLICE_NS, end_ns, state=State.KEPT))
+        )
         return [
             {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
              'received_start_ns': received_ns, 'received_end_ns': received_end_ns, 'where': ON_ROBOT}
-            for _, key, state, _, sensor, topic, _, size, start_ns, last_ns, received_ns, received_end_ns, *_ in found
-            if state == State.KEPT.value and want.takes(key, sensor, topic, start_ns, last_ns, {})
+            for _, key, _, _, sensor, topic, _, size, start_ns, last_ns, received_ns, received_end_ns, *_ in found
+            if want.takes(key, sensor, topic, start_ns, last_ns, {})
         ]  # fmt: skip
 
     def mbps(self, robot: str) -> float | None:

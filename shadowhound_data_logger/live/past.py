@@ -12,14 +12,14 @@ import re
 import sqlite3
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -39,7 +39,9 @@ from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import HERE
+from shadowhound_data_logger.spool.overview_table import MAX_NS
 from shadowhound_data_logger.spool.status import read as read_status
+from shadowhound_data_logger.spool.table import after
 from shadowhound_data_logger.stores import open_reader, open_store
 
 if TYPE_CHECKING:
@@ -51,7 +53,17 @@ MOST_ROWS: Final = 1_500_000
 """Of a day: a robot that stores every message of everything makes some 600,000."""
 MAX_DAYS_KEPT: Final = 3
 FRESH_S: Final = 10.0
-"""A day that goes on is read again after so long."""
+"""A time that has just passed is read again after so long."""
+SETTLED_S: Final = 300.0
+"""The same of an older one: some of it may still arrive."""
+LONGEST_BATCH_NS: Final = 15 * SECOND
+BLOCK_NS: Final = 60 * SECOND
+"""Of a spool so much is read together."""
+MAX_BLOCKS: Final = 60
+"""Of those that are kept, each with some 1,000 objects."""
+MAX_MISSIONS: Final = 1000
+MS: Final = SECOND // 1000
+BAG_SENSOR: Final = 'bag'
 KEPT_BYTES: Final = 48 << 20
 """Of contents that were read: neighbouring moments are of the same objects."""
 MAX_BAGS: Final = 200
@@ -89,56 +101,77 @@ class PastObject:
 
 
 class PastDay:
-    """The objects that begin on one day, by time."""
+    """The rows of a catalog of the objects that begin on one day, by time."""
 
-    def __init__(self, begins: NDArray[np.int64], ends: NDArray[np.int64], names: Sequence[str], codes: NDArray[np.int32],
-                 rows: Any, problem: str = '') -> None:  # fmt: skip
-        self.begins, self.ends, self.names, self.codes = begins, ends, names, codes
-        """``names[codes[n]]`` is the topic of row n, or its sensor where nobody knows the topic."""
-        self._rows = rows
-        self.problem = problem
+    def __init__(self, rows: Any, problem: str = '') -> None:
+        """``rows`` is a table of pyarrow with ``_COLUMNS``, sorted by ``t_start_ns``."""
+        import pyarrow as pa  # noqa: PLC0415 - the extra lake
+        import pyarrow.compute as pc  # noqa: PLC0415
+
+        self._rows, self.problem = rows, problem
+        self.begins: NDArray[np.int64] = rows['t_start_ns'].to_numpy()
+        self.ends: NDArray[np.int64] = np.maximum(self.begins, pc.fill_null(rows['t_end_ns'], 0).to_numpy())
+        names = pc.dictionary_encode(pc.coalesce(rows['topic'], rows['sensor'], pa.scalar(''))).combine_chunks()
+        self._codes = names.indices.to_numpy().astype(np.int32)
+        self._names = [str(name) for name in names.dictionary.to_pylist()]
+
+    def runs(self, begin_ns: int, end_ns: int, grain_ns: int) -> Iterator[Run]:
+        """Those in which no pause is longer than ``grain_ns``."""
+        inside = (self.begins < end_ns) & (self.ends >= begin_ns)
+        codes, begins, ends = self._codes[inside], self.begins[inside], self.ends[inside]
+        for code, name in enumerate(self._names):
+            chosen = codes == code
+            if _is_bookkeeping(name) or not chosen.any():
+                continue
+            starts, reached = begins[chosen], np.maximum.accumulate(ends[chosen])
+            breaks = np.flatnonzero(starts[1:] - reached[:-1] > grain_ns) + 1
+            for low, high in zip((0, *breaks.tolist()), (*breaks.tolist(), len(starts)), strict=True):
+                yield Run(name, int(starts[low]), int(reached[high - 1]))
 
     def between(self, begin_ns: int, end_ns: int) -> list[PastObject]:
         """Those that begin in this time."""
         low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
-        if isinstance(self._rows, list):
-            return self._rows[low:high]
         return [_of_catalog(row) for row in self._rows.slice(low, max(0, high - low)).to_pylist()]
 
     @cached_property
-    def missions(self) -> list[tuple[str, str, int, int]]:
-        """(id, type, first, last)."""
-        found: dict[str, list[Any]] = {}
-        if isinstance(self._rows, list):
-            for one in self._rows:
-                if one.mission_id:
-                    _widen(found, one.mission_id, one.mission_type, one.begin_ns, one.end_ns)
-        else:
-            known = self._rows.select(['mission_id', 'mission_type', 't_start_ns', 't_end_ns'])
-            told = known.group_by('mission_id').aggregate([('mission_type', 'max'), ('t_start_ns', 'min'), ('t_end_ns', 'max')])
-            for row in told.to_pylist():
-                if row['mission_id']:
-                    begin_ns, end_ns = row['t_start_ns_min'], row['t_end_ns_max'] or 0
-                    _widen(found, row['mission_id'], row['mission_type_max'] or '', begin_ns, max(begin_ns, end_ns))
-        return [(name, *values) for name, values in found.items()]
+    def missions(self) -> list[PastMission]:
+        known = self._rows.select(['mission_id', 'mission_type', 't_start_ns', 't_end_ns'])
+        told = known.group_by('mission_id').aggregate([('mission_type', 'max'), ('t_start_ns', 'min'), ('t_end_ns', 'max')])
+        return [
+            PastMission(row['mission_id'], row['mission_type_max'] or '', row['t_start_ns_min'],
+                        max(row['t_start_ns_min'], row['t_end_ns_max'] or 0))
+            for row in told.to_pylist() if row['mission_id']
+        ]  # fmt: skip
 
     @cached_property
     def bag_files(self) -> dict[str, list[PastObject]]:
         """Files of bags, by bag."""
-        files: dict[str, list[PastObject]] = {}
-        if isinstance(self._rows, list):
-            chosen = [one for one in self._rows if '/rosbags/' in one.key]
-        else:
-            import pyarrow.compute as pc  # noqa: PLC0415 - only where the rows are pyarrow's
+        import pyarrow.compute as pc  # noqa: PLC0415 - the extra lake
 
-            chosen = [
-                _of_catalog(row) for row in self._rows.filter(pc.match_substring(self._rows['key'], '/rosbags/')).to_pylist()
-            ]
-        for one in chosen:
-            bag, slash, _ = one.key.partition('/rosbags/')[2].partition('/')
-            if slash and (bag in files or len(files) < MAX_BAGS):
-                files.setdefault(bag, []).append(one)
-        return files
+        chosen = self._rows.filter(pc.match_substring(self._rows['key'], '/rosbags/'))
+        return _by_bag([_of_catalog(row) for row in chosen.to_pylist()])
+
+
+class Run(NamedTuple):
+    """Objects of one topic that follow one another, or a part of them."""
+
+    name: str
+    """The topic, or the sensor where nobody knows the topic."""
+    begin_ns: int
+    end_ns: int
+    settled_ns: int | None = None
+    """When they left the spool; None where that is unknown."""
+    waits: bool = False
+    """Whether some of them are in the spool."""
+
+
+class PastMission(NamedTuple):
+    """What is known of a mission's time."""
+
+    id: str
+    type: str
+    begin_ns: int
+    end_ns: int
 
 
 class PastSource(Protocol):
@@ -149,8 +182,23 @@ class PastSource(Protocol):
     def days(self, robot: str) -> list[str]:
         """Dates with something recorded, ``YYYY-MM-DD``."""
 
-    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
-        """The objects that begin on it, by their stamps or by the arrival of their messages."""
+    def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
+        """What was recorded in this time, by stamps or by the arrival of messages; pauses below ``grain_ns`` may be missing.
+
+        Of each topic in the order of time; runs of a topic may meet.
+        """
+
+    def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
+        """Those of this time, as far as they are known after ``runs`` of it."""
+
+    def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
+        """Objects that begin in this time, in its order."""
+
+    def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
+        """Files of bags that begin on the dates of this time, by bag."""
+
+    def problem(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> str:
+        """What of this time cannot be read; empty if all of it can."""
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """As ``SpoolFigures.gaps``."""
@@ -227,9 +275,11 @@ class SpoolPast:
 
     def __init__(self, spool: Path, robot: str) -> None:
         self._spool, self._robot = spool, robot
-        self._tree = Tree(spool)
+        self._folder = lru_cache(64)(lambda state, reason, bucket: str(Tree(spool).path(State(state), reason, bucket, '')))
         self._clock = SystemClock.of_this_machine()
-        self._kept: OrderedDict[str, tuple[float, PastDay]] = OrderedDict()
+        self._blocks: OrderedDict[tuple[str, str, int], tuple[float, list[PastObject]]] = OrderedDict()
+        self._bags: dict[tuple[str, str, str], tuple[float, dict[str, list[PastObject]]]] = {}
+        self._missions: dict[tuple[str, str, str], PastMission] = {}
 
     def robots(self) -> list[str]:
         return [self._robot]
@@ -245,27 +295,124 @@ class SpoolPast:
                 found.add(f'{utc(at_ns):%Y-%m-%d}')
         return sorted(found)
 
-    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
-        """Raises SpoolError."""
-        return _kept(self._kept, f'{date} {by}', lambda: self._read(robot, date, by))
-
-    def _read(self, robot: str, date: str, by: str) -> PastDay:
-        begin_ns = date_ns(date)
-        topics = {row.sensor: topic for topic, row in read_status(self._spool, robot, self._clock).node.topics.items()}
+    def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
+        """Looks at the first and the last object of each ``grain_ns`` only. Raises SpoolError."""
+        found: list[Run] = []
         with closing(self._index()) as index, _reading(self._spool):
-            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, begin_ns + DAY_NS, by)]
-            topics |= {one.sensor: one.topic for one in found if one.topic}
-            for bucket, key, sensor, size, settled_s, late_ms in _compact_rows(index, robot, begin_ns, by):
-                bag = key.partition('/rosbags/')[2].partition('/')[0]
-                late_ns = late_ms * (SECOND // 1000)
-                offset_ns = late_ns if by == BY_RECEIVED else 0
-                at_ns = ((_bag_begin(bag) if bag else _stamp(key)) or 0) + offset_ns
-                if begin_ns <= at_ns < begin_ns + DAY_NS:
-                    end_ns = max(at_ns, settled_s * SECOND) if bag else at_ns
-                    found.append(PastObject(bucket, key, sensor, topics.get(sensor, ''), '', size, at_ns, end_ns,
-                                            late_ns=late_ns, offset_ns=offset_ns))  # fmt: skip
-        found.sort(key=lambda one: one.begin_ns)
-        return _day(found[:MOST_ROWS], 'this is not all of the day' if len(found) > MOST_ROWS else '')
+            topics = self._topics(index, robot)
+            for sensor in index.overview.sensors():
+                if not _is_bookkeeping(sensor):
+                    found += self._runs_of_rows(index, robot, sensor, begin_ns, end_ns, grain_ns, by)
+            for folder in _folders(index, robot, begin_ns, end_ns, by):
+                if not _is_bookkeeping(folder.sensor):
+                    name = topics.get(folder.sensor, folder.sensor)
+                    found += _runs_of_names(index, folder, name, begin_ns, end_ns, grain_ns, by)
+        return sorted(found, key=lambda run: (run.name, run.begin_ns))
+
+    def _runs_of_rows(self, index: Index, robot: str, sensor: str, begin_ns: int, end_ns: int, grain_ns: int,
+                      by: str) -> Iterator[Run]:  # fmt: skip
+        edge = partial(index.overview.edge, robot, sensor, by=by)
+        at_ns = begin_ns - LONGEST_BATCH_NS
+        while at_ns < end_ns and (first := edge(at_ns, end_ns, is_last=False)) is not None:
+            at_ns = first[0] + grain_ns
+            both = first, edge(first[0], min(at_ns, end_ns), is_last=True) or first
+            ends_ns = [max(start_ns, (received_ns or start_ns) if by == BY_RECEIVED else last_ns)
+                       for start_ns, _, last_ns, received_ns, *_ in both]  # fmt: skip
+            for start_ns, _, _, _, _, _, _, mission, kind in both:
+                if mission:
+                    self._widen(robot, by, PastMission(mission, kind or '', start_ns, max(ends_ns)))
+            settled = [settled_ns for *_, settled_ns, _, _ in both if settled_ns is not None]
+            yield Run(both[0][4] or sensor, first[0], max(ends_ns), max(settled, default=None),
+                      any(row[5] == State.PENDING.value for row in both))  # fmt: skip
+
+    def _widen(self, robot: str, by: str, one: PastMission) -> None:
+        known = self._missions.pop((robot, by, one.id), one)
+        self._missions[robot, by, one.id] = PastMission(one.id, known.type or one.type, min(known.begin_ns, one.begin_ns),
+                                                        max(known.end_ns, one.end_ns))  # fmt: skip
+        while len(self._missions) > MAX_MISSIONS:
+            del self._missions[next(iter(self._missions))]
+
+    def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
+        return [one for (of, clock, _), one in self._missions.items()
+                if (of, clock) == (robot, by) and one.end_ns >= begin_ns and one.begin_ns <= end_ns]  # fmt: skip
+
+    def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
+        """Read by blocks, which neighboring moments share. Raises SpoolError."""
+        numbers = range(begin_ns // BLOCK_NS, (max(begin_ns, end_ns - 1)) // BLOCK_NS + 1)
+        now_s, now_ns = time.monotonic(), self._clock.wall_ns()
+        lacking = []
+        for number in numbers:
+            is_new = (number + 1) * BLOCK_NS > now_ns - 2 * BLOCK_NS
+            known = self._blocks.get((robot, by, number))
+            if known is None or now_s - known[0] > (FRESH_S if is_new else SETTLED_S):
+                lacking.append(number)
+        for first, last in consecutive(lacking):
+            found: dict[int, list[PastObject]] = {number: [] for number in range(first, last + 1)}
+            for one in self._read(robot, first * BLOCK_NS, (last + 1) * BLOCK_NS, by):
+                found[one.begin_ns // BLOCK_NS].append(one)
+            for number, block in found.items():
+                self._blocks[robot, by, number] = now_s, block
+        chosen = []
+        for number in numbers:
+            chosen += [one for one in self._blocks[robot, by, number][1] if begin_ns <= one.begin_ns < end_ns]
+            self._blocks.move_to_end((robot, by, number))
+        while len(self._blocks) > max(MAX_BLOCKS, len(numbers)):
+            self._blocks.popitem(last=False)
+        return chosen
+
+    def _read(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[PastObject]:
+        with closing(self._index()) as index, _reading(self._spool):
+            topics = self._topics(index, robot)
+            sensors = [sensor for sensor in index.overview.sensors() if sensor != BAG_SENSOR]
+            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, sensors)]
+            for folder in _folders(index, robot, begin_ns, end_ns, by):
+                found += _of_names(index, folder, topics.get(folder.sensor, ''), begin_ns, end_ns, by)
+        return sorted(found, key=lambda one: one.begin_ns)
+
+    def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
+        """Raises SpoolError."""
+        found: dict[str, list[PastObject]] = {}
+        now_s = time.monotonic()
+        for date in dates_between(begin_ns, end_ns):
+            known = self._bags.get((robot, by, date))
+            if known is None or now_s - known[0] > FRESH_S:
+                known = self._bags[robot, by, date] = now_s, _by_bag(self._read_bags(robot, date_ns(date), by))
+            for bag, files in known[1].items():
+                found.setdefault(bag, []).extend(files)
+        while len(self._bags) > MAX_DAYS_KEPT:
+            del self._bags[next(iter(self._bags))]
+        return found
+
+    def _read_bags(self, robot: str, begin_ns: int, by: str) -> list[PastObject]:
+        end_ns = begin_ns + DAY_NS
+        with closing(self._index()) as index, _reading(self._spool):
+            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, [BAG_SENSOR])]
+            around = (-DAY_NS, 0, DAY_NS) if by == BY_RECEIVED else (0,)
+            for number, bucket, path, sensor in (
+                row for step_ns in around for row in index.overview.folders_of(robot, f'{utc(begin_ns + step_ns):%Y%m%d}')
+            ):
+                at_ns = _bag_begin(path.partition('/rosbags/')[2].partition('/')[0])
+                for name, size, settled_s, late_ms in index.overview.compact(number, '', after('')) if at_ns else ():
+                    offset_ns = late_ms * MS if by == BY_RECEIVED else 0
+                    start_ns = (at_ns or 0) + offset_ns
+                    if begin_ns <= start_ns < end_ns:
+                        last_ns = max(start_ns, settled_s * SECOND)
+                        found.append(PastObject(bucket, path + name, sensor, '', '', size, start_ns, last_ns,
+                                                late_ns=late_ms * MS, offset_ns=offset_ns))  # fmt: skip
+        return found
+
+    def problem(self, *_: object) -> str:
+        """Nothing: an index that cannot be read is an error."""
+        return ''
+
+    def _topics(self, index: Index, robot: str) -> dict[str, str]:
+        """Sensor -> topic, as the node has them now or its newest objects have them: short rows do not."""
+        found = {row.sensor: topic for topic, row in read_status(self._spool, robot, self._clock).node.topics.items()}
+        for sensor in index.overview.sensors():
+            newest = index.overview.edge(robot, sensor, 0, MAX_NS, BY_STAMP, is_last=True)
+            if newest is not None and newest[4]:
+                found[sensor] = newest[4]
+        return found
 
     def _of_row(self, row: tuple[Any, ...], by: str) -> PastObject:
         """Of a row of ``OverviewTable.recorded``."""
@@ -276,7 +423,7 @@ class SpoolPast:
         if offset_ns:
             begin_ns, end_ns = received_ns, received_end_ns or received_ns
         is_here = State(state) in HERE
-        path = str(self._tree.path(State(state), reason, bucket, key)) if is_here else ''
+        path = f'{self._folder(state, reason, bucket)}/{key}' if is_here else ''
         return PastObject(
             bucket, content or key, sensor, topic or '', kind or '', size, begin_ns, max(begin_ns, end_ns), mission or '',
             mission_type or '', _pose(pose), _number(battery), late_ns, offset_ns, path,
@@ -323,15 +470,54 @@ class StorePast:
         found = dates(self._source, robot, (schema.OBJECTS, schema.KEPT), self._findings)
         return [date for date in found if date > schema.UNDATED]
 
-    def day(self, robot: str, date: str, by: str = BY_STAMP) -> PastDay:
+    def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
         """Raises StoreError."""
-        return _kept(self._kept, f'{robot} {date} {by}', lambda: self._read(robot, date, by))
+        days = self._days(robot, begin_ns - LONGEST_BATCH_NS, end_ns, by)
+        return sorted(run for day in days for run in day.runs(begin_ns, end_ns, grain_ns))
+
+    def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
+        """Raises StoreError."""
+        found: dict[str, PastMission] = {}
+        for one in (one for day in self._days(robot, begin_ns, end_ns, by) for one in day.missions):
+            known = found.get(one.id, one)
+            found[one.id] = PastMission(
+                one.id, known.type or one.type, min(known.begin_ns, one.begin_ns), max(known.end_ns, one.end_ns)
+            )
+        return list(found.values())
+
+    def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
+        """Raises StoreError."""
+        return [one for day in self._days(robot, begin_ns, end_ns, by) for one in day.between(begin_ns, end_ns)]
+
+    def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
+        """Raises StoreError."""
+        found: dict[str, list[PastObject]] = {}
+        for day in self._days(robot, begin_ns, end_ns, by):
+            for bag, files in day.bag_files.items():
+                found.setdefault(bag, []).extend(files)
+        return found
+
+    def problem(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> str:
+        """Raises StoreError."""
+        return next((day.problem for day in self._days(robot, begin_ns, end_ns, by) if day.problem), '')
+
+    def _days(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[PastDay]:
+        return [self._day(robot, date, by) for date in dates_between(begin_ns, end_ns)]
+
+    def _day(self, robot: str, date: str, by: str) -> PastDay:
+        """As it was read, again after a while: it may go on, and older days still arrive."""
+        name, now_s = f'{robot} {date} {by}', time.monotonic()
+        known = self._kept.get(name)
+        fresh_s = FRESH_S if date_ns(date) + 2 * DAY_NS > time.time_ns() else SETTLED_S
+        if known is None or now_s - known[0] > fresh_s:
+            known = self._kept[name] = (time.monotonic(), self._read(robot, date, by))
+            while len(self._kept) > MAX_DAYS_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(name)
+        return known[1]
 
     def _read(self, robot: str, date: str, by: str) -> PastDay:
-        import pyarrow as pa  # noqa: PLC0415 - the extra lake
-        import pyarrow.compute as pc  # noqa: PLC0415
-
-        from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
+        from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake.views import rows_of  # noqa: PLC0415
 
         findings = Findings(lambda _: None)
@@ -341,14 +527,9 @@ class StorePast:
             where, has_date = f't_start_ns >= {begin_ns} AND t_start_ns < {begin_ns + DAY_NS}', schema.UNDATED.__ne__
         table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=has_date, where=where,
                         columns=_COLUMNS, order='t_start_ns, key', limit=MOST_ROWS, by=by)  # fmt: skip
-        begins = table['t_start_ns'].to_numpy()
-        ends = np.maximum(begins, pc.fill_null(table['t_end_ns'], 0).to_numpy())
-        names = pc.dictionary_encode(pc.coalesce(table['topic'], table['sensor'], pa.scalar(''))).combine_chunks()
-        codes = names.indices.to_numpy().astype(np.int32)
         left = [f'{one.key}: {one.why}' for one in findings][:3]
         problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''
-        return PastDay(begins, ends, [str(name) for name in names.dictionary.to_pylist()], codes, table,
-                       problem or ('this is not all of the day' if len(table) >= MOST_ROWS else ''))  # fmt: skip
+        return PastDay(table, problem or ('this is not all of the day' if len(table) >= MOST_ROWS else ''))
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """Raises StoreError."""
@@ -383,18 +564,6 @@ def dates_between(begin_ns: int, end_ns: int) -> list[str]:
     return [str(first + timedelta(days=number)) for number in range((last - first).days + 1)]
 
 
-def _kept(kept: OrderedDict[str, tuple[float, PastDay]], name: str, read: Callable[[], PastDay]) -> PastDay:
-    """The day as it was read, again after a while: it may go on, and older days still arrive."""
-    now_s = time.monotonic()
-    known = kept.get(name)
-    if known is None or now_s - known[0] > FRESH_S:
-        known = kept[name] = (time.monotonic(), read())
-        while len(kept) > MAX_DAYS_KEPT:
-            kept.popitem(last=False)
-    kept.move_to_end(name)
-    return known[1]
-
-
 @contextmanager
 def _reading(spool: Path) -> Iterator[None]:
     try:
@@ -403,20 +572,89 @@ def _reading(spool: Path) -> Iterator[None]:
         raise SpoolError(f'the index of {spool} cannot be read: {error}') from error
 
 
-def _compact_rows(index: Index, robot: str, begin_ns: int, by: str) -> Iterator[tuple[str, str, str, int, int, int]]:
-    """Of objects that may be of the day that begins then: their keys have the date of the stamp."""
-    around = (-DAY_NS, 0, DAY_NS) if by == BY_RECEIVED else (0,)
-    for step_ns in around:
-        yield from index.overview.recorded_compact(robot, f'{utc(begin_ns + step_ns):%Y%m%d}')
+class _Folder(NamedTuple):
+    """A folder of short rows, whose keys have the time of their objects: the date in the path, the rest in the name."""
+
+    id: int
+    bucket: str
+    path: str
+    sensor: str
+    date_ns: int
+    late_ns: tuple[int, int]
+    """By how much its times are behind those of the chosen clock: minimum and maximum."""
+
+    def name(self, at_ns: int) -> str:
+        """The first name of that second."""
+        seconds = min(max(0, (at_ns - self.date_ns) // SECOND), 24 * 3600)
+        return f'{seconds // 3600:02}{seconds // 60 % 60:02}{seconds % 60:02}'
+
+    def at_ns(self, row: tuple[str, int, int, int], by: str) -> int | None:
+        """When the object of a short row begins."""
+        at_ns = _stamp(self.path + row[0])
+        return None if at_ns is None else at_ns + (row[3] * MS if by == BY_RECEIVED else 0)
 
 
-def _day(found: list[PastObject], problem: str) -> PastDay:
-    names = sorted({one.topic or one.sensor for one in found})
-    places = {name: place for place, name in enumerate(names)}
-    return PastDay(
-        np.array([one.begin_ns for one in found], np.int64), np.array([one.end_ns for one in found], np.int64), names,
-        np.array([places[one.topic or one.sensor] for one in found], np.int32), found, problem,
-    )  # fmt: skip
+def _folders(index: Index, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Folder]:
+    """Those that may have objects of a time."""
+    around_ns = DAY_NS if by == BY_RECEIVED else 0
+    for date in dates_between(begin_ns - around_ns, end_ns + around_ns):
+        for number, bucket, path, sensor in index.overview.folders_of(robot, date.replace('-', '')):
+            if path.endswith(f'/{date.replace("-", "")}/'):
+                late_ms = index.overview.delays_ms(number) if by == BY_RECEIVED else (0, 0)
+                yield _Folder(number, bucket, path, sensor, date_ns(date), (late_ms[0] * MS, late_ms[1] * MS))
+
+
+def _of_names(index: Index, folder: _Folder, topic: str, begin_ns: int, end_ns: int, by: str) -> Iterator[PastObject]:
+    first, last = folder.name(begin_ns - folder.late_ns[1]), folder.name(end_ns - folder.late_ns[0] + SECOND)
+    for row in index.overview.compact(folder.id, first, last):
+        at_ns = folder.at_ns(row, by)
+        if at_ns is not None and begin_ns <= at_ns < end_ns:
+            late_ns = row[3] * MS
+            yield PastObject(folder.bucket, folder.path + row[0], folder.sensor, topic, '', row[1], at_ns, at_ns,
+                             late_ns=late_ns, offset_ns=late_ns if by == BY_RECEIVED else 0)  # fmt: skip
+
+
+def _runs_of_names(index: Index, folder: _Folder, name: str, begin_ns: int, end_ns: int, grain_ns: int, by: str) -> Iterator[Run]:
+    """Names are in the order of time; the first and the last of each ``grain_ns`` are looked at."""
+    edge = partial(index.overview.compact_edge, folder.id)
+    step = -(-grain_ns // SECOND) * SECOND
+    at_ns, until_ns = begin_ns - folder.late_ns[1], end_ns - folder.late_ns[0]
+    while at_ns < until_ns and (first := edge(folder.name(at_ns), folder.name(until_ns + SECOND), is_last=False)) is not None:
+        stamp_ns = _stamp(folder.path + first[0])
+        if stamp_ns is None:
+            at_ns += step
+            continue
+        at_ns = stamp_ns // SECOND * SECOND + step
+        both = first, edge(first[0], folder.name(at_ns), is_last=True) or first
+        times = [each for each in (folder.at_ns(row, by) for row in both) if each is not None]
+        settled_ns = max(row[2] for row in both) * SECOND
+        if abs(both[0][3] - both[1][3]) * MS > grain_ns:
+            yield from (Run(name, each, each, settled_ns) for each in sorted(times) if begin_ns <= each < end_ns)
+        elif min(times) < end_ns and max(times) >= begin_ns:
+            yield Run(name, min(times), max(times), settled_ns)
+
+
+def _is_bookkeeping(name: str) -> bool:
+    """Whether a sensor has no data of the robot: bags have their own marks."""
+    return not name or name in {BAG_SENSOR, 'missions'} or name.startswith('_')
+
+
+def _by_bag(files: Iterable[PastObject]) -> dict[str, list[PastObject]]:
+    found: dict[str, list[PastObject]] = {}
+    for one in files:
+        bag, slash, _ = one.key.partition('/rosbags/')[2].partition('/')
+        if slash and (bag in found or len(found) < MAX_BAGS):
+            found.setdefault(bag, []).append(one)
+    return found
+
+
+def consecutive(numbers: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """First and last of those that follow one another."""
+    for place, number in enumerate(numbers):
+        if not place or numbers[place - 1] != number - 1:
+            first = number
+        if place + 1 == len(numbers) or numbers[place + 1] != number + 1:
+            yield first, number
 
 
 def _of_catalog(row: Mapping[str, Any]) -> PastObject:
@@ -427,11 +665,6 @@ def _of_catalog(row: Mapping[str, Any]) -> PastObject:
         row['battery_pct'], 0 if row['received_start_ns'] is None else row['received_start_ns'] - row['t_start_ns'],
         row['clock_offset_ns'] or 0,
     )  # fmt: skip
-
-
-def _widen(found: dict[str, list[Any]], name: str, kind: str, begin_ns: int, end_ns: int) -> None:
-    known = found.setdefault(name, [kind, begin_ns, end_ns])
-    known[:] = known[0] or kind, min(known[1], begin_ns), max(known[2], end_ns)
 
 
 def _stamp(key: str) -> int | None:
@@ -446,11 +679,12 @@ def _bag_begin(bag: str) -> int | None:
 
 
 def _parsed(text: str, millis: int) -> int | None:
+    parts = [int(text[:4]), *(int(text[place : place + 2]) for place in range(4, 14, 2))]
     try:
-        at = datetime.strptime(text, '%Y%m%d%H%M%S').replace(tzinfo=timezone.utc)
+        at = datetime(parts[0], parts[1], parts[2], parts[3], parts[4], parts[5], tzinfo=timezone.utc)
     except ValueError:
         return None
-    return int(at.timestamp()) * SECOND + millis * (SECOND // 1000)
+    return int(at.timestamp()) * SECOND + millis * MS
 
 
 def _pose(text: object) -> tuple[float, float, float] | None:

@@ -33,7 +33,7 @@ class PastRoutes:
     def routes(self) -> list[web.RouteDef]:
         return [
             web.get('/api/gaps', self._gaps),
-            web.get('/api/past/{do:robots|days|timeline|moment|kept|requests}', self._past),
+            web.get('/api/past/{do:robots|days|timeline|range|moment|kept|requests}', self._past),
         ]  # fmt: skip
 
     async def close(self) -> None:
@@ -77,12 +77,12 @@ class PastRoutes:
 
     async def _past(self, request: web.Request) -> web.StreamResponse:
         do, robot = request.match_info['do'], request.query.get('robot', self._robot)
-        takes = {'timeline': ('from', 'to'), 'kept': ('from', 'to'), 'moment': ('at',)}.get(do, ())
+        takes = {'timeline': ('from', 'to'), 'range': ('from', 'to'), 'kept': ('from', 'to'), 'moment': ('at',)}.get(do, ())
         try:
             times = {name: query_ms(request, name) for name in takes}
         except ValueError as error:
             return problem(400, str(error))
         if not is_name(robot) or None in times.values():
             return problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
-        by = {'by': request.query['by']} if 'by' in request.query else {}
-        return await self.ask(do, robot, {**times, **by})
+        more = {name: request.query[name] for name in ('by', 'fit') if name in request.query}
+        return await self.ask(do, robot, {**times, **more})

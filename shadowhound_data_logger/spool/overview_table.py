@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_words as words
-from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
 from shadowhound_data_logger.spool.history_table import CATALOG
 from shadowhound_data_logger.spool.object_table import IN_SPOOL
 from shadowhound_data_logger.spool.table import Table, after
 
+DAY_NS: Final = 24 * 3600 * SECOND
+MAX_NS: Final = (1 << 63) - 1
 _DESCRIBED: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
 _RECEIVED: Final = tuple(
     f"CAST(json_extract(metadata, '$.{word}') AS INTEGER)" for word in (words.RECEIVED_START_NS, words.RECEIVED_END_NS)
 )
+_ARRIVED: Final = """ifnull(CASE WHEN json_valid(metadata)
+  THEN CAST(json_extract(metadata, '$.received_start_ns') AS INTEGER) END, t_start_ns)"""
+"""The expression of the index ``arrived`` in schema.sql."""
+_START: Final = {BY_STAMP: 't_start_ns', BY_RECEIVED: _ARRIVED}
+_SENSORS: Final = f"""
+WITH RECURSIVE found(name) AS (SELECT min(sensor) FROM objects UNION ALL
+  SELECT (SELECT min(sensor) FROM objects WHERE sensor > found.name) FROM found WHERE found.name IS NOT NULL)
+SELECT name FROM found WHERE name IS NOT NULL AND name <> '{CATALOG}'"""  # noqa: S608 - own constants only
+"""Seeks one row per sensor instead of reading all rows."""
 
 
 class OverviewTable(Table):
@@ -50,39 +61,88 @@ class OverviewTable(Table):
             (state and state.value, sensor, prefix, prefix),
         )
 
-    def recorded(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> Iterator[tuple[Any, ...]]:
+    def sensors(self) -> list[str]:
+        """Sensors of objects with full rows, except the catalog."""
+        return [name for (name,) in self._db.execute(_SENSORS)]
+
+    def recorded(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP, sensors: Sequence[str] | None = None,
+                 state: State | None = None) -> Iterator[tuple[Any, ...]]:  # fmt: skip
         """Objects of a robot that are not lost and begin in this time, with what the catalog has of them, by time.
 
         (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, received_start_ns, received_end_ns,
         mission_id, mission_type, pose, battery, content_key); objects with a short row are not included.
         """
-        start = f'ifnull({_RECEIVED[0]}, t_start_ns)' if by == BY_RECEIVED else 't_start_ns'
+        start = _START[by]
         described = ', '.join(f"json_extract(metadata, '$.{word}')" for word in _DESCRIBED)
+        sensors = self.sensors() if sensors is None else sensors
+        state_is = "state <> 'evicted'" if state is None else f"state = '{state.value}'"
         return self._db.execute(
             'SELECT bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns,'  # noqa: S608
             f' {", ".join(_RECEIVED)}, {described} FROM objects'
-            f" WHERE {start} >= ? AND {start} < ? AND key >= ? AND key < ? AND state <> 'evicted'"
-            f" AND sensor <> '{CATALOG}' AND json_valid(metadata) ORDER BY {start}",
-            (begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),
+            f' WHERE sensor IN ({", ".join("?" * len(sensors))}) AND {start} >= ? AND {start} < ? AND key >= ? AND key < ?'
+            f' AND {state_is} AND json_valid(metadata) ORDER BY {start}',
+            (*sensors, begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),
         )
 
-    def recorded_compact(self, robot: str, date: str) -> Iterator[tuple[str, str, str, int, int, int]]:
-        """Short rows of delivered objects in folders with this ``YYYYMMDD``: (bucket, key, sensor, bytes, settled_s, late_ms)."""
+    def edge(self, robot: str, sensor: str, begin_ns: int, end_ns: int, by: str, *, is_last: bool) -> tuple[Any, ...] | None:
+        """The first or the last object of a sensor that begins in this time and is not lost, found without reading others.
+
+        (start by that clock, t_start_ns, t_end_ns, received_end_ns, topic, state, settled_ns, mission, mission_type)
+        """
+        start = _START[by]
+        row: tuple[Any, ...] | None = self._db.execute(
+            f'SELECT {start}, t_start_ns, t_end_ns, {_RECEIVED[1]}, topic, state, settled_ns, mission,'  # noqa: S608
+            f" json_extract(metadata, '$.{words.MISSION_TYPE}') FROM objects"
+            f' WHERE sensor = ? AND {start} >= ? AND {start} < ? AND key >= ? AND key < ?'
+            f" AND state <> 'evicted' AND json_valid(metadata) ORDER BY {start} {'DESC' if is_last else ''} LIMIT 1",
+            (sensor, begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),
+        ).fetchone()
+        return row
+
+    def folders_of(self, robot: str, date: str) -> list[tuple[int, str, str, str]]:
+        """Folders of keys with short rows that have this ``YYYYMMDD``: (id, bucket, path, sensor)."""
         return self._db.execute(
-            'SELECT bucket, path || name, sensor, bytes, settled_s, late_ms FROM folders'  # noqa: S608
-            ' JOIN compact_objects ON folder = folders.id'
-            f" WHERE path >= ? AND path < ? AND instr(path, ?) AND state <> 2 AND sensor <> '{CATALOG}'",
+            'SELECT id, bucket, path, sensor FROM folders'  # noqa: S608
+            f" WHERE path >= ? AND path < ? AND instr(path, ?) AND sensor <> '{CATALOG}'",
             (f'{robot}/', after(f'{robot}/'), date),
+        ).fetchall()
+
+    def delays_ms(self, folder: int) -> tuple[int, int]:
+        """How much later than their stamps the objects of a folder arrived: minimum and maximum; both 0 without objects."""
+        least, most = self._db.execute(
+            'SELECT min(late_ms), max(late_ms) FROM compact_objects WHERE folder = ? AND state <> 2', (folder,)
+        ).fetchone()
+        return least or 0, most or 0
+
+    def compact(self, folder: int, first: str, last: str) -> Iterator[tuple[str, int, int, int]]:
+        """Short rows of objects that are not lost, with names from ``first`` to before ``last``.
+
+        (name, bytes, settled_s, late_ms)
+        """
+        return self._db.execute(
+            'SELECT name, bytes, settled_s, late_ms FROM compact_objects'
+            ' WHERE folder = ? AND name >= ? AND name < ? AND state <> 2',
+            (folder, first, last),
         )
+
+    def compact_edge(self, folder: int, first: str, last: str, *, is_last: bool) -> tuple[str, int, int, int] | None:
+        """The first or last of these, found without reading others."""
+        row: tuple[str, int, int, int] | None = self._db.execute(
+            'SELECT name, bytes, settled_s, late_ms FROM compact_objects WHERE folder = ? AND name >= ? AND name < ?'  # noqa: S608
+            f' AND state <> 2 ORDER BY name {"DESC" if is_last else ""} LIMIT 1',
+            (folder, first, last),
+        ).fetchone()
+        return row
 
     def recorded_days(self, robot: str) -> list[int]:
         """Days since 1970 on which objects with full rows begin."""
-        rows = self._db.execute(
-            'SELECT DISTINCT t_start_ns / 86400000000000 FROM objects WHERE key >= ? AND key < ? AND t_start_ns >= ?'  # noqa: S608
-            f" AND sensor <> '{CATALOG}'",
-            (f'{robot}/', after(f'{robot}/'), EARLIEST_SANE_NS),
-        )
-        return [day for (day,) in rows]
+        found = set()
+        for sensor in self.sensors():
+            at_ns = EARLIEST_SANE_NS
+            while (row := self.edge(robot, sensor, at_ns, MAX_NS, BY_STAMP, is_last=False)) is not None:
+                found.add(row[1] // DAY_NS)
+                at_ns = (row[1] // DAY_NS + 1) * DAY_NS
+        return sorted(found)
 
     def folders(self, robot: str) -> list[str]:
         """Folders of keys with short rows."""

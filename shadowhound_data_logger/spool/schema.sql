@@ -40,6 +40,10 @@ CREATE INDEX kept ON objects (id, bytes) WHERE state = 'kept';
 CREATE INDEX evictable ON objects (priority DESC, id, bytes) WHERE state IN ('pending', 'held') AND NOT protected;
 CREATE INDEX quarantined ON objects (reason, bytes) WHERE state = 'quarantined';
 CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
+-- The past of a sensor by either of its two times, which the live page seeks in.
+CREATE INDEX begun ON objects (sensor, t_start_ns);
+CREATE INDEX arrived ON objects (sensor, ifnull(CASE WHEN json_valid(metadata)
+  THEN CAST(json_extract(metadata, '$.received_start_ns') AS INTEGER) END, t_start_ns));
 
 -- Messages by topic of an object that has several (a bag's slice).
 CREATE TABLE contents (

@@ -337,7 +337,7 @@ def test_a_bag_is_read_by_ranges(store: ObjectStore, opened: Opened, tmp_path: P
     monkeypatch.setattr(type(store), 'ranges', counted)
     head, shown = asked(history, 50.55)
     assert shown['/bagged'][1] == jpeg(100)
-    assert shown['/imu'][0]['rows'] == 151
+    assert shown['/imu'][0]['rows'] >= 151
     assert [key for key in got if key.endswith('.mcap')] == []
     assert 0 < sum(sent) < max(row['bytes'] for row in rows) / 5
     cut = dict(head['commands'])['bag cut']
@@ -390,10 +390,16 @@ def test_labels_are_marks_and_an_operator_adds_them(store: ObjectStore, opened: 
     history = opened(StorePast())
     noon = NOON_NS // 1_000_000
     timeline = {'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000}
-    assert [mark for mark in history.answer(timeline)[0]['marks'] if mark[0] == 'label'] == []
+
+    def labelled() -> list[Any]:
+        while (found := history.answer(timeline)[0])['labels']:
+            assert not found['problem']
+        return [mark for mark in found['marks'] if mark[0] == 'label']
+
+    assert labelled() == []
     given = {'do': 'label', 'robot': 'thor', 'note': HOSTILE, 'by': 'operator at ::1', 'from': noon + 1000, 'to': noon + 2500}
     added, _ = history.answer({**given, 'label': 'stairs'})
-    (mark,) = [mark for mark in history.answer(timeline)[0]['marks'] if mark[0] == 'label']
+    (mark,) = labelled()
     assert mark[:4] == ['label', 'stairs', noon + 1000, noon + 2500]
     assert mark[4].endswith('by operator at ::1')
     assert '\x1b' not in mark[4]
@@ -468,7 +474,7 @@ def test_what_a_spool_keeps_is_asked_of_its_node(store: ObjectStore, opened: Ope
 
 def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectStore, tmp_path: Path,
                                                  monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    """The rest is told, and that the labels are still being read."""
+    """The rest is shown, and that the labels are still being read."""
     patrol(store, tmp_path)
     answers = threading.Event()
     monkeypatch.setattr(module, 'LABELS_S', 0.01)
@@ -479,7 +485,7 @@ def test_a_store_that_is_away_delays_no_timeline(opened: Opened, store: ObjectSt
     finally:
         answers.set()
     assert [kind for kind, *_ in found['marks']] == ['mission']
-    assert 'still being read' in found['problem']
+    assert (found['labels'], found['problem']) == ('reading', '')
 
 
 @pytest.mark.parametrize('question', [
