@@ -63,7 +63,7 @@ class Auth:
         except web.HTTPException as error:
             response = problem(error.status, error.text or error.reason)
         if not response.prepared:
-            response.headers.update(SECURITY)
+            response.headers.update({name: value for name, value in SECURITY.items() if name not in response.headers})
         return response
 
     def _problem_of(self, request: web.Request) -> web.StreamResponse | None:
@@ -71,7 +71,7 @@ class Auth:
         if not self._names.has(request.host, own[0] if own else ''):
             return problem(403, f'this page is not called {request.host[:100]!r}: see --hostname')
         is_ws = request.path == '/ws'
-        if is_ws or request.method not in ('GET', 'HEAD'):
+        if is_ws or request.method not in ('GET', 'HEAD', 'OPTIONS'):
             if not is_same_origin(request.headers.get('Origin'), request.host, self._scheme):
                 return problem(403, 'the request does not come from this page')
             if (request.content_length or 0) > MAX_BODY:

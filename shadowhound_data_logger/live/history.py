@@ -196,8 +196,9 @@ class PastReader:
         runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
         bags = list(self._marks_of_bags(robot, begin_ns, end_ns, by))
         kept = self._kept_runs(robot, begin_ns, end_ns, by)
-        if is_fitted and (begins := [*(run.begin_ns for run in runs), *(one[1] for one in kept)]):
-            ends = [*(run.end_ns for run in runs), *(one[2] for one in kept)]
+        times = [*((run.begin_ns, run.end_ns) for run in runs), *(one[1:] for one in kept), *(mark[2:4] for mark in bags)]
+        if is_fitted and times:
+            begins, ends = zip(*times, strict=True)
             spare_ns = max(SECOND, (max(ends) - min(begins)) // 40)
             begin_ns, end_ns = max(begin_ns, min(begins) - spare_ns), min(end_ns, max(ends) + spare_ns)
             grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
@@ -239,7 +240,7 @@ class PastReader:
     def range(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """What there is of a time, and the commands that get it. Raises ValueError, DataLoggerError.
 
-        ``bags``: [name, bytes of what covers the time], of those from which the time can be cut.
+        ``bags``: [name, bytes of what covers the time, from, to], of those from which the time can be cut, by arrival.
         """
         near = self._source.between(robot, begin_ns - PATH_NS, min(end_ns, begin_ns + PATH_NS), by)
         late = _offsets(near) if by == BY_STAMP else [0]
@@ -252,7 +253,8 @@ class PastReader:
         missions = [one.id for one in self._source.missions(robot, begin_ns, end_ns, by)]
         return {
             'from': begin_ns / 1e6, 'to': end_ns / 1e6,
-            'bags': [[_text(bag), size] for bag, size in bags.items() if is_name(bag)],
+            'bags': [[bag, size, (begin_ns + min(late)) // 1_000_000, (end_ns + max(late)) // 1_000_000]
+                     for bag, size in bags.items() if is_name(bag)],
             'commands': commands(robot, begin_ns, end_ns, list(bags), by, (min(late), max(late)), missions, is_kept=bool(kept)),
         }  # fmt: skip
 

@@ -30,6 +30,7 @@ from shadowhound_data_logger.live.acts import Acts
 from shadowhound_data_logger.live.answers import REQUEST_S, problem
 from shadowhound_data_logger.live.auth import MAX_BODY, Auth, Handler
 from shadowhound_data_logger.live.cameras import Cameras
+from shadowhound_data_logger.live.cuts import Cuts
 from shadowhound_data_logger.live.figures import SpoolFigures
 from shadowhound_data_logger.live.history_process import HistoryProcess
 from shadowhound_data_logger.live.kinds import LiveItem
@@ -101,6 +102,7 @@ class LiveServer:
         self.past = PastRoutes(
             history, self._figures, self._pool, self._reading, settings.robot, is_of_store=settings.is_of_store
         )
+        self.cuts = Cuts(self.auth, settings.tokens, None if settings.is_of_store else settings.spool)
         self.acts = Acts(self.auth, self.past, self._pool, settings.spool, settings.robot, is_of_store=settings.is_of_store)
         self._topics: Topics | None = None
         self._relay: Relay | None = None
@@ -116,6 +118,7 @@ class LiveServer:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
         app.add_routes([
             web.get('/ws', self.viewers.serve), *self.auth.routes(), *self.acts.routes(), *self.past.routes(),
+            *self.cuts.routes(),
             web.get('/{name:.*}', self._file),
         ])  # fmt: skip
         logging.getLogger('aiohttp.server').addFilter(_is_ours)
@@ -150,6 +153,7 @@ class LiveServer:
         if self._runner is not None:
             await self._runner.cleanup()
         await self.past.close()
+        self.cuts.close()
         await self.cameras.close()
         if self._relay is not None:
             await self._relay.close()

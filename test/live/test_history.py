@@ -7,6 +7,8 @@ import json
 import os
 import shlex
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -103,6 +105,7 @@ def patrol(store: ObjectStore, folder: Path) -> None:
             ('odom', '/odom', ODOMETRY, 'json', odometry(second)),
         ):
             rows.append(told(second, sensor, topic, kind, extension, mission_id='m1', mission_type='patrol'))
+            rows[-1]['bytes'] = len(body)
             add(store, folder / 'tmp', rows[-1]['key'], body)
     add_part(store, rows, 'a', folder / 'tmp')
 
@@ -529,3 +532,144 @@ def test_the_process_ends_when_nobody_asks_and_comes_again(store: ObjectStore, t
         await slow.close()
 
     asyncio.run(run())
+
+
+def pauses(found: list[list[Any]], topic: str) -> list[tuple[int, int]]:
+    """From and to of what was recorded of a topic, in seconds after noon."""
+    noon = NOON_NS_OF_SPOOL // 1_000_000
+    return [(round(begin - noon) // 1000, round(end - noon) // 1000) for name, begin, end in found if name == topic]
+
+
+@pytest.mark.parametrize('is_compact', [False, True])
+@pytest.mark.parametrize('by', ['stamp', 'received'])
+def test_a_timeline_of_a_spool_has_every_pause(
+    store: ObjectStore, opened: Opened, tmp_path: Path, by: str, *, is_compact: bool
+) -> None:
+    """Though only the first and the last object of each step are read; bookkeeping is not data; ``fit`` opens at the data."""
+    clock = FakeClock()
+    spool = new_spool(tmp_path / 'spool', clock)
+    spool.open()
+    late_s = 100 if by == 'received' else 0
+    seconds = [*range(20), *range(40, 50), 60, *range(80, 83)]
+    try:
+        for sensor, topic in (('camera', '/camera'), ('_ledger', '/ledger')):
+            for second in seconds:
+                at_ns = NOON_NS_OF_SPOOL + second * SECOND
+                arrived = str(at_ns + late_s * SECOND)
+                key = f'thor/{sensor}/20251018/12{second // 60:02}{second % 60:02}_front.jpg'
+                (item,) = put(spool, make(key, b'x', sensor=sensor, topic=topic, t_start_ns=at_ns, t_end_ns=at_ns,
+                                          metadata={'received_start_ns': arrived, 'received_end_ns': arrived}))  # fmt: skip
+                settle(spool, item, State.DELIVERED)
+    finally:
+        spool.close()
+    with index_of(tmp_path / 'spool') as index:
+        index.catalog.clear()
+        if is_compact:
+            with index.transaction():
+                index.history.compact(clock.wall_ns() + 1)
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
+    noon = NOON_NS_OF_SPOOL // 1_000_000
+    day = {'do': 'timeline', 'robot': 'thor', 'from': noon - 3_600_000, 'to': noon + 3_600_000, 'by': by}
+    found, _ = history.answer({**day, 'fit': 1})
+    assert noon + 1000 * (late_s - 20) <= found['from'] < noon + 1000 * late_s
+    assert noon + 1000 * (late_s + 82) < found['to'] <= noon + 1000 * (late_s + 102)
+    topic = 'camera' if is_compact else '/camera'
+    expected = [(begin + late_s, end + late_s) for begin, end in ((0, 19), (40, 49), (60, 60), (80, 82))]
+    assert pauses(found['recorded'], topic) == expected
+    assert {name for name, *_ in found['recorded']} == {topic}
+    part, _ = history.answer({**day, 'from': noon + 1000 * (late_s + 45), 'to': noon + 1000 * (late_s + 81) + 500})
+    assert pauses(part['recorded'], topic) == [(late_s + 45, late_s + 49), (late_s + 60, late_s + 60), (late_s + 80, late_s + 81)]
+
+
+def test_what_was_delivered_late_and_what_waits(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Of an outage of the store from 10 s on, which ended after two minutes: until when it waited; and of what waits now."""
+    clock = FakeClock()
+    spool = new_spool(tmp_path / 'spool', clock)
+    spool.open()
+    try:
+        made = []
+        for second in range(40):
+            at_ns = NOON_NS_OF_SPOOL + second * SECOND
+            made += put(spool, make(f'thor/camera/20251018/1200{second:02}_f.jpg', b'x', t_start_ns=at_ns, t_end_ns=at_ns))
+        for begin, end, settled_s in ((0, 10, 11), (10, 30, 150)):
+            clock.now_ns = NOON_NS_OF_SPOOL + settled_s * SECOND
+            for item in made[begin:end]:
+                settle(spool, item, State.DELIVERED)
+    finally:
+        spool.close()
+    noon = NOON_NS_OF_SPOOL // 1_000_000
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
+    found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon, 'to': noon + 60_000})
+    (late, waits) = found['deliveries']
+    assert late[2] == noon + 150_000
+    assert noon + 6000 <= late[0] <= noon + 10_000
+    assert waits[2] is None
+    assert noon + 27_000 <= waits[0] <= noon + 30_000
+    assert waits[1] == noon + 39_000
+
+
+def ran(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A command line of the page, as a shell has it."""
+    words = shlex.split(command)
+    assert words[0] == 'shadowhound-data'
+    line = [sys.executable, '-m', 'shadowhound_data_logger.cli.main', *words[1:]]
+    return subprocess.run(line, cwd=folder, env=dict(os.environ), capture_output=True, text=True, check=False, timeout=240)
+
+
+def test_the_commands_of_a_time_run(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Query finds what is there, fetch and bag cut make files, export names the mission."""
+    patrol(store, tmp_path)
+    name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
+    add_part(store, bag(store, tmp_path, name, 'bump', seconds=3), 'b', tmp_path / 'tmp')
+    history = opened(StorePast())
+    noon = NOON_NS // 1_000_000
+    found, _ = history.answer({'do': 'range', 'robot': 'thor', 'from': noon + 2000, 'to': noon + 22_000})
+    assert [each[0] for each in found['bags']] == [name]
+    lines = dict(found['commands'])
+    assert list(lines) == ['query', 'fetch', 'bag cut', 'export']
+    (tmp_path / 'there').mkdir()
+    told = ran(f'{lines["query"]} --json', tmp_path / 'there')
+    assert len(json.loads(told.stdout)) >= 16, told.stderr
+    for what, made in (('fetch', 'data'), ('bag cut', 'cut')):
+        told = ran(lines[what], tmp_path / 'there')
+        assert told.returncode == 0, told.stderr
+        assert any(path.is_file() for path in (tmp_path / 'there' / made).rglob('*'))
+    told = ran(f'{lines["export"]} --dry-run', tmp_path / 'there')
+    assert told.returncode in {0, 1}
+    assert 'm1' in told.stdout + told.stderr
+
+
+def test_what_is_kept_can_be_pulled_with_the_command(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """It is told only where something of the time is on the robot."""
+    with closing(Field(tmp_path)) as field:
+        field.records(*range(6))
+        history = opened(StorePast())
+        noon = NOON_NS_OF_SPOOL // 1_000_000
+        lines = dict(history.answer({'do': 'range', 'robot': 'thor', 'from': noon, 'to': noon + 2500})[0]['commands'])
+        told = ran(f'{lines["pull"]} --dry-run --json', tmp_path)
+        assert told.returncode == 0, told.stderr
+        assert '"objects": 3' in told.stdout, told.stdout
+        later = history.answer({'do': 'range', 'robot': 'thor', 'from': noon + 60_000, 'to': noon + 70_000})[0]
+        assert 'pull' not in dict(later['commands'])
+
+
+def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """What objects have of the time before what was read of the bag is in the same series."""
+    rows = [told(second, 'imu', '/imu', IMU, 'json') for second in range(12, 21)]
+    vector, turn = {'x': 1.0, 'y': 2.0, 'z': 3.0}, {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+    for second, row in zip(range(12, 21), rows, strict=True):
+        unknown = {f'{each}_covariance': [0.0] * 9 for each in ('orientation', 'angular_velocity', 'linear_acceleration')}
+        sample = {'stamp_ns': NOON_NS + second * SECOND, 'orientation': turn, 'angular_velocity': vector,
+                  'linear_acceleration': vector, **unknown}  # fmt: skip
+        add(store, tmp_path / 'tmp', row['key'], json.dumps({'type': IMU, 'samples': [sample]}).encode())
+    name = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
+    add_part(store, [*rows, *bag(store, tmp_path, name, 'bump', seconds=5)], 'a', tmp_path / 'tmp')
+    head, body = asked(opened(StorePast()), 21.505)[1]['/imu']
+    times = np.frombuffer(body, '<f8', head['rows'])
+    noon = NOON_NS // 1_000_000
+    assert times[0] == noon + 12_000
+    assert times[-1] == noon + 21_500
+    assert (np.diff(times) > 0).all()
+    assert len(times) > 150
+    figures = np.frombuffer(body, '<f4', offset=8 * head['rows']).reshape(head['rows'], -1)
+    assert (figures == figures[0]).all()

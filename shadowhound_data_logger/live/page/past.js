@@ -2,7 +2,7 @@
 import { batch, signal } from './vendor/preact.js';
 
 const PIECE_MS = 125; // between two moments that are played, where they can be read that fast
-const LONGEST_MS = 1000; // what takes longer plays slower
+const SLOWEST_MS = 1000; // what takes longer plays slower
 const TICK_MS = 20;
 
 export const past = signal(null); // null: now; else { robot, at, mission, shown, commands }
@@ -15,6 +15,9 @@ export const speed = signal(1);
 export const clock = signal('stamp'); // by which of the two times of its messages a moment is shown: stamp, or received
 export const robots = signal([]);
 export const days = signal([]);
+export const selection = signal(null); // a time that somebody marked: { from, to }
+export const SHORTEST_MS = 2000;
+export const LONGEST_MS = 48 * 3600000;
 
 let onItems = () => {};
 export function show(handler) {
@@ -92,24 +95,59 @@ export function showBy(chosen) {
 
 export function leave() {
   batch(() => {
-    past.value = range.value = told.value = wanted = null;
+    past.value = range.value = told.value = selection.value = wanted = sought = null;
     playing.value = false;
     problem.value = '';
   });
 }
 
-let loading = 0;
-export async function look(robot, from, to) {
-  const mine = (loading += 1);
-  range.value = { robot, from, to };
-  try {
-    const found = await (await ask('timeline', { robot, from: Math.round(from), to: Math.round(to), by: clock.value })).json();
-    if (mine !== loading || range.value === null) return;
-    told.value = found;
-    problem.value = '';
-  } catch (error) {
-    if (mine === loading) problem.value = reason(error);
+export async function timeline(robot, from, to, more = {}) {
+  return (await ask('timeline', { robot, from: Math.round(from), to: Math.round(to), by: clock.value, ...more })).json();
+}
+
+export async function spanOf(robot, from, to) {
+  return (await ask('range', { robot, from: Math.round(from), to: Math.round(to), by: clock.value })).json();
+}
+
+let sought = null; // the range that is asked for next: however fast somebody zooms, one question is open at a time
+let seeking = null;
+async function seek() {
+  while (sought) {
+    const { robot, from, to, more } = sought;
+    sought = null;
+    try {
+      const found = await timeline(robot, from, to, more);
+      if (range.value === null) return;
+      batch(() => {
+        if (more.fit && !sought) range.value = { robot, from: found.from, to: found.to };
+        told.value = { ...found, robot };
+        problem.value = '';
+      });
+      if (found.labels) setTimeout(() => { if (range.value && !sought) look(range.value.robot, range.value.from, range.value.to); }, 1000);
+    } catch (error) {
+      if (!sought) problem.value = reason(error);
+    }
   }
+}
+
+export function look(robot, from, to, more = {}) {
+  range.value = { robot, from, to };
+  sought = { robot, from, to, more };
+  seeking ??= seek().finally(() => { seeking = null; });
+  return seeking;
+}
+
+// The same length, or another, around a place that stays where it is.
+export function zoom(at, factor) {
+  const { robot, from, to } = range.value;
+  const length = Math.min(LONGEST_MS, Math.max(SHORTEST_MS, (to - from) * factor));
+  const begin = at - ((at - from) / (to - from)) * length;
+  look(robot, begin, begin + length);
+}
+
+export function pan(ms) {
+  const { robot, from, to } = range.value;
+  look(robot, from + ms, to + ms);
 }
 
 export async function list(robot) {
@@ -127,7 +165,7 @@ export async function list(robot) {
 const DAY_MS = 86400000;
 export async function openDay(robot, day) {
   const from = Date.parse(`${day}T00:00:00Z`);
-  await look(robot, from, from + DAY_MS);
+  await look(robot, from, from + DAY_MS, { fit: 1 });
   const { recorded = [], kept = [] } = told.value ?? {};
   const last = [...recorded, ...kept].reduce((most, [, , to]) => Math.max(most, to), 0);
   go(robot, last || from + DAY_MS / 2);
@@ -145,7 +183,7 @@ const end = () => Math.min(range.value?.to ?? Infinity, told.value?.now ?? Infin
 // The moment after this one, which is as far from it as the last one took to come.
 function askAhead(robot, at) {
   const now = performance.now();
-  const passed = Math.min(LONGEST_MS, Math.max(PIECE_MS, now - shownAt));
+  const passed = Math.min(SLOWEST_MS, Math.max(PIECE_MS, now - shownAt));
   shownAt = now;
   const next = Math.min(at + passed * speed.value, end());
   ahead = { robot, at: next, answer: read(robot, next) };

@@ -5,7 +5,7 @@ import { clock, digits, moment, span, volume } from './words.js';
 
 const EVERY_MS = 5000;
 const PAUSE_MS = 400;
-const AROUND_MS = 5000; // of the moment, where no time was begun
+const AROUND_MS = 5000; // of the moment, where no time is selected
 const OPEN = ['asked', 'accepted', 'sending', 'active'];
 
 async function read(what, more) {
@@ -25,14 +25,14 @@ function Request({ each, mbps, mayCancel, cancel }) {
     ${isOpen && mayCancel && html` <button type="button" onClick=${() => cancel(each.id)}>Cancel</button>`}</li>`;
 }
 
-export function Pull({ session, robot, begin }) {
+export function Pull({ session, robot, selected }) {
   const [kept, setKept] = useState({});
   const [asked, setAsked] = useState({ requests: [], mbps: null });
   const [sensor, setSensor] = useState('');
   const [said, setSaid] = useState(['', '']);
   const [rounds, again] = useState(0);
   const at = Math.round(past.value.at);
-  const [from, to] = begin === null ? [at - AROUND_MS, at + AROUND_MS] : [Math.min(begin, at), Math.max(begin, at) + 1];
+  const [from, to] = selected ? [Math.round(selected[0]), Math.round(selected[1]) + 1] : [at - AROUND_MS, at + AROUND_MS];
   const mayAct = session.role === 'operator';
 
   useEffect(() => {

@@ -1,10 +1,12 @@
 // What was recorded and what is missing, by topic and time: of today beside the live view, of any day when looking back.
-import { html, useEffect, useRef, useState } from './vendor/preact.js';
+import { html, useEffect, useMemo, useRef, useState } from './vendor/preact.js';
+import { GapWords } from './gaps.js';
 import {
-  busy, clock as shownBy, days, go, leave, list, look, openDay, openRobot, past, playing, problem as pastProblem, range, robots, showBy, speed, told,
+  busy, clock as shownBy, days, go, leave, list, look, openDay, openRobot, pan, past, playing, problem as pastProblem, range, robots, selection, showBy, spanOf, speed,
+  timeline, told, zoom,
 } from './past.js';
 import { Pull } from './pull.js';
-import { clock, digits, meaning, moment, shade, span } from './words.js';
+import { clock, digits, meaning, moment, shade, span, volume } from './words.js';
 
 const SPANS = [[15, '15 min'], [60, '1 h'], [360, '6 h'], [0, 'Today']];
 const ZOOMS = [[1, '1 min'], [15, '15 min'], [60, '1 h'], [360, '6 h'], [1440, '24 h']];
@@ -12,8 +14,14 @@ const SPEEDS = [0.5, 1, 4, 16, 60];
 const EVERY_MS = 5000;
 const ROW = 26;
 const LANE = 17;
+const AXIS = 26;
 const MINUTE = 60000;
+const DAY = 1440 * MINUTE;
+const AROUND_MS = 5000; // of a moment, on either side
+const CLICK_PX = 4; // what moves less is no drag
 const STEPS = [1, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10800].map((seconds) => seconds * 1000);
+const exact = (ms) => new Date(ms).toISOString().slice(11, 21);
+const named = (found) => (found?.gaps ?? []).map((row) => Object.fromEntries(found.columns.map((name, place) => [name, row[place]])));
 
 function ticks(from, to) {
   const step = STEPS.find((each) => (to - from) / each <= 8) ?? 14400000;
@@ -73,35 +81,88 @@ export function Copy({ text }) {
   return html`<button type="button" onClick=${copy}>${said}</button>`;
 }
 
-function Commands() {
-  const [what, setWhat] = useState('moment');
-  const commands = (what === 'moment' ? past.value?.commands : told.value?.commands) ?? [];
-  return html`<div class="commands"><div class="panel-head"><h3>On a command line</h3><select aria-label="Of which time" value=${what} onChange=${(event) => setWhat(event.target.value)}>
+// A piece of a bag: made when somebody asks for it, then a link that other viewers can open too.
+const VIEWERS = [['Foxglove', 'https://app.foxglove.dev/~/view?ds=remote-file&ds.url='], ['Foxglove on this computer', 'foxglove://open?ds=remote-file&ds.url='], ['Lichtblick', 'lichtblick://open?ds=remote-file&ds.url=']];
+function Piece({ session, robot, bag, size, from, to }) {
+  const [state, setState] = useState('');
+  const [made, setMade] = useState(null);
+  const cut = async () => {
+    setState('cutting…');
+    try {
+      const answer = await fetch('/api/cut', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ robot, bag, from, to }) });
+      const content = await answer.json();
+      setState(answer.ok ? '' : content.error);
+      if (answer.ok) setMade(content);
+    } catch {
+      setState('it cannot be reached');
+    }
+  };
+  const address = made && new URL(made.path, location.href).href;
+  return html`<p class="download" data-bag=${bag}><span class="row-name">bag</span><span>${bag} <span class="unit">${made ? html`${digits(made.messages)} messages, ${volume(made.bytes)}; the links work for 15 minutes` : `the files of this time have ${volume(size)}`}</span>
+      ${state && state !== 'cutting…' && html` <span class="note bad" role="alert">${state}</span>`}</span>
+    ${made ? html`<span class="links"><a class="button" data-piece href=${made.path} download>Download MCAP</a>${VIEWERS.map(([name, link]) => html`<a class="button" data-viewer=${name} target="_blank" rel="noopener" href=${link + encodeURIComponent(address)}>${name}</a>`)}</span>`
+      : html`<button type="button" data-cut=${bag} disabled=${state === 'cutting…'} onClick=${cut}>${state === 'cutting…' ? state : 'Cut as MCAP'}</button>`}</p>`;
+}
+
+// The commands of a time, as they can be pasted into a shell; the bags that have it can be downloaded here.
+function Commands({ session, robot, selected }) {
+  const [what, setWhat] = useState('');
+  const [found, setFound] = useState(null);
+  const [failed, setFailed] = useState('');
+  const chosen = what === 'selection' && !selected ? '' : what || (selected ? 'selection' : 'moment');
+  const { at } = past.value;
+  const [from, to] = chosen === 'selection' ? selected : chosen === 'range' && range.value ? [range.value.from, range.value.to] : [at - AROUND_MS, at + AROUND_MS];
+  useEffect(() => {
+    if (chosen === 'moment') return undefined; // its answer has them
+    let isOver = false;
+    const timer = setTimeout(() => spanOf(robot, from, to).then((content) => { if (!isOver) { setFound(content); setFailed(''); } }, (error) => !isOver && setFailed(error.message)), 250);
+    return () => {
+      isOver = true;
+      clearTimeout(timer);
+    };
+  }, [robot, from, to, chosen, shownBy.value]);
+  const commands = chosen === 'moment' ? past.value.commands : found?.commands ?? [];
+  const bags = chosen === 'moment' ? [] : found?.bags ?? [];
+  return html`<div class="commands"><div class="panel-head"><h3>Get this data</h3><select aria-label="Of which time" value=${chosen} onChange=${(event) => setWhat(event.target.value)}>
+      ${selected && html`<option value="selection">the selected ${span((to - from) / 1000)}</option>`}
       <option value="moment">5 s around this moment</option><option value="range">all that the timeline shows</option></select></div>
+    ${failed && html`<p class="note bad" role="alert">${failed}</p>`}
+    ${bags.map(([bag, size, start, end]) => html`<${Piece} key=${`${bag} ${start} ${end}`} session=${session} robot=${robot} bag=${bag} size=${size} from=${start} to=${end} />`)}
     ${commands.map(([name, line]) => html`<p key=${line}><span class="row-name">${name}</span><code data-command=${name}>${line}</code><${Copy} text=${line} /></p>`)}</div>`;
 }
 
-function Transport({ robot }) {
+function Transport({ robot, begin, setBegin, jump }) {
   const { at } = past.value;
   const step = (ms) => go(robot, at + ms);
+  const jumps = [['gap', -1, '‹ Gap', 'Previous gap'], ['gap', 1, 'Gap ›', 'Next gap'], ['event', -1, '‹ Event', 'Previous event'], ['event', 1, 'Event ›', 'Next event']];
   return html`<div class="row transport"><button type="button" onClick=${() => step(-10000)} aria-label="10 seconds back">−10 s</button>
     <button type="button" onClick=${() => step(-1000)} aria-label="1 second back">−1 s</button>
     <button type="button" class="primary" onClick=${() => { playing.value = !playing.value; }} aria-pressed=${playing.value} data-play>${playing.value ? 'Pause' : 'Play'}</button>
     <button type="button" onClick=${() => step(1000)} aria-label="1 second on">+1 s</button>
     <button type="button" onClick=${() => step(10000)} aria-label="10 seconds on">+10 s</button>
     <select aria-label="How fast" value=${speed.value} onChange=${(event) => { speed.value = Number(event.target.value); }}>${SPEEDS.map((each) => html`<option value=${each}>${each}×</option>`)}</select>
-    <select aria-label="By which time of the messages" value=${shownBy.value} onChange=${(event) => showBy(event.target.value)}>
+    <select aria-label="By which time of the messages" title="Stamp: when it was measured. Arrival: when the robot's computer got it." value=${shownBy.value} onChange=${(event) => showBy(event.target.value)}>
       <option value="stamp">by stamp</option><option value="received">by arrival</option></select>
+    <span class="tabs" role="group" aria-label="Jump to">${jumps.map(([what, direction, name, said]) => html`<button type="button" aria-label=${said} data-jump=${`${what} ${direction}`} onClick=${() => jump(what, direction)}>${name}</button>`)}</span>
+    <button type="button" aria-pressed=${begin !== null} title="Select the time from this moment to where you go next" onClick=${() => { selection.value = null; setBegin(begin === null ? Math.round(at) : null); }}>From here</button>
     <time class="moment" data-moment=${Math.round(at)}>${moment(at)}</time><span class="unit">UTC${past.value.mission ? ` · ${past.value.mission}` : ''}${busy.value ? ' · reading…' : ''}</span></div>`;
 }
 
-// An operator says what there is to see: of this moment, or of the time since "From here".
-function LabelForm({ session, robot, begin, setBegin }) {
+function Selected({ selected, clear }) {
+  const [from, to] = selected;
+  return html`<p class="row selected" data-selected=${`${Math.round(from)} ${Math.round(to)}`}><b>Selected</b> ${exact(from)} to ${exact(to)} <span class="unit">UTC, ${span((to - from) / 1000)}</span>
+    <button type="button" onClick=${() => look(range.value.robot, from - (to - from) * 0.1, to + (to - from) * 0.1)}>Zoom to it</button>
+    <button type="button" onClick=${() => document.querySelector('.commands')?.scrollIntoView({ block: 'nearest' })}>Commands and downloads</button>
+    <button type="button" onClick=${clear}>Clear</button></p>`;
+}
+
+// An operator says what there is to see: of this moment, or of the time that is selected.
+function LabelForm({ session, robot, selected, clear }) {
   const [label, setLabel] = useState('');
   const [note, setNote] = useState('');
   const [said, setSaid] = useState(['', '']);
   const at = Math.round(past.value.at);
-  const [from, to] = begin === null ? [at, at] : [Math.min(begin, at), Math.max(begin, at)];
+  const [from, to] = selected?.map(Math.round) ?? [at, at];
   const submit = async (event) => {
     event.preventDefault();
     try {
@@ -111,7 +172,7 @@ function LabelForm({ session, robot, begin, setBegin }) {
       if (!answer.ok) return;
       setLabel('');
       setNote('');
-      setBegin(null);
+      clear();
       look(robot, range.value.from, range.value.to);
     } catch {
       setSaid(['bad', 'it cannot be reached']);
@@ -119,9 +180,16 @@ function LabelForm({ session, robot, begin, setBegin }) {
   };
   return html`<form class="row label-form" onSubmit=${submit}><input aria-label="Label" name="label" placeholder="label, such as stairs" required maxlength="200" value=${label} onInput=${(event) => setLabel(event.target.value)} />
     <input aria-label="Note on the label" placeholder="a note" maxlength="500" value=${note} onInput=${(event) => setNote(event.target.value)} />
-    <button type="button" aria-pressed=${begin !== null} onClick=${() => setBegin(begin === null ? at : null)}>From here</button>
-    <button class="primary" data-act="label">${begin === null ? 'Label this moment' : `Label ${span((to - from) / 1000)}`}</button>
+    <button class="primary" data-act="label">${!selected ? 'Label this moment' : `Label ${span((to - from) / 1000)}`}</button>
     ${said[1] && html`<span class=${`note ${said[0]}`} role="status">${said[1]}</span>`}</form>`;
+}
+
+// The part of a time that has anything in it, with some room; all of it where that is most of it.
+function fitted(found) {
+  const begins = [...found.known.map(([, since]) => since), ...found.gaps.map((row) => row[4])].filter((each) => each > found.from);
+  const until = Math.min(found.to, found.now + (found.to - found.from) * 0.01);
+  const since = begins.length ? Math.max(found.from, Math.min(...begins)) : found.from;
+  return since - found.from < (found.to - found.from) / 2 ? [found.from, found.to] : [since - (until - since) * 0.04, until + (until - since) * 0.02];
 }
 
 export function Timeline({ session }) {
@@ -129,11 +197,14 @@ export function Timeline({ session }) {
   const [today, setToday] = useState(null);
   const [failed, setFailed] = useState('');
   const [chosen, setChosen] = useState(null);
+  const [late, setLate] = useState(null);
+  const [note, setNote] = useState('');
   const [width, setWidth] = useState(800);
-  const [begin, setBegin] = useState(null); // of the time that a label or a request is for, which ends at the moment
+  const [begin, setBegin] = useState(null); // of a time that ends at the moment
   const box = useRef(null);
-  const drags = useRef(false);
+  const drag = useRef(null); // what the pointer does: { what, ... }
   const lately = useRef(null); // what the robot's clock was, and when: { now, at }
+  const acts = useRef({});
   const isPast = past.value !== null;
   const isByArrival = shownBy.value === 'received';
 
@@ -178,23 +249,32 @@ export function Timeline({ session }) {
   useEffect(() => {
     const seen = new ResizeObserver(([entry]) => setWidth(entry.contentRect.width));
     seen.observe(box.current);
+    const wheel = (event) => acts.current.wheel(event);
+    box.current.addEventListener('wheel', wheel, { passive: false });
     return () => seen.disconnect();
   }, []);
 
   const found = isPast ? told.value ?? today : today;
   const problem = isPast ? pastProblem.value : failed;
   const robot = range.value?.robot ?? past.value?.robot ?? session.robot;
-  const gaps = (found?.gaps ?? []).map((row) => Object.fromEntries(found.columns.map((name, place) => [name, row[place]])));
-  const recorded = found?.recorded ?? [];
-  const kept = found?.kept ?? [];
-  const topics = [...new Set([...(found?.known ?? []), ...recorded, ...kept].map(([topic]) => topic).concat(gaps.map((gap) => gap.topic)))].sort().slice(0, 60);
+  const gaps = useMemo(() => named(found), [found]);
+  const { now = 0 } = found ?? {};
+  const [from, to] = isPast && range.value ? [range.value.from, range.value.to] : found ? fitted(found) : [0, 1];
+  const at = past.value?.at ?? now;
+  const marked = isPast ? selection.value ?? (begin !== null ? { from: Math.min(begin, at), to: Math.max(begin, at) } : null) : null;
+  const selected = marked && marked.to - marked.from >= 1 ? [marked.from, marked.to] : null;
   const left = width < 520 ? 92 : 150;
-  const { from = 0, to = 1, now = 0 } = found ?? {};
   const x = (ms) => left + ((Math.min(Math.max(ms, from), to) - from) / (to - from)) * (width - left - 8);
   const timeAt = (event) => from + Math.min(1, Math.max(0, (event.clientX - box.current.getBoundingClientRect().left - left) / (width - left - 8))) * (to - from);
-  const marks = lanes((found?.marks ?? []).map(([kind, name, begin, end, text]) => ({ kind, name, from: begin, to: end, text })), x);
+  const isSeen = (since, until) => until >= from && since <= to;
+  const recorded = found?.recorded ?? [];
+  const kept = found?.kept ?? [];
+  const deliveries = found?.deliveries ?? [];
+  const topics = useMemo(() => [...new Set([...(found?.known ?? []), ...recorded, ...kept].map(([topic]) => topic).concat(gaps.map((gap) => gap.topic)))].sort().slice(0, 60), [found]);
+  const marks = lanes((found?.marks ?? []).filter(([, , since, until]) => isSeen(since, until)).map(([kind, name, since, until, text]) => ({ kind, name, from: since, to: until, text })), x);
   const top = marks.length ? (Math.max(...marks.map((mark) => mark.lane)) + 1) * LANE + 6 : 0;
-  const height = top + topics.length * ROW + 26;
+  const rows = topics.length + (deliveries.length ? 1 : 0);
+  const height = top + rows * ROW + AXIS;
   const seen = new Map();
   const shades = [...new Map([...gaps, ...(chosen ? [chosen] : [])].map(({ cause }) => [shade(cause).join(), shade(cause)])).values()];
   for (const gap of gaps) {
@@ -205,37 +285,126 @@ export function Timeline({ session }) {
     seen.set(name, known);
   }
 
-  const pick = (at) => {
-    if (!isPast) look(robot, from, Math.max(to, at));
-    go(robot, Math.min(at, now || at));
+  const clear = () => {
+    selection.value = null;
+    setBegin(null);
+  };
+  const pick = (ms) => {
+    if (!isPast) look(robot, from, Math.max(to, ms));
+    go(robot, Math.min(ms, now || ms));
+  };
+  const show = (gap) => {
+    setChosen(gap);
+    setLate(null);
+    pick(gap.from);
   };
   const down = (event) => {
-    if (event.button || event.clientX - box.current.getBoundingClientRect().left < left) return;
-    drags.current = true;
+    const place = event.clientX - box.current.getBoundingClientRect().left;
+    if (event.button || place < left) return;
     playing.value = false;
     event.currentTarget.setPointerCapture(event.pointerId);
-    pick(timeAt(event));
+    const ms = timeAt(event);
+    const edge = event.target.closest?.('[data-edge]')?.dataset.edge;
+    const isAxis = event.clientY - event.currentTarget.getBoundingClientRect().top > height - AXIS || event.target.closest?.('.cursor');
+    const gap = gaps[event.target.dataset?.gap];
+    drag.current = { what: edge ? 'edge' : event.shiftKey ? 'brush' : isAxis ? 'scrub' : 'pan', x: event.clientX, ms, from, to, gap, late: deliveries[event.target.dataset?.late], fixed: edge === 'from' ? marked?.to : edge ? marked?.from : ms, moved: false };
+    if (event.shiftKey && !isPast) pick(ms);
+    if (drag.current.what === 'scrub') pick(ms);
   };
-  const drag = (event) => drags.current && pick(timeAt(event));
+  const move = (event) => {
+    const doing = drag.current;
+    if (!doing || (!doing.moved && Math.abs(event.clientX - doing.x) < CLICK_PX)) return;
+    doing.moved = true;
+    const ms = timeAt(event);
+    if (doing.what === 'scrub') pick(ms);
+    else if (doing.what === 'pan') {
+      const by = ((doing.x - event.clientX) / (width - left - 8)) * (doing.to - doing.from);
+      if (!isPast) go(robot, Math.min(doing.ms, now));
+      look(robot, doing.from + by, doing.to + by);
+    } else {
+      setBegin(null);
+      selection.value = { from: Math.min(doing.fixed, ms), to: Math.max(doing.fixed, ms) };
+    }
+  };
+  const up = () => {
+    const doing = drag.current;
+    drag.current = null;
+    if (!doing || doing.moved || doing.what !== 'pan') return;
+    if (doing.gap) show(doing.gap);
+    else {
+      setLate(doing.late ?? null);
+      pick(doing.ms);
+    }
+  };
+  const jump = async (what, direction) => {
+    setNote('');
+    const edge = 1;
+    const list_ = (of) => (what === 'gap' ? named(of).map((gap) => ({ at: gap.from, gap })) : (of.marks ?? []).filter(([kind]) => kind === 'event' || kind === 'label').map(([, , since]) => ({ at: since })))
+      .filter((each) => (direction > 0 ? each.at > at + edge : each.at < at - edge)).sort((a, b) => direction * (a.at - b.at) || (b.gap?.count ?? 0) - (a.gap?.count ?? 0));
+    let [next] = list_(found ?? {});
+    try {
+      if (!next) [next] = list_(direction > 0 ? await timeline(robot, at, at + DAY) : await timeline(robot, at - DAY, at));
+    } catch (error) {
+      return setNote(error.message);
+    }
+    if (!next) return setNote(`There is no ${direction > 0 ? 'later' : 'earlier'} ${what} within 24 hours.`);
+    if (next.at < from || next.at > to) look(robot, next.at - (to - from) / 2, next.at + (to - from) / 2);
+    if (next.gap) show(next.gap);
+    else pick(next.at);
+    return undefined;
+  };
+  const scale = (factor, middle) => {
+    if (isPast) zoom(middle, factor);
+    else setMinutes(Math.min(1440, Math.max(1, ((to - from) / MINUTE) * factor)));
+  };
+  acts.current.wheel = (event) => {
+    if (!found || !event.target.closest?.('svg[role=slider]') || (!isPast && !event.ctrlKey && document.activeElement !== event.target.closest('svg'))) return; // the page scrolls
+    event.preventDefault();
+    const step = Math.max(-240, Math.min(240, event.deltaMode ? event.deltaY * 30 : event.deltaY));
+    if (isPast && (event.shiftKey || Math.abs(event.deltaX) > Math.abs(event.deltaY))) pan(((event.deltaX || step) / width) * (to - from));
+    else scale(1.0025 ** step, timeAt(event));
+  };
   const key = (event) => {
     const step = { ArrowLeft: -1000, ArrowRight: 1000, PageUp: -60000, PageDown: 60000 }[event.key];
-    if (!step || !found) return;
+    const mark = (side) => {
+      const other = side === 'from' ? selection.value?.to ?? at + 1000 : selection.value?.from ?? at - 1000;
+      setBegin(null);
+      selection.value = { from: Math.min(at, other), to: Math.max(at, other) };
+    };
+    const others = {
+      '+': () => scale(0.5, at), '=': () => scale(0.5, at), '-': () => scale(2, at), 0: () => isPast && look(robot, from, to, { fit: 1 }), '[': () => isPast && mark('from'), ']': () => isPast && mark('to'),
+      Escape: clear, n: () => jump('gap', 1), p: () => jump('gap', -1), e: () => jump('event', 1), E: () => jump('event', -1), ' ': () => isPast && (playing.value = !playing.value),
+    };
+    if (!found || event.ctrlKey || event.metaKey || (!step && !others[event.key])) return;
     event.preventDefault();
-    pick((past.value?.at ?? now) + step * (event.shiftKey ? 10 : 1));
+    if (step) pick(at + step * (event.shiftKey ? 10 : 1));
+    else others[event.key]();
   };
-  const zoom = (each) => {
-    const middle = past.value.at;
-    look(robot, middle - (each * MINUTE) / 2, middle + (each * MINUTE) / 2);
-  };
+  const around = (each) => look(robot, at - (each * MINUTE) / 2, at + (each * MINUTE) / 2);
   const zoomed = range.value ? Math.round((range.value.to - range.value.from) / MINUTE) : 0;
   const missions = marks.filter((mark) => mark.kind === 'mission');
   const label = (topic) => (topic.length > (left - 12) / 6.6 ? `…${topic.slice(-Math.floor((left - 18) / 6.6))}` : topic);
+  const bar = (kind, topic, title) => ([, since, until]) => html`<rect class=${kind} data-topic=${topic} data-from=${since} data-to=${until} x=${x(since)} width=${Math.max(kind === 'known' ? 1 : 1.5, x(until) - x(since))}
+    y=${kind === 'known' ? 5 : ROW - 9} height=${kind === 'known' ? ROW - 10 : 4} rx=${kind === 'known' ? 3 : 1}>${title && html`<title>${title}</title>`}</rect>`;
+  const body = useMemo(() => topics.map((topic, place) => {
+    const of = (each) => each[0] === topic && isSeen(each[1], each[2]);
+    return html`<g transform=${`translate(0 ${top + place * ROW})`}>
+      <text class="row-label" x="0" y=${ROW / 2 + 4}><title>${topic}</title>${label(topic)}</text>
+      <rect class="unknown" x=${left} y="5" width=${Math.max(0, x(now) - left)} height=${ROW - 10} rx="3" fill="url(#unknown)"><title>not known (yet)</title></rect>
+      ${found.known.filter(of).map(bar('known', topic))}${recorded.filter(of).map(bar('recorded', topic))}${kept.filter(of).map(bar('kept', topic, 'kept on the robot'))}
+      ${gaps.map((gap, number) => gap.topic === topic && isSeen(gap.from, gap.to) && html`<rect ...${paint(gap.cause, 'gap')} data-gap=${number} data-topic=${topic} data-kind=${gap.kind}
+        data-cause=${gap.cause} data-from=${gap.from} data-to=${gap.to} data-count=${gap.count} x=${x(gap.from)} y="3"
+        width=${Math.max(2.5, x(gap.to) - x(gap.from))} height=${ROW - 6} rx="1.5" onPointerEnter=${() => { if (!drag.current) setChosen(gap); }}>
+        <title>${`${topic}: ${gap.count} ${gap.kind} (${gap.cause}), ${clock(gap.from)} for ${span((gap.to - gap.from) / 1000)}`}</title></rect>`)}
+    </g>`;
+  }), [found, from, to, width, top, now]);
+  const wait = (each) => `recorded ${clock(each[0])} to ${clock(each[1])}, ${each[2] === null ? 'not all of it is delivered yet' : `delivered until ${clock(each[2])}`}`;
 
   return html`<div class="panel timeline">
     <div class="panel-head">
-      <h3>${isPast ? 'Back in time' : minutes ? `The last ${SPANS.find(([each]) => each === minutes)[1]}` : 'Today'} <span class="unit">UTC</span></h3>
+      <h3>${isPast ? 'Back in time' : minutes ? `The last ${span((to - from) / 1000)}` : 'Today'} <span class="unit">UTC</span></h3>
       ${isPast && html`${robots.value.length > 1 && html`<select aria-label="Robot" value=${robot} onChange=${(event) => openRobot(event.target.value)}>${robots.value.map((each) => html`<option>${each}</option>`)}</select>`}
-        <select aria-label="Day" value=${range.value ? new Date(range.value.from).toISOString().slice(0, 10) : ''} onChange=${(event) => openDay(robot, event.target.value)}>
+        <select aria-label="Day" value=${range.value ? new Date(Math.max(0, range.value.from)).toISOString().slice(0, 10) : ''} onChange=${(event) => openDay(robot, event.target.value)}>
           ${days.value.map((each) => html`<option>${each}</option>`)}</select>
         ${missions.length > 0 && html`<select aria-label="Mission" onChange=${(event) => {
           const mission = missions[event.target.value];
@@ -245,64 +414,61 @@ export function Timeline({ session }) {
           go(robot, mission.from);
         }}><option value="">Missions</option>${missions.map((mission, place) => html`<option value=${place}>${mission.name}</option>`)}</select>`}`}
       <div class="tabs" role="group" aria-label="How long">
-        ${isPast ? ZOOMS.map(([each, name]) => html`<button type="button" aria-pressed=${each === zoomed} onClick=${() => zoom(each)}>${name}</button>`)
+        ${isPast ? [...ZOOMS.map(([each, name]) => html`<button type="button" aria-pressed=${each === zoomed} onClick=${() => around(each)}>${name}</button>`),
+          html`<button type="button" title="All that was recorded in these 24 hours" onClick=${() => look(robot, Math.min(from, at - DAY / 2), Math.max(to, at + DAY / 2), { fit: 1 })}>Fit</button>`]
           : SPANS.map(([each, name]) => html`<button type="button" aria-pressed=${each === minutes} onClick=${() => setMinutes(each)}>${name}</button>`)}
       </div>
-      ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${leave}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
+      ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${() => { clear(); leave(); }}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
     </div>
-    ${isPast && html`<${Transport} robot=${robot} />`}
+    ${isPast && html`<${Transport} robot=${robot} begin=${begin} setBegin=${setBegin} jump=${jump} />`}
+    ${note && html`<p class="note" role="status">${note}</p>`}
     ${isPast && isByArrival && session.role === 'operator' && html`<p class="note">Labels and requests are by stamp.</p>`}
-    ${isPast && !isByArrival && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} begin=${begin} setBegin=${setBegin} />`}
-    ${isPast && !isByArrival && html`<${Pull} session=${session} robot=${robot} begin=${begin} />`}
+    ${isPast && !isByArrival && session.role === 'operator' && html`<${LabelForm} session=${session} robot=${robot} selected=${selected} clear=${clear} />`}
+    ${isPast && !isByArrival && html`<${Pull} session=${session} robot=${robot} selected=${selected} />`}
     <div ref=${box} class="timeline-box">
       ${problem && html`<p class="note bad" role="alert">${problem}</p>`}
       ${isPast && found?.problem && html`<p class="note watch">${found.problem}</p>`}
       ${!problem && found && !topics.length && html`<p class="empty">Nothing was recorded in this time.</p>`}
-      ${topics.length > 0 && html`<svg width=${width} height=${height} tabindex="0" role="slider" aria-label="Time: click, drag or arrow keys show a moment; the table below has all gaps"
-          aria-valuemin=${Math.round(from)} aria-valuemax=${Math.round(to)} aria-valuenow=${Math.round(past.value?.at ?? now)} aria-valuetext=${moment(past.value?.at ?? now)}
-          onPointerDown=${down} onPointerMove=${drag} onPointerUp=${() => { drags.current = false; }} onPointerCancel=${() => { drags.current = false; }} onKeyDown=${key}>
+      ${topics.length > 0 && html`<svg width=${width} height=${height} tabindex="0" role="slider" aria-label="Time: click or arrow keys show a moment, plus and minus zoom, brackets select a time, n and p go to gaps, e to events; the table below has all gaps"
+          aria-valuemin=${Math.round(from)} aria-valuemax=${Math.round(to)} aria-valuenow=${Math.round(at)} aria-valuetext=${moment(at)}
+          onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerCancel=${() => { drag.current = null; }} onKeyDown=${key}>
         <defs><pattern id="unknown" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">
           <rect class="unknown-back" width="6" height="6" /><rect class="unknown-line" width="2" height="6" /></pattern><${Patterns} shades=${shades} /></defs>
-        ${ticks(from, to).map((at) => html`<g><line class="tick" x1=${x(at)} x2=${x(at)} y1="0" y2=${height - 22} />
-          <text class="tick-label" x=${x(at)} y=${height - 6}>${clock(at, to - from < 600000)}</text></g>`)}
+        <rect class="axis" x=${left} y=${height - AXIS} width=${Math.max(0, width - left - 8)} height=${AXIS} />
+        ${ticks(from, to).map((each) => html`<g><line class="tick" x1=${x(each)} x2=${x(each)} y1="0" y2=${height - AXIS} />
+          <text class="tick-label" x=${x(each)} y=${height - 7}>${clock(each, to - from < 600000)}</text></g>`)}
         ${marks.map((mark) => html`<g class=${`mark-of-${mark.kind}`} data-mark=${mark.kind} data-from=${mark.from} data-to=${mark.to} data-name=${mark.name} transform=${`translate(0 ${mark.lane * LANE})`}>
           <title>${`${mark.kind} ${mark.name}${mark.text ? ` (${mark.text})` : ''}, ${clock(mark.from)}`}</title>
           ${mark.kind === 'event' ? html`<path d=${`M${x(mark.from)} 2l6 6l-6 6l-6-6z`} />`
             : html`<rect x=${x(mark.from)} y="1" width=${Math.max(3, x(mark.to) - x(mark.from))} height=${LANE - 3} rx="3" />
               <text x=${x(mark.from) + 4} y="12">${mark.name.length > 22 ? `${mark.name.slice(0, 21)}…` : mark.name}</text>`}</g>`)}
-        ${topics.map((topic, place) => html`<g transform=${`translate(0 ${top + place * ROW})`}>
-          <text class="row-label" x="0" y=${ROW / 2 + 4}><title>${topic}</title>${label(topic)}</text>
-          <rect class="unknown" x=${left} y="5" width=${Math.max(0, x(now) - left)} height=${ROW - 10} rx="3" fill="url(#unknown)"><title>not known (yet)</title></rect>
-          ${found.known.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="known" data-topic=${topic} data-from=${since} data-to=${until}
-            x=${x(since)} y="5" width=${Math.max(1, x(until) - x(since))} height=${ROW - 10} rx="3" />`)}
-          ${recorded.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="recorded" data-topic=${topic} data-from=${since} data-to=${until}
-            x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1" />`)}
-          ${kept.filter(([name]) => name === topic).map(([, since, until]) => html`<rect class="kept" data-topic=${topic} data-from=${since} data-to=${until}
-            x=${x(since)} y=${ROW - 9} width=${Math.max(1.5, x(until) - x(since))} height="4" rx="1"><title>kept on the robot</title></rect>`)}
-          ${gaps.filter((gap) => gap.topic === topic).map((gap) => html`<rect ...${paint(gap.cause, 'gap')} data-topic=${topic} data-kind=${gap.kind}
-            data-cause=${gap.cause} data-from=${gap.from} data-to=${gap.to} data-count=${gap.count} x=${x(gap.from)} y="3"
-            width=${Math.max(2.5, x(gap.to) - x(gap.from))} height=${ROW - 6} rx="1.5" onPointerEnter=${() => setChosen(gap)}>
-            <title>${`${topic}: ${gap.count} ${gap.kind} (${gap.cause}), ${clock(gap.from)} for ${span((gap.to - gap.from) / 1000)}`}</title></rect>`)}
-        </g>`)}
-        ${now < to && now > from && html`<line class="now" x1=${x(now)} x2=${x(now)} y1="0" y2=${height - 22} />`}
-        ${isPast && begin !== null && html`<rect class="span" x=${x(Math.min(begin, past.value.at))} y="0" width=${Math.abs(x(past.value.at) - x(begin))} height=${height - 22} />`}
-        ${isPast && past.value.at >= from && past.value.at <= to && html`<g class="cursor"><line x1=${x(past.value.at)} x2=${x(past.value.at)} y1="0" y2=${height - 22} /><circle cx=${x(past.value.at)} cy=${height - 22} r="5" /></g>`}
+        ${body}
+        ${deliveries.length > 0 && html`<g transform=${`translate(0 ${top + topics.length * ROW})`}><text class="row-label" x="0" y=${ROW / 2 + 4}><title>What was delivered late, or waits on the robot</title>delivery</text>
+          ${deliveries.map((each, number) => isSeen(each[0], each[1]) && html`<rect class=${each[2] === null ? 'waits' : 'late'} data-late=${number} data-from=${each[0]} data-to=${each[1]} data-delivered=${each[2] ?? ''}
+            x=${x(each[0])} y="7" width=${Math.max(2.5, x(each[1]) - x(each[0]))} height=${ROW - 14} rx="2"><title>${wait(each)}</title></rect>`)}</g>`}
+        ${now < to && now > from && html`<line class="now" x1=${x(now)} x2=${x(now)} y1="0" y2=${height - AXIS} />`}
+        ${selected && html`<g class="selection"><rect class="span" x=${x(selected[0])} y="0" width=${Math.max(1, x(selected[1]) - x(selected[0]))} height=${height - AXIS} />
+          ${['from', 'to'].map((edge, place) => selected[place] >= from && selected[place] <= to && html`<rect class="edge" data-edge=${edge} x=${x(selected[place]) - 3} y="0" width="6" height=${height - AXIS} rx="2" />`)}</g>`}
+        ${isPast && at >= from && at <= to && html`<g class="cursor"><line x1=${x(at)} x2=${x(at)} y1="0" y2=${height - AXIS} /><circle cx=${x(at)} cy=${height - AXIS} r="6" /></g>`}
       </svg>`}
     </div>
+    ${selected && html`<${Selected} selected=${selected} clear=${clear} />`}
     <div class="legend">
       ${isPast && html`<span><i class="swatch recorded"></i>recorded</span>`}
       ${kept.length > 0 && html`<span><i class="swatch kept"></i>kept on the robot</span>`}
-      <span><i class="swatch known"></i>nothing else is missing</span><span><i class="swatch unknown"></i>not known yet</span>
+      <span title="The robot has accounted for every message of this time"><i class="swatch known"></i>nothing else is missing</span><span title="The robot has not reported that far, or was off"><i class="swatch unknown"></i>not known yet</span>
+      ${deliveries.length > 0 && html`<span title="It reached the store more than half a minute after it was recorded"><i class="swatch late"></i>delivered late</span><span title="It is on the robot and waits for the store"><i class="swatch waits"></i>waits</span>`}
       ${[...seen.values()].map((each) => html`<span title=${meaning(each.cause)}><${Swatch} cause=${each.cause} />${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
       ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
       ${found && !gaps.length && topics.length > 0 && html`<span class="good">no gap is known in this time</span>`}
-      ${!isPast && topics.length > 0 && html`<span class="unit">click on a time to see it again</span>`}
+      ${topics.length > 0 && html`<span class="unit">${isPast ? 'click: that moment · wheel: zoom · drag: move · shift-drag: select' : 'click on a time to see it again'}</span>`}
     </div>
-    ${chosen && html`<p class="chosen" aria-live="polite"><${Swatch} cause=${chosen.cause} /><b>${chosen.topic}</b> ${digits(chosen.count)} messages
-      ${chosen.kind}, ${meaning(chosen.cause)}: from ${clock(chosen.from)} for ${span((chosen.to - chosen.from) / 1000)}${chosen.grade === 'exact' ? '' : ' (estimated)'}</p>`}
-    ${isPast && html`<${Commands} />`}
+    ${chosen && html`<${GapWords} gap=${chosen} swatch=${html`<${Swatch} cause=${chosen.cause} />`}>
+      <p class="row"><button type="button" onClick=${() => show(chosen)}>Show the moment before</button>${isPast && html`<button type="button" onClick=${() => { setBegin(null); selection.value = { from: chosen.from, to: chosen.to }; }}>Select this time</button>`}</p></${GapWords}>`}
+    ${late && html`<p class="chosen" aria-live="polite" data-late-words>Recorded ${clock(late[0])} to ${clock(late[1])}, ${late[2] === null ? 'and some of it still waits on the robot' : html`and delivered until ${clock(late[2])}, up to ${span((late[2] - late[0]) / 1000)} later`}: the store could not be reached then, or uploads had to wait. It waited on the robot's disk; what is lost is drawn as a gap.</p>`}
+    ${isPast && html`<${Commands} session=${session} robot=${robot} selected=${selected} />`}
     ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
-      <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td>${clock(gap.from)}</td>
+      <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td><button type="button" class="link" onClick=${() => show(gap)}>${clock(gap.from)}</button></td>
       <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td>${gap.cause.replaceAll('_', ' ')}</td></tr>`)}</tbody></table></div></details>`}
   </div>`;
 }

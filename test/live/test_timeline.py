@@ -1,0 +1,195 @@
+"""The timeline of the live page in a real Chromium, of a store: zoom, pan, selection, gaps in words, jumps and pieces of bags."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from lake.gap_parts import lost, mark, tell
+from lake.making import NOON_NS, add_part, folder_store
+from live.test_history import bag, patrol
+from live.test_page import CAUSES, CHROMIUM, FLAGS, HOSTILE, Served, fits, holds, opened, press
+
+from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.formats.mcap.index import read_index
+from shadowhound_data_logger.formats.mcap.ranges import LocalFile
+from shadowhound_data_logger.live.server import PAGE, LiveSettings
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+NOON_MS = NOON_NS // 1_000_000
+BAG = f'bump_{utc(NOON_NS + 20 * SECOND):%Y%m%d_%H%M%S}'
+
+
+def test_each_cause_has_a_remedy() -> None:
+    """For every cause that the code knows the page says what to do."""
+    source = (PAGE / 'gaps.js').read_text()
+    known = set(re.findall(r'^  (\w+): ', source.partition('const REMEDIES')[2].partition('};')[0], re.MULTILINE))
+    assert set(CAUSES) | {'unknown'} <= known | {'EntityTooLarge'}
+
+
+def in_chromium(test: Any) -> Any:
+    """A test with a browser."""
+    skip = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+    return pytest.mark.long('a Chromium')(skip(test))
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Browser]:
+    api = pytest.importorskip('playwright.sync_api')
+    with (
+        api.sync_playwright() as playwright,
+        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
+    ):
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Page]:
+    """Ten seconds of a mission, a second without the IMU in it, and a bag of an event ten seconds later."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    settings = folder_store(tmp_path)
+    with closing(open_store(settings, UploadSettings())) as store:
+        patrol(store, tmp_path)
+        add_part(store, bag(store, tmp_path, BAG, 'bump', seconds=5), 'b', tmp_path / 'tmp')
+    tell(settings, tmp_path, lost('1', 3, 4, cause='transport', topic='/imu'), mark(8, topic='/imu'),
+         lost('2', 6, 7, cause=HOSTILE, topic='/odom', count=2))  # fmt: skip
+    store_page = LiveSettings(spool=tmp_path / 'none', robot='thor', tokens=tmp_path / 'live', port=0, is_of_store=True)
+    served = Served(store_page, monkeypatch)
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, 'shadowhound.past?.count > 0 && document.querySelectorAll("rect.gap").length === 2')
+        yield page
+        assert page.wrong == []  # type: ignore[attr-defined]
+        page.close()
+    finally:
+        served.close()
+
+
+def shown(page: Page) -> tuple[int, int, int]:
+    """Begin and end of the timeline and the moment, in ms after noon."""
+    slider = page.locator('svg[role=slider]')
+    begin, end, now = (int(slider.get_attribute(f'aria-value{name}') or 0) - NOON_MS for name in ('min', 'max', 'now'))
+    return begin, end, now
+
+
+def at(page: Page, ms: float) -> tuple[float, float]:
+    """Where a time is on the screen, on the last row of the timeline."""
+    begin, end, _ = shown(page)
+    box = page.locator('svg[role=slider]').bounding_box()
+    assert box is not None
+    return box['x'] + 150 + (ms - begin) / (end - begin) * (box['width'] - 158), box['y'] + box['height'] - 40
+
+
+def dragged(page: Page, first_ms: float, last_ms: float, key: str = '') -> None:
+    ends = at(page, first_ms), at(page, last_ms)
+    if key:
+        page.keyboard.down(key)
+    page.mouse.move(*ends[0])
+    page.mouse.down()
+    page.mouse.move(*ends[1], steps=4)
+    page.mouse.up()
+    if key:
+        page.keyboard.up(key)
+
+
+def moment_is(page: Page, ms: int) -> None:
+    holds(page, f'Math.abs(Number(document.querySelector("[data-moment]").dataset.moment) - {NOON_MS + ms}) < 300')
+
+
+@in_chromium
+def test_it_opens_at_the_data_and_zooms_and_pans(page: Page) -> None:
+    """Half a minute is not a line in a day; wheel, drag, keys and buttons change what is shown, around the pointer."""
+    begin, end, _ = shown(page)
+    assert -2000 <= begin < 0
+    assert 19_000 < end < 27_000
+    page.mouse.move(*at(page, 5000))
+    page.mouse.wheel(0, -240)
+    slider = "document.querySelector('svg[role=slider]')"
+    holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin < {(end - begin) * 0.7}')
+    first, last, _ = shown(page)
+    assert (5000 - first) / (last - first) == pytest.approx((5000 - begin) / (end - begin), abs=0.02)
+    dragged(page, 5000, 3000)
+    holds(page, f'{slider}.ariaValueMin - {NOON_MS + first} > 1500')
+    moved, moved_end, _ = shown(page)
+    assert moved - first == pytest.approx(2000, abs=100)
+    assert moved_end - moved == pytest.approx(last - first, abs=2)
+    page.locator('svg[role=slider]').focus()
+    page.keyboard.press('-')
+    holds(page, f'{slider}.ariaValueMax - {slider}.ariaValueMin > {(last - first) * 1.9}')
+    press(page.get_by_role('button', name='Fit', exact=True))
+    holds(
+        page,
+        f'Math.abs({slider}.ariaValueMin - {NOON_MS + begin}) < 50 && Math.abs({slider}.ariaValueMax - {NOON_MS + end}) < 50',
+    )
+
+
+@in_chromium
+def test_a_gap_is_shown_and_told_in_words(page: Page) -> None:
+    """A click goes to the last message before it: what was lost, why, what to do; jumps go there too; hostile causes are text."""
+    gap = page.locator('rect.gap[data-topic="/imu"]').bounding_box()
+    assert gap is not None
+    page.mouse.click(gap['x'] + gap['width'] / 2, gap['y'] + 4)
+    moment_is(page, 3000)
+    words = page.locator('[data-gap=transport]').inner_text()
+    assert '/imu: 5 messages never reached the node, 12:00:03 to 12:00:04 UTC (1.0 s).' in words.replace('\n', ' ')
+    assert 'Why: Lost on the way to the node' in words
+    assert 'net.core.rmem_max' in words
+    press(page.get_by_role('button', name='Next gap'))
+    moment_is(page, 6000)
+    assert HOSTILE in page.locator('.chosen').first.inner_text()
+    press(page.get_by_role('button', name='Next event'))
+    moment_is(page, 20_000)
+    press(page.get_by_role('button', name='Next event'))
+    page.get_by_text('There is no later event within 24 hours.').wait_for()
+    press(page.get_by_role('button', name='Previous gap'))
+    moment_is(page, 6000)
+    page.locator('svg[role=slider]').focus()
+    page.keyboard.press('p')
+    moment_is(page, 3000)
+    assert page.evaluate('window.attacked ?? null') is None
+
+
+@in_chromium
+def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_path: Path) -> None:
+    """By shift and drag, and by keys; the piece is an MCAP file with the messages of that time, which other viewers may open."""
+    dragged(page, 2000, 21_500, 'Shift')
+    holds(page, 'document.querySelector("[data-selected]") !== null')
+    begin, end = (int(each) - NOON_MS for each in (page.locator('[data-selected]').get_attribute('data-selected') or '').split())
+    assert abs(begin - 2000) < 200
+    assert abs(end - 21_500) < 200
+    holds(page, '["query", "fetch", "bag cut", "export"].every(name => document.querySelector(`[data-command="${name}"]`))')
+    since = f'{utc(NOON_NS + begin * 1_000_000):%Y-%m-%dT%H:%M:%S}'
+    assert f'--since {since}' in page.locator('[data-command=query]').inner_text()
+    press(page.locator(f'[data-cut="{BAG}"]'))
+    page.locator('[data-piece]').wait_for()
+    with page.expect_download() as download:
+        page.locator('[data-piece]').evaluate('link => link.click()')
+    download.value.save_as(tmp_path / 'piece.mcap')
+    index = read_index(LocalFile(tmp_path / 'piece.mcap'))
+    assert {channel.topic for channel in index.channels.values()} == {'/bagged', '/imu'}
+    assert NOON_NS + 20 * SECOND <= index.t_start_ns <= index.t_end_ns < NOON_NS + (end + 1) * 1_000_000
+    address = page.evaluate('document.querySelector("[data-piece]").href')
+    elsewhere = page.context.browser.new_context().request if page.context.browser is not None else page.request
+    part = elsewhere.get(address, headers={'Range': 'bytes=0-7', 'Origin': 'https://app.foxglove.dev'})
+    assert (part.status, part.body()[:5], part.headers['access-control-allow-origin']) == (206, b'\x89MCAP', '*')
+    assert elsewhere.get(address.replace('.mcap', 'x.mcap')).status == 404
+    assert address in page.evaluate('decodeURIComponent(document.querySelector("[data-viewer=Foxglove]").href)')
+    for width in (1280, 390):
+        fits(page, width)
+    page.set_viewport_size({'width': 1280, 'height': 800})
+    page.locator('svg[role=slider]').focus()
+    page.keyboard.press('Escape')
+    holds(page, 'document.querySelector("[data-selected]") === null')
+    for key in ('[', 'ArrowRight', 'ArrowRight', 'ArrowRight', ']'):
+        page.keyboard.press(key)
+    length = '(([from, to]) => to - from)((document.querySelector("[data-selected]")?.dataset.selected ?? "0 0").split(" "))'
+    holds(page, f'{length} === 3000')
