@@ -123,7 +123,7 @@ class Cuts:
         await asyncio.to_thread(out.parent.mkdir, mode=0o700, exist_ok=True)
         process = await asyncio.create_subprocess_exec(
             'nice', sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'bag', 'cut', '--json', '--robot', robot,
-            '--start', times[0], '--end', times[1], '--output', str(out), '--', source, stdin=asyncio.subprocess.DEVNULL,
+            '--start', times[0], '--end', times[1], '--to', str(out), '--', source, stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, env=dict(os.environ),
         )  # fmt: skip
         try:

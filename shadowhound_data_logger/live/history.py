@@ -577,11 +577,11 @@ def commands(robot: str, begin_ns: int, end_ns: int, bags: Sequence[str], by: st
         for bag in [bag for bag in dict.fromkeys(bags) if is_name(bag)][:MAX_CUTS]
     ]
     exports = [
-        ['export', f'shadowhound-data export lerobot {shlex.quote(mission)} {of} --mission {shlex.quote(mission)} --by {by}']
+        ['export', f'shadowhound-data export lerobot {shlex.quote(mission)} {of} --mission {shlex.quote(mission)}']
         for mission in [mission for mission in dict.fromkeys(missions) if is_name(mission)][:MAX_CUTS]
     ]
     if by == BY_RECEIVED:
-        return [['query', f'shadowhound-data query {span} --by {by}'], *cuts, *exports]
+        return [['query', f'shadowhound-data query {span} --by {by}'], *cuts]
     pulls = [['pull', f'shadowhound-data pull {span}']] if is_kept else []
     fetch = ['fetch', f'shadowhound-data fetch {span} --to data']
     return [['query', f'shadowhound-data query {span}'], fetch, *cuts, *exports, *pulls]
