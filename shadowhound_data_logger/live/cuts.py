@@ -19,11 +19,11 @@ from typing import Any, Final
 
 from aiohttp import web
 
-from shadowhound_data_logger.bags.naming import BUCKET, prefix_of
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.untrusted import visible
+from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.live.answers import answer, body_of, is_ms, problem
 from shadowhound_data_logger.live.auth import Auth
 from shadowhound_data_logger.spool.files import Tree
@@ -102,7 +102,7 @@ class Cuts:
         folder = self._folder / name
         sources = [bag]
         if self._spool is not None:
-            local = Tree(self._spool).path(State.PENDING, None, BUCKET, prefix_of(robot, bag))
+            local = Tree(self._spool).path(State.PENDING, None, BUCKET, f'{robot}/rosbags/{bag}')
             sources += [str(local)] if await asyncio.to_thread(local.is_dir) else []
         said: dict[str, Any] = {}
         for source in sources:

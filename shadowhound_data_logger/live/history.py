@@ -52,6 +52,7 @@ from shadowhound_data_logger.live.past import (
     BAG_SENSOR,
     FRESH_S,
     LONGEST_BATCH_NS,
+    MAX_BATTERY,
     PastContents,
     PastObject,
     PastSource,
@@ -75,6 +76,11 @@ STALE_NS: Final = 10 * SECOND
 SERIES_NS: Final = 10 * SECOND
 """So much before a moment the plots show."""
 PATH_NS: Final = 600 * SECOND
+RECENT_NS: Final = 30 * SECOND
+"""So much of plots is read for the live view where it left the spool already."""
+MAX_PLAN_CLOUDS: Final = 8
+PLAN_EVERY: Final = 8
+"""Every such point of the clouds by which the plan of the live view begins."""
 AROUND_NS: Final = 5 * SECOND
 """Of a moment, on either side: what its commands ask for."""
 LABELS_S: Final = 0.1
@@ -128,10 +134,14 @@ class PastReader:
         do, robot = asked.get('do'), asked.get('robot', '')
         if do == 'robots':
             return {'robots': self._source.robots()}, b''
+        if do == 'fleet':
+            return {'fleet': self._source.fleet()}, b''
         if not isinstance(robot, str) or not is_name(robot):
             raise ValueError('robot is the name of a robot')
         if do == 'moment':
             return self.moment(robot, int(asked['at']) * 1_000_000, _clock(asked))
+        if do == 'recent':
+            return self.recent(robot, time.time_ns())
         answers: dict[str, Callable[[], dict[str, Any]]] = {
             'days': lambda: {'days': self._source.days(robot)},
             'timeline': lambda: self.timeline(robot, *_times(asked), _clock(asked), is_fitted=bool(asked.get('fit'))),
@@ -190,7 +200,8 @@ class PastReader:
         Missions, bags, events and labels have the robot's own time, which is that of arrival. ``is_fitted``: only of the part in
         which something was recorded. ``recorded``: [topic, from, to]; ``kept`` the same of what is on the robot alone;
         ``marks``: [kind, name, from, to, text]; ``deliveries``: [from, to, delivered or null] of what was not delivered soon;
-        times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError, DataLoggerError.
+        ``battery``: [at, percent]; times are UTC in ms, the rest is as in ``SpoolFigures.gaps``. Raises ValueError,
+        DataLoggerError.
         """
         grain_ns = max(RHYTHM_NS, (end_ns - begin_ns) // RUNS)
         runs = self._runs(robot, begin_ns, end_ns, grain_ns, by)
@@ -209,6 +220,11 @@ class PastReader:
         found['deliveries'] = [
             [round(from_ns / 1e6), round(to_ns / 1e6), None if settled_ns is None else round(settled_ns / 1e6)]
             for from_ns, to_ns, settled_ns in _deliveries(runs, grain_ns, time.time_ns())
+        ]  # fmt: skip
+        battery = self._source.battery(robot, begin_ns, end_ns, by)
+        found['battery'] = [
+            [round(at_ns / 1e6), round(percent, 1)]
+            for at_ns, percent in battery[:: len(battery) // MAX_BATTERY + 1] if begin_ns <= at_ns <= end_ns
         ]  # fmt: skip
         labels, lacking = self._labels.marks(robot)
         missions = [('mission', one.id, one.begin_ns, one.end_ns, one.type)
@@ -304,6 +320,32 @@ class PastReader:
         self._read_ahead(robot, at_ns, by, list(bag_files.values()), late)
         return head, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
 
+    def recent(self, robot: str, now_ns: int) -> tuple[dict[str, Any], bytes]:
+        """What plots, path and plan of the live view begin with, as items like those of a moment.
+
+        Series of the last seconds; of longer ago only what is in the spool, and a cloud now and then. ``at`` is by the clock of
+        this machine that live items have. Raises DataLoggerError.
+        """
+        walked = self._source.between(robot, now_ns - PATH_NS, now_ns + 1, BY_RECEIVED)
+        by_topic: dict[str, list[PastObject]] = {}
+        for one in walked:
+            if '/rosbags/' not in one.key and '/missions/' not in one.key and len(by_topic) < MAX_TOPICS:
+                by_topic.setdefault(one.topic or one.sensor, []).append(one)
+        offset_ms = time.monotonic() * 1e3 - time.time() * 1e3
+        items: list[LiveItem] = []
+        for topic, objects in by_topic.items():
+            near = [one for one in objects if one.path or one.begin_ns >= now_ns - RECENT_NS]
+            extension = decode.extension_of(objects[-1].key)
+            with suppress(DataLoggerError, *_BROKEN):
+                if extension == 'json' and (found := self._series(topic, near, now_ns, BY_RECEIVED, PATH_NS)) is not None:
+                    items.append(_shifted(found[0], offset_ms))
+                if extension in decode.CLOUDS:
+                    for one in near[:: len(near) // MAX_PLAN_CLOUDS + 1]:
+                        table = decode.cloud(self._contents.get(one))[::PLAN_EVERY, :3]
+                        items.append(next(points_items(topic, one.begin_ns / 1e6 + offset_ms, table, 'odom', (FULL,))))
+        items += _track([((one.begin_ns + one.end_ns) // 2, one.pose) for one in walked if one.pose])
+        return {'at': now_ns / 1e6}, b''.join(len(item.packed).to_bytes(4, 'little') + item.packed for item in items)
+
     def _read_ahead(self, robot: str, at_ns: int, by: str, bags: Sequence[Sequence[PastObject]], late: Sequence[int]) -> None:
         """Of what plays or is scrubbed forward, the contents that come next, while the page shows this moment."""
         last_robot, last_ns, last_by = self._shown
@@ -360,7 +402,8 @@ class PastReader:
                 return item, _where(last)
         return None
 
-    def _series(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str) -> tuple[LiveItem, str] | None:
+    def _series(self, topic: str, objects: Sequence[PastObject], at_ns: int, by: str,
+                before_ns: int = SERIES_NS) -> tuple[LiveItem, str] | None:  # fmt: skip
         if not objects or (objects[-1].type and objects[-1].type not in KINDS):
             return None
         rows: list[tuple[float, Mapping[str, float]]] = []
@@ -375,7 +418,7 @@ class PastReader:
             dated = [*zip(times, samples, strict=True)][-MAX_MESSAGES:]
             rows += [
                 (time_ns / 1e6, _checked(kind.values(_message(name, sample))))
-                for time_ns, sample in dated if at_ns - SERIES_NS <= time_ns <= at_ns
+                for time_ns, sample in dated if at_ns - before_ns <= time_ns <= at_ns
             ]  # fmt: skip
         if not rows:
             return None
@@ -683,6 +726,14 @@ def _deliveries(runs: Sequence[Run], grain_ns: int, now_ns: int) -> Iterator[tup
             last[1:3] = max(last[1], end_ns), max(last[2], settled_ns)
     if last is not None:
         yield last[0], last[1], None if last[3] else last[2]
+
+
+def _shifted(item: LiveItem, offset_ms: float) -> LiveItem:
+    """A series with its times by another clock."""
+    head = item.head or {}
+    times = np.frombuffer(item.body, '<f8', head['rows']) + offset_ms
+    return LiveItem(item.topic, item.kind, head={**head, 'at': round(head['at'] + offset_ms, 1)},
+                    body=times.tobytes() + item.body[8 * head['rows'] :])  # fmt: skip
 
 
 def _after(before: LiveItem, item: LiveItem) -> LiveItem:

@@ -62,6 +62,8 @@ BLOCK_NS: Final = 60 * SECOND
 MAX_BLOCKS: Final = 60
 """Of those that are kept, each with some 1,000 objects."""
 MAX_MISSIONS: Final = 1000
+MAX_BATTERY: Final = 800
+"""Points of the battery's line on a timeline."""
 MS: Final = SECOND // 1000
 BAG_SENSOR: Final = 'bag'
 KEPT_BYTES: Final = 48 << 20
@@ -128,6 +130,13 @@ class PastDay:
             for low, high in zip((0, *breaks.tolist()), (*breaks.tolist(), len(starts)), strict=True):
                 yield Run(name, int(starts[low]), int(reached[high - 1]))
 
+    def battery(self, begin_ns: int, end_ns: int) -> list[tuple[int, float]]:
+        """(time, percent)."""
+        low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
+        column = self._rows['battery_pct'].slice(low, max(0, high - low)).to_numpy()
+        known = np.flatnonzero(~np.isnan(column.astype(np.float64)))
+        return [(int(self.begins[low + place]), float(column[place])) for place in known[:: len(known) // MAX_BATTERY + 1]]
+
     def between(self, begin_ns: int, end_ns: int) -> list[PastObject]:
         """Those that begin in this time."""
         low, high = (int(np.searchsorted(self.begins, at_ns)) for at_ns in (begin_ns, end_ns))
@@ -179,6 +188,9 @@ class PastSource(Protocol):
 
     def robots(self) -> list[str]: ...
 
+    def fleet(self) -> list[dict[str, Any]]:
+        """All robots at a glance (``live/fleet.py``), those that need a look first; empty on a robot."""
+
     def days(self, robot: str) -> list[str]:
         """Dates with something recorded, ``YYYY-MM-DD``."""
 
@@ -190,6 +202,9 @@ class PastSource(Protocol):
 
     def missions(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastMission]:
         """Those of this time, as far as they are known after ``runs`` of it."""
+
+    def battery(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[tuple[int, float]]:
+        """(time, percent) in this time, as far as it is known after ``runs`` of it."""
 
     def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
         """Objects that begin in this time, in its order."""
@@ -280,9 +295,13 @@ class SpoolPast:
         self._blocks: OrderedDict[tuple[str, str, int], tuple[float, list[PastObject]]] = OrderedDict()
         self._bags: dict[tuple[str, str, str], tuple[float, dict[str, list[PastObject]]]] = {}
         self._missions: dict[tuple[str, str, str], PastMission] = {}
+        self._battery: list[tuple[int, float]] = []
 
     def robots(self) -> list[str]:
         return [self._robot]
+
+    def fleet(self) -> list[dict[str, Any]]:
+        return []
 
     def days(self, robot: str) -> list[str]:
         """Raises SpoolError."""
@@ -298,6 +317,7 @@ class SpoolPast:
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
         """Looks at the first and the last object of each ``grain_ns`` only. Raises SpoolError."""
         found: list[Run] = []
+        self._battery = []
         with closing(self._index()) as index, _reading(self._spool):
             topics = self._topics(index, robot)
             for sensor in index.overview.sensors():
@@ -318,12 +338,17 @@ class SpoolPast:
             both = first, edge(first[0], min(at_ns, end_ns), is_last=True) or first
             ends_ns = [max(start_ns, (received_ns or start_ns) if by == BY_RECEIVED else last_ns)
                        for start_ns, _, last_ns, received_ns, *_ in both]  # fmt: skip
-            for start_ns, _, _, _, _, _, _, mission, kind in both:
+            for start_ns, _, _, _, _, _, _, mission, kind, battery in both:
+                if (percent := _number(battery)) is not None:
+                    self._battery.append((start_ns, percent))
                 if mission:
                     self._widen(robot, by, PastMission(mission, kind or '', start_ns, max(ends_ns)))
-            settled = [settled_ns for *_, settled_ns, _, _ in both if settled_ns is not None]
+            settled = [settled_ns for *_, settled_ns, _, _, _ in both if settled_ns is not None]
             yield Run(both[0][4] or sensor, first[0], max(ends_ns), max(settled, default=None),
                       any(row[5] == State.PENDING.value for row in both))  # fmt: skip
+
+    def battery(self, *_: object) -> list[tuple[int, float]]:
+        return sorted(self._battery)
 
     def _widen(self, robot: str, by: str, one: PastMission) -> None:
         known = self._missions.pop((robot, by, one.id), one)
@@ -463,6 +488,13 @@ class StorePast:
 
         return robots(self._source)
 
+    def fleet(self) -> list[dict[str, Any]]:
+        """Raises StoreError, LakeError."""
+        from shadowhound_data_logger.live.fleet import overview  # noqa: PLC0415 - the extra lake
+
+        now_ns = time.time_ns()
+        return [row.to_json(now_ns) for row in overview(self._source, self._findings, now_ns)]
+
     def days(self, robot: str) -> list[str]:
         """Raises StoreError."""
         from shadowhound_data_logger.lake.views import dates  # noqa: PLC0415
@@ -484,6 +516,10 @@ class StorePast:
                 one.id, known.type or one.type, min(known.begin_ns, one.begin_ns), max(known.end_ns, one.end_ns)
             )
         return list(found.values())
+
+    def battery(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[tuple[int, float]]:
+        """Raises StoreError."""
+        return [each for day in self._days(robot, begin_ns, end_ns, by) for each in day.battery(begin_ns, end_ns)]
 
     def between(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> list[PastObject]:
         """Raises StoreError."""

@@ -87,12 +87,12 @@ class OverviewTable(Table):
     def edge(self, robot: str, sensor: str, begin_ns: int, end_ns: int, by: str, *, is_last: bool) -> tuple[Any, ...] | None:
         """The first or the last object of a sensor that begins in this time and is not lost, found without reading others.
 
-        (start by that clock, t_start_ns, t_end_ns, received_end_ns, topic, state, settled_ns, mission, mission_type)
+        (start by that clock, t_start_ns, t_end_ns, received_end_ns, topic, state, settled_ns, mission, mission_type, battery)
         """
         start = _START[by]
         row: tuple[Any, ...] | None = self._db.execute(
             f'SELECT {start}, t_start_ns, t_end_ns, {_RECEIVED[1]}, topic, state, settled_ns, mission,'  # noqa: S608
-            f" json_extract(metadata, '$.{words.MISSION_TYPE}') FROM objects"
+            f" json_extract(metadata, '$.{words.MISSION_TYPE}'), json_extract(metadata, '$.{words.BATTERY}') FROM objects"
             f' WHERE sensor = ? AND {start} >= ? AND {start} < ? AND key >= ? AND key < ?'
             f" AND state <> 'evicted' AND json_valid(metadata) ORDER BY {start} {'DESC' if is_last else ''} LIMIT 1",
             (sensor, begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -142,6 +143,8 @@ def test_the_past_of_a_store(store: ObjectStore, opened: Opened, tmp_path: Path)
     found, _ = history.answer({'do': 'timeline', 'robot': 'thor', 'from': noon - 60_000, 'to': noon + 60_000})
     assert found['recorded'] == [['/camera', noon, noon + 9000], ['/odom', noon, noon + 9000]]
     assert found['marks'] == [['mission', 'm1', noon, noon + 9000, 'patrol']]
+    assert found['battery'][0] == [noon, 80.0]
+    assert len(found['battery']) == 20
     named = [dict(zip(found['columns'], row, strict=True)) for row in found['gaps']]
     assert [(gap['topic'], gap['cause'], gap['from'], gap['to']) for gap in named] == [
         ('/imu', 'transport', noon + 3000, noon + 4000)
@@ -673,3 +676,33 @@ def test_a_plot_keeps_its_range_where_a_bag_covers_the_moment(store: ObjectStore
     assert len(times) > 150
     figures = np.frombuffer(body, '<f4', offset=8 * head['rows']).reshape(head['rows'], -1)
     assert (figures == figures[0]).all()
+
+
+def test_what_the_live_view_begins_with(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Series, path and battery of the spool, with the times that live items have: of a clock that only this machine knows."""
+    spool = new_spool(tmp_path / 'spool', FakeClock())
+    spool.open()
+    now_ns = time.time_ns()
+    try:
+        for second in range(5):
+            at_ns = now_ns - (5 - second) * SECOND
+            document = json.loads(odometry(second)) | {'stamp_ns': at_ns}
+            metadata = {'received_start_ns': str(at_ns), 'received_end_ns': str(at_ns), 'pose': f'{second}.0 1.0 0.5 odom',
+                        'battery_pct': f'{80 - second}'}  # fmt: skip
+            body = json.dumps({'type': ODOMETRY, 'samples': [document]}).encode()
+            put(spool, make(f'thor/odom/{utc(at_ns):%Y%m%d/%H%M%S}_odom.json', body, sensor='odom', topic='/odom', type=ODOMETRY,
+                            t_start_ns=at_ns, t_end_ns=at_ns, metadata=metadata))  # fmt: skip
+    finally:
+        spool.close()
+    history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
+    _, body = history.recent('thor', now_ns)
+    found = items(body)
+    head, rows = found['/odom']
+    ages_s = time.monotonic() - np.frombuffer(rows, '<f8', head['rows']) / 1e3
+    elapsed_s = (time.time_ns() - now_ns) / SECOND
+    assert ages_s - elapsed_s == pytest.approx([5, 4, 3, 2, 1], abs=0.5)
+    assert np.frombuffer(found[''][1], '<f4').reshape(-1, 3)[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    timeline, _ = history.answer(
+        {'do': 'timeline', 'robot': 'thor', 'from': now_ns // 1_000_000 - 60_000, 'to': now_ns // 1_000_000}
+    )
+    assert {percent for _, percent in timeline['battery']} >= {80.0, 76.0}

@@ -50,6 +50,9 @@ function parts(content) {
 
 const read = async (robot, at) => parts(await (await ask('moment', { robot, at: Math.round(at), by: clock.value })).arrayBuffer());
 
+// What the robot recorded lately: [item, body] as those of a moment, with the times of live items.
+export const recent = async () => parts(await (await ask('recent')).arrayBuffer())[1];
+
 let wanted = null;
 let asking = false;
 let ahead = null; // the moment that is played next, asked for while the one before it is shown: { robot, at, answer }
@@ -149,6 +152,8 @@ export function pan(ms) {
   const { robot, from, to } = range.value;
   look(robot, from + ms, to + ms);
 }
+
+export const fleet = async () => (await (await ask('fleet')).json()).fleet;
 
 export async function list(robot) {
   try {

@@ -1,6 +1,8 @@
 // What was recorded and what is missing, by topic and time: of today beside the live view, of any day when looking back.
 import { html, useEffect, useMemo, useRef, useState } from './vendor/preact.js';
+import { Fleet } from './fleet.js';
 import { GapWords } from './gaps.js';
+import { Losses } from './losses.js';
 import {
   busy, clock as shownBy, days, go, leave, list, look, openDay, openRobot, pan, past, playing, problem as pastProblem, range, robots, selection, showBy, spanOf, speed,
   timeline, told, zoom,
@@ -111,7 +113,7 @@ function Commands({ session, robot, selected }) {
   const [failed, setFailed] = useState('');
   const chosen = what === 'selection' && !selected ? '' : what || (selected ? 'selection' : 'moment');
   const { at } = past.value;
-  const [from, to] = chosen === 'selection' ? selected : chosen === 'range' && range.value ? [range.value.from, range.value.to] : [at - AROUND_MS, at + AROUND_MS];
+  const [from, to] = chosen === 'selection' ? selected : chosen === 'range' && range.value ? [range.value.from, range.value.to] : chosen === 'minute' ? [at - MINUTE / 2, at + MINUTE / 2] : [at - AROUND_MS, at + AROUND_MS];
   useEffect(() => {
     if (chosen === 'moment') return undefined; // its answer has them
     let isOver = false;
@@ -123,16 +125,18 @@ function Commands({ session, robot, selected }) {
   }, [robot, from, to, chosen, shownBy.value]);
   const commands = chosen === 'moment' ? past.value.commands : found?.commands ?? [];
   const bags = chosen === 'moment' ? [] : found?.bags ?? [];
-  return html`<div class="commands"><div class="panel-head"><h3>Get this data</h3><select aria-label="Of which time" value=${chosen} onChange=${(event) => setWhat(event.target.value)}>
+  return html`<div class="commands"><div class="panel-head"><h3>Get this data: commands and bags</h3><select aria-label="Of which time" value=${chosen} onChange=${(event) => setWhat(event.target.value)}>
       ${selected && html`<option value="selection">the selected ${span((to - from) / 1000)}</option>`}
-      <option value="moment">5 s around this moment</option><option value="range">all that the timeline shows</option></select></div>
+      <option value="moment">5 s around this moment</option><option value="minute">the minute around this moment</option><option value="range">all that the timeline shows</option></select></div>
     ${failed && html`<p class="note bad" role="alert">${failed}</p>`}
     ${bags.map(([bag, size, start, end]) => html`<${Piece} key=${`${bag} ${start} ${end}`} session=${session} robot=${robot} bag=${bag} size=${size} from=${start} to=${end} />`)}
+    ${chosen !== 'moment' && found && !bags.length && html`<p class="note">No bag was recorded in this time, so there is none to cut; fetch gets its objects.</p>`}
     ${commands.map(([name, line]) => html`<p key=${line}><span class="row-name">${name}</span><code data-command=${name}>${line}</code><${Copy} text=${line} /></p>`)}</div>`;
 }
 
 function Transport({ robot, begin, setBegin, jump }) {
   const { at } = past.value;
+  const [percent, setPercent] = useState(30);
   const step = (ms) => go(robot, at + ms);
   const jumps = [['gap', -1, '‹ Gap', 'Previous gap'], ['gap', 1, 'Gap ›', 'Next gap'], ['event', -1, '‹ Event', 'Previous event'], ['event', 1, 'Event ›', 'Next event']];
   return html`<div class="row transport"><button type="button" onClick=${() => step(-10000)} aria-label="10 seconds back">−10 s</button>
@@ -144,6 +148,8 @@ function Transport({ robot, begin, setBegin, jump }) {
     <select aria-label="By which time of the messages" title="Stamp: when it was measured. Arrival: when the robot's computer got it." value=${shownBy.value} onChange=${(event) => showBy(event.target.value)}>
       <option value="stamp">by stamp</option><option value="received">by arrival</option></select>
     <span class="tabs" role="group" aria-label="Jump to">${jumps.map(([what, direction, name, said]) => html`<button type="button" aria-label=${said} data-jump=${`${what} ${direction}`} onClick=${() => jump(what, direction)}>${name}</button>`)}</span>
+    ${told.value?.battery?.length > 0 && html`<span class="below"><button type="button" data-jump="battery" title="Go to the first time in what the timeline shows at which the charge is lower" onClick=${() => jump('battery', percent)}>Battery below</button>
+      <input type="number" min="1" max="100" aria-label="Percent of charge" value=${percent} onInput=${(event) => setPercent(Number(event.target.value))} /> %</span>`}
     <button type="button" aria-pressed=${begin !== null} title="Select the time from this moment to where you go next" onClick=${() => { selection.value = null; setBegin(begin === null ? Math.round(at) : null); }}>From here</button>
     <time class="moment" data-moment=${Math.round(at)}>${moment(at)}</time><span class="unit">UTC${past.value.mission ? ` · ${past.value.mission}` : ''}${busy.value ? ' · reading…' : ''}</span></div>`;
 }
@@ -182,6 +188,12 @@ function LabelForm({ session, robot, selected, clear }) {
     <input aria-label="Note on the label" placeholder="a note" maxlength="500" value=${note} onInput=${(event) => setNote(event.target.value)} />
     <button class="primary" data-act="label">${!selected ? 'Label this moment' : `Label ${span((to - from) / 1000)}`}</button>
     ${said[1] && html`<span class=${`note ${said[0]}`} role="status">${said[1]}</span>`}</form>`;
+}
+
+// The charge at a time: the newest before it.
+function chargeAt(battery, at) {
+  const before = battery.filter(([each]) => each <= at);
+  return (before.at(-1) ?? battery[0])?.[1];
 }
 
 // The part of a time that has anything in it, with some room; all of it where that is most of it.
@@ -270,10 +282,11 @@ export function Timeline({ session }) {
   const recorded = found?.recorded ?? [];
   const kept = found?.kept ?? [];
   const deliveries = found?.deliveries ?? [];
+  const battery = (isPast && found?.battery) || [];
   const topics = useMemo(() => [...new Set([...(found?.known ?? []), ...recorded, ...kept].map(([topic]) => topic).concat(gaps.map((gap) => gap.topic)))].sort().slice(0, 60), [found]);
   const marks = lanes((found?.marks ?? []).filter(([, , since, until]) => isSeen(since, until)).map(([kind, name, since, until, text]) => ({ kind, name, from: since, to: until, text })), x);
   const top = marks.length ? (Math.max(...marks.map((mark) => mark.lane)) + 1) * LANE + 6 : 0;
-  const rows = topics.length + (deliveries.length ? 1 : 0);
+  const rows = topics.length + (deliveries.length ? 1 : 0) + (battery.length ? 1 : 0);
   const height = top + rows * ROW + AXIS;
   const seen = new Map();
   const shades = [...new Map([...gaps, ...(chosen ? [chosen] : [])].map(({ cause }) => [shade(cause).join(), shade(cause)])).values()];
@@ -290,7 +303,8 @@ export function Timeline({ session }) {
     setBegin(null);
   };
   const pick = (ms) => {
-    if (!isPast) look(robot, from, Math.max(to, ms));
+    if (!isPast && ms < from) look(robot, ms - (to - from) / 2, ms + (to - from) / 2);
+    else if (!isPast) look(robot, from, Math.max(to, ms));
     go(robot, Math.min(ms, now || ms));
   };
   const show = (gap) => {
@@ -338,6 +352,10 @@ export function Timeline({ session }) {
   };
   const jump = async (what, direction) => {
     setNote('');
+    if (what === 'battery') {
+      const low = battery.find(([, percent]) => percent < direction);
+      return low ? pick(low[0]) : setNote(`The battery is not below ${direction} % in the time that is shown.`);
+    }
     const edge = 1;
     const list_ = (of) => (what === 'gap' ? named(of).map((gap) => ({ at: gap.from, gap })) : (of.marks ?? []).filter(([kind]) => kind === 'event' || kind === 'label').map(([, , since]) => ({ at: since })))
       .filter((each) => (direction > 0 ? each.at > at + edge : each.at < at - edge)).sort((a, b) => direction * (a.at - b.at) || (b.gap?.count ?? 0) - (a.gap?.count ?? 0));
@@ -400,7 +418,7 @@ export function Timeline({ session }) {
   }), [found, from, to, width, top, now]);
   const wait = (each) => `recorded ${clock(each[0])} to ${clock(each[1])}, ${each[2] === null ? 'not all of it is delivered yet' : `delivered until ${clock(each[2])}`}`;
 
-  return html`<div class="panel timeline">
+  return html`${isPast && (!session.has_live || robots.value.length > 1) && html`<${Fleet} chosen=${robot} />`}<div class="panel timeline">
     <div class="panel-head">
       <h3>${isPast ? 'Back in time' : minutes ? `The last ${span((to - from) / 1000)}` : 'Today'} <span class="unit">UTC</span></h3>
       ${isPast && html`${robots.value.length > 1 && html`<select aria-label="Robot" value=${robot} onChange=${(event) => openRobot(event.target.value)}>${robots.value.map((each) => html`<option>${each}</option>`)}</select>`}
@@ -420,6 +438,7 @@ export function Timeline({ session }) {
       </div>
       ${isPast ? session.has_live && html`<button type="button" class="primary" onClick=${() => { clear(); leave(); }}>Back to now</button>` : html`<button type="button" class="primary" onClick=${() => openRobot(session.robot)}>Back in time</button>`}
     </div>
+    ${!isPast && html`<${Losses} robot=${session.robot} show=${show} />`}
     ${isPast && html`<${Transport} robot=${robot} begin=${begin} setBegin=${setBegin} jump=${jump} />`}
     ${note && html`<p class="note" role="status">${note}</p>`}
     ${isPast && isByArrival && session.role === 'operator' && html`<p class="note">Labels and requests are by stamp.</p>`}
@@ -446,6 +465,8 @@ export function Timeline({ session }) {
         ${deliveries.length > 0 && html`<g transform=${`translate(0 ${top + topics.length * ROW})`}><text class="row-label" x="0" y=${ROW / 2 + 4}><title>What was delivered late, or waits on the robot</title>delivery</text>
           ${deliveries.map((each, number) => isSeen(each[0], each[1]) && html`<rect class=${each[2] === null ? 'waits' : 'late'} data-late=${number} data-from=${each[0]} data-to=${each[1]} data-delivered=${each[2] ?? ''}
             x=${x(each[0])} y="7" width=${Math.max(2.5, x(each[1]) - x(each[0]))} height=${ROW - 14} rx="2"><title>${wait(each)}</title></rect>`)}</g>`}
+        ${battery.length > 0 && html`<g transform=${`translate(0 ${top + (rows - 1) * ROW})`} class="battery"><text class="row-label" x="0" y=${ROW / 2 + 4}><title>The charge of the battery, from 0 to 100 %</title>battery ${Math.round(chargeAt(battery, at) ?? 0)} %</text>
+          <line x1=${left} x2=${width - 8} y1=${ROW - 4} y2=${ROW - 4} /><path data-battery=${battery.length} d=${battery.filter(([each]) => isSeen(each, each)).map(([each, percent], place) => `${place ? 'L' : 'M'}${x(each).toFixed(1)} ${(ROW - 4 - (Math.min(100, Math.max(0, percent)) / 100) * (ROW - 8)).toFixed(1)}`).join('')} /></g>`}
         ${now < to && now > from && html`<line class="now" x1=${x(now)} x2=${x(now)} y1="0" y2=${height - AXIS} />`}
         ${selected && html`<g class="selection"><rect class="span" x=${x(selected[0])} y="0" width=${Math.max(1, x(selected[1]) - x(selected[0]))} height=${height - AXIS} />
           ${['from', 'to'].map((edge, place) => selected[place] >= from && selected[place] <= to && html`<rect class="edge" data-edge=${edge} x=${x(selected[place]) - 3} y="0" width="6" height=${height - AXIS} rx="2" />`)}</g>`}

@@ -1,0 +1,35 @@
+// All robots of a store, those that need a look first.
+import { html, useEffect, useState } from './vendor/preact.js';
+import { Mark } from './data.js';
+import { fleet, openRobot } from './past.js';
+import { digits, moment, span } from './words.js';
+
+const EVERY_MS = 60000;
+
+export function Fleet({ chosen }) {
+  const [rows, setRows] = useState(null);
+  const [failed, setFailed] = useState('');
+  useEffect(() => {
+    let isOver = false;
+    const load = () => !document.hidden && fleet().then((found) => { if (!isOver) { setRows(found); setFailed(''); } }, (error) => !isOver && setFailed(error.message));
+    const first = setTimeout(load, 1500); // the moment that is shown goes first
+    const timer = setInterval(load, EVERY_MS);
+    return () => {
+      isOver = true;
+      clearTimeout(first);
+      clearInterval(timer);
+    };
+  }, []);
+  if (failed) return html`<div class="panel fleet"><p class="note bad" role="alert">${failed}</p></div>`;
+  if (!rows?.length) return null;
+  const now = Date.now();
+  const ago = (ms) => (ms === null ? '–' : `${span(Math.max(0, now - ms) / 1000)} ago`);
+  return html`<div class="panel fleet"><div class="panel-head"><h3>Robots</h3><span class="unit">what needs a look is first</span></div><div class="scroll"><table>
+    <thead><tr><th><span class="visually-hidden">State</span></th><th>Robot</th><th title="When the newest message in the store came to the robot">Last contact</th><th>Last mission</th>
+      <th class="n" title="Messages that are known to be lost since midnight, UTC">Missing today</th><th title="Up to here the robot has told what is missing. What is newer still waits on the robot.">Known until</th></tr></thead>
+    <tbody>${rows.map((row) => html`<tr key=${row.robot} class=${row.robot === chosen ? 'shown' : ''} data-robot=${row.robot} data-state=${row.state}><td><${Mark} kind=${row.state} why=${row.why} /></td>
+      <td><button type="button" class="link" onClick=${() => openRobot(row.robot)}>${row.robot}</button><small> ${row.state === 'good' ? '' : row.why}</small></td>
+      <td title=${row.last === null ? '' : moment(row.last)}>${row.last === null ? row.last_date || 'never' : ago(row.last)}</td>
+      <td>${row.mission || '–'}${row.mission_at === null ? '' : html` <small>${ago(row.mission_at)}</small>`}</td>
+      <td class=${`n ${row.lost ? 'lossy' : ''}`} data-field="lost" title=${row.causes.map(([cause, count]) => `${cause}: ${count}`).join(', ')}>${digits(row.lost)}</td><td title=${row.known === null ? '' : moment(row.known)}>${ago(row.known)}</td></tr>`)}</tbody></table></div></div>`;
+}

@@ -1,0 +1,112 @@
+"""All robots of a store at a glance: what is known of each, in which order, and the table of them in a real Chromium."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from lake.gap_parts import lost, mark, tell
+from lake.making import DAY_NS, NOON_NS, add_part, folder_store, row
+from live.test_page import CHROMIUM, FLAGS, HOSTILE, Served, fits, holds, opened
+
+from shadowhound_data_logger.core.clock import SECOND
+from shadowhound_data_logger.core.options import UploadSettings
+from shadowhound_data_logger.lake.bucket import Bucket
+from shadowhound_data_logger.lake.findings import Findings
+from shadowhound_data_logger.live.fleet import BAD, GOOD, SILENT, WATCH, overview
+from shadowhound_data_logger.live.server import LiveSettings
+from shadowhound_data_logger.stores import open_store
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+
+def store_of(folder: Path, now_ns: int) -> None:
+    """Four robots that were seen a moment ago, two days ago, or a month ago, and a folder that is none."""
+    with closing(open_store(folder_store(folder), UploadSettings())) as store:
+        for name, at_ns in (('thor', now_ns), ('loki', now_ns), ('odin', now_ns - 2 * DAY_NS), ('freya', now_ns - 30 * DAY_NS)):
+            rows = [
+                row('camera', at_ns + second * SECOND, name, mission_id=HOSTILE, mission_type='patrol') for second in range(3)
+            ]
+            add_part(store, rows, 'a', folder / 'tmp')
+    (folder / 'store' / 'sensor-data' / '<img src=x onerror=attacked=1>').mkdir()
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the store is a folder."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    monkeypatch.delenv('AWS_ENDPOINT_URL', raising=False)
+    return tmp_path
+
+
+@pytest.fixture
+def robots(home: Path) -> Path:
+    """The robots at noon, and what one of them lost."""
+    store_of(home, NOON_NS)
+    tell(folder_store(home), home, lost('1', 3, 4, cause='transport', topic='/imu', count=7), mark(8, topic='/imu'))
+    return home
+
+
+def test_what_needs_a_look_comes_first(robots: Path) -> None:
+    """Losses of today, then what is fine, then what is off; of a robot that is silent for long the last day is known."""
+    found = overview(Bucket(folder_store(robots), 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
+    told = [(one.robot, one.state(NOON_NS + 60 * SECOND)[0], sum(one.lost.values())) for one in found]
+    assert told[0] == ('thor', WATCH, 7)
+    assert [state for _, state, _ in told[2:]] == [SILENT, SILENT]
+    by_name = {one.robot: one for one in found}
+    assert list(by_name) == ['thor', 'loki', 'odin', 'freya']
+    assert by_name['thor'].known_ns == NOON_NS + 8 * SECOND
+    assert by_name['thor'].mission == HOSTILE
+    assert by_name['loki'].last_ns == NOON_NS + 2 * SECOND
+    assert by_name['freya'].last_ns == 0
+    assert by_name['freya'].last_date == '2026-09-28'
+
+
+def test_data_that_the_robot_had_and_lost_is_worse(robots: Path) -> None:
+    """Than messages that never reached it."""
+    settings = folder_store(robots)
+    tell(settings, robots, lost('2', 5, 6, kind='quarantined', cause='access_denied', topic='/imu', count=1), name='b')
+    found = overview(Bucket(settings, 'sensor-data'), Findings(lambda _: None), NOON_NS + 60 * SECOND)
+    assert (found[0].robot, found[0].state(NOON_NS + 60 * SECOND)[0]) == ('thor', BAD)
+    tomorrow_ns = NOON_NS + DAY_NS
+    tomorrow = {one.robot: one for one in overview(Bucket(settings, 'sensor-data'), Findings(lambda _: None), tomorrow_ns)}
+    assert tomorrow['thor'].state(tomorrow_ns)[0] == GOOD
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Browser]:
+    api = pytest.importorskip('playwright.sync_api')
+    with (
+        api.sync_playwright() as playwright,
+        closing(playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)) as browser,
+    ):
+        yield browser
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_the_table_of_robots(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In their order, with names as text; a click shows the past of that robot."""
+    store_of(home, time.time_ns() - 10 * SECOND)
+    settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
+    served = Served(settings, monkeypatch)
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, 'document.querySelectorAll("tr[data-robot]").length === 4')
+        rows = 'document.querySelectorAll("tr[data-robot]")'
+        assert page.evaluate(f'[...{rows}].map(row => row.dataset.robot)') == ['loki', 'thor', 'odin', 'freya']
+        assert HOSTILE in page.locator('.fleet').inner_text()
+        page.locator('tr[data-robot=odin] button').dispatch_event('click')
+        holds(page, 'document.querySelector("tr.shown").dataset.robot === "odin"')
+        for width in (1280, 390):
+            fits(page, width)
+        assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
+        assert page.wrong == []  # type: ignore[attr-defined]
+        page.close()
+    finally:
+        served.close()
