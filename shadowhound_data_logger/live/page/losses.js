@@ -51,7 +51,6 @@ export function Losses({ robot, show }) {
   if (!gaps.length) return html`<p class="losses good" data-losses="0">Nothing was lost ${ago}.</p>`;
   const causes = [...new Set(gaps.map((gap) => gap.cause))];
   const messages = gaps.reduce((sum, gap) => sum + gap.count, 0);
-  return html`<div class="losses" role="status" data-losses=${messages}><p><b>${digits(messages)} message${messages === 1 ? '' : 's'} lost</b> ${ago}: on ${[...topics.keys()].slice(0, 3).join(', ')}${topics.size > 3 ? ` and ${topics.size - 3} more topics` : ''}.
-      ${causes.slice(0, 3).map(meaning).join('; ')}.</p>
+  return html`<div class="losses" role="status" data-losses=${messages}><p><b>${digits(messages)} message${messages === 1 ? '' : 's'} lost</b> ${ago}: on ${[...topics.keys()].slice(0, 3).join(', ')}${topics.size > 3 ? ` and ${topics.size - 3} more topics` : ''}. ${causes.slice(0, 3).map(meaning).join('; ')}.</p>
     <p class="row"><button type="button" onClick=${() => show(gaps[0])}>Show the first</button><button type="button" onClick=${acknowledge} title="They stay on the timeline and in the totals, and are no alarm any more in this browser">I have seen them</button></p></div>`;
 }
