@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ MAX_KEPT: Final = 4
 KEPT_S: Final = 900.0
 CUT_S: Final = 300.0
 MIN_FREE_BYTES: Final = 1 << 30
-FOLDER: Final = 'cuts'
+FOLDER: Final = 'cuts-'
 SHARED: Final = {
     'Access-Control-Allow-Origin': '*', 'Access-Control-Allow-Headers': 'Range', 'Access-Control-Allow-Private-Network': 'true',
     'Access-Control-Expose-Headers': 'Accept-Ranges, Content-Length, Content-Range, ETag',
@@ -56,10 +57,13 @@ class Cuts:
 
     def __init__(self, auth: Auth, folder: Path, spool: Path | None) -> None:
         """``folder`` is where pieces are; ``spool`` that of the robot itself, which may have slices that the store lacks."""
-        self._auth, self._folder, self._spool = auth, folder / FOLDER, spool
+        self._auth, self._parent, self._spool = auth, folder, spool
+        self._folder: Path | None = None
         self._cutting = asyncio.Lock()
         self._pieces: dict[str, _Piece] = {}
-        shutil.rmtree(self._folder, ignore_errors=True)  # of a page that was killed
+        for old in folder.glob(f'{FOLDER}*'):  # of a page that was killed
+            if time.time() - old.stat().st_mtime > 2 * KEPT_S:
+                shutil.rmtree(old, ignore_errors=True)
 
     def routes(self) -> list[web.RouteDef]:
         return [
@@ -68,7 +72,8 @@ class Cuts:
         ]  # fmt: skip
 
     def close(self) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _cut(self, request: web.Request) -> web.StreamResponse:
         """Make the piece of a bag; the answer has its address."""
@@ -91,15 +96,15 @@ class Cuts:
             return problem(503, 'another piece is being cut: try again in a moment', {'Retry-After': '5'})
         async with self._cutting:
             self._forget(MAX_KEPT - 1)
-            self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._folder = self._folder or Path(tempfile.mkdtemp(prefix=FOLDER, dir=self._parent))
             if shutil.disk_usage(self._folder).free < MIN_FREE_BYTES:
                 return problem(507, 'the disk of this machine is nearly full: cut on another one, with the command below')
             log.info('%s cuts bag %s of %s', request.remote, bag, robot)
-            return await self._made(robot, bag, begin, end)
+            return await self._made(self._folder, robot, bag, begin, end)
 
-    async def _made(self, robot: str, bag: str, begin_ms: int, end_ms: int) -> web.StreamResponse:
+    async def _made(self, folder: Path, robot: str, bag: str, begin_ms: int, end_ms: int) -> web.StreamResponse:
         name = secrets.token_urlsafe(16)
-        folder = self._folder / name
+        folder = folder / name
         sources = [bag]
         if self._spool is not None:
             local = Tree(self._spool).path(State.PENDING, None, BUCKET, f'{robot}/rosbags/{bag}')

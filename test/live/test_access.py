@@ -115,6 +115,7 @@ async def serving(folder: Path, monkeypatch: pytest.MonkeyPatch, bind: str = '0.
 
 ACT = json.dumps({'do': 'flush'}).encode()
 LABEL = b'{"robot": "thor", "label": "x", "from": 5, "to": 5}'
+CUT = b'{"robot": "thor", "bag": "bumped", "from": 5, "to": 6}'
 PULL = b'{"robot": "thor", "sensor": "x", "from": 5, "to": 6}'
 POLICY = {
     'default-src': "'none'", 'script-src': "'self'", 'style-src': "'self'", 'img-src': "'self'", 'connect-src': "'self'",
@@ -180,6 +181,20 @@ TABLE: tuple[tuple[str, str, dict[str, Any], tuple[int, int, int]], ...] = (
     ('POST', '/api/pull', {'body': PULL.replace(b'"x"', b'5')}, (401, 403, 400)),
     ('POST', '/api/pull', {'body': PULL.replace(b'6', b'-6')}, (401, 403, 400)),
     ('GET', '/api/past/requests', {}, (401, 503, 503)),  # there is no spool
+    ('GET', '/api/past/recent', {}, (401, 503, 503)),
+    ('GET', '/api/past/range?from=5&to=6', {}, (401, 503, 503)),
+    ('GET', '/api/past/range?from=5', {}, (401, 400, 400)),
+    ('GET', '/api/past/fleet', {}, (401, 200, 200)),
+    ('POST', '/api/cut', {'body': CUT}, (401, 503, 503)),  # there is no such bag
+    ('POST', '/api/cut', {'body': CUT, 'csrf': False}, (401, 403, 403)),
+    ('POST', '/api/cut', {'body': CUT, 'headers': FOREIGN}, (403, 403, 403)),
+    ('POST', '/api/cut', {'body': CUT.replace(b'bumped', b'../x')}, (401, 400, 400)),
+    ('POST', '/api/cut', {'body': CUT.replace(b'thor', b'$(reboot)')}, (401, 400, 400)),
+    ('POST', '/api/cut', {'body': CUT.replace(b'6', b'600006')}, (401, 400, 400)),
+    ('GET', '/api/cut', {}, (401, 404, 404)),
+    ('GET', '/cut/x.mcap', {}, (404, 404, 404)),
+    ('GET', '/cut/..%2f..%2fx.mcap', {}, (404, 404, 404)),
+    ('GET', '/cut/x.mcap', {'headers': REBOUND}, (403, 403, 403)),
     ('GET', '/api/past/kept?from=5', {}, (401, 400, 400)),
     ('POST', '/api/sign-out', {'csrf': False}, (401, 403, 403)),
     ('DELETE', '/api/session', {}, (403, 403, 403)),
