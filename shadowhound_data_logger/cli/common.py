@@ -70,8 +70,8 @@ class Verb(NamedTuple):
     """A verb whose module is imported when the verb is called, or its help is needed."""
 
     name: str
-    help: str
-    """The first line of its help."""
+    help: str = ''
+    """The first line of its help, for the help of the program, which imports no verb."""
     module: str = ''
     """In this folder; by default that of its name."""
     attribute: str = ''

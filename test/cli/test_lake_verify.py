@@ -146,7 +146,7 @@ def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch)
         return answered[-1]
 
     monkeypatch.setattr(verify, 'PAGE', 2)
-    monkeypatch.setattr('shadowhound_data_logger.cli.lake.THREADS', 1)
+    monkeypatch.setattr('shadowhound_data_logger.cli.lake_check.THREADS', 1)
     with monkeypatch.context() as patched:
         patched.setattr('shadowhound_data_logger.shipping.audit.check_object', judge)
         assert as_json(home)['unreachable']
