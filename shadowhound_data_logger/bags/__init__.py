@@ -1,4 +1,4 @@
-"""Bags: full-rate recordings in rosbag2's own format, in slices that are whole one by one."""
+"""Bags: full-rate recordings in rosbag2's format, in slices that are complete files."""
 
 from shadowhound_data_logger.bags.record import Recorded, record_and_upload_rosbag
 

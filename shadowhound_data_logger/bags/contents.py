@@ -19,7 +19,7 @@ from typing import IO, Any, Final, Protocol
 
 from shadowhound_data_logger.bags.description import Description, of_files, of_manifest, of_metadata
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural
+from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural_key
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
 from shadowhound_data_logger.core.zstd import ZstdError, ZstdFile
@@ -345,7 +345,7 @@ def described(
     By the manifest if it knows all of them. Otherwise, SQLite and packed files in a store would have to be downloaded: of a bag
     with those, it is what the metadata claims. The same is true without ``scans`` of MCAP files whose summary is not enough.
     """
-    names = slices_of(sorted(sources, key=natural), claimed)
+    names = slices_of(sorted(sources, key=natural_key), claimed)
     if claimed is not None and manifest is not None and {each.file for each in manifest.slices}.issuperset(names):
         return of_manifest(manifest, sources, claimed)
     if any(not name.endswith(MCAP) and not isinstance(sources[name], LocalFile) for name in names):
@@ -397,7 +397,7 @@ def files_of(path: Path) -> dict[str, Path]:
     if not path.is_dir():
         raise BagError(f'there is no folder {path}', remedy='name the folder that `ros2 bag record -o` made', path=str(path))
     found = {str(each.relative_to(path)): each for each in path.rglob('*') if each.is_file()}
-    return {name: found[name] for name in sorted(found, key=natural)}
+    return {name: found[name] for name in sorted(found, key=natural_key)}
 
 
 def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:

@@ -29,7 +29,7 @@ from shadowhound_data_logger.bags.description import BagPart, Description, is_la
 from shadowhound_data_logger.bags.fetch import fetch, on_disk
 from shadowhound_data_logger.bags.latched import MAX_LATCHED_BYTES, MAX_PER_TOPIC, Latched
 from shadowhound_data_logger.bags.naming import BUCKET, MCAP, METADATA
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.remote import RemoteBag, clock_of, document, read_manifest
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import BagError, SettingError
@@ -188,10 +188,10 @@ class _LatchedBefore:
             repeats[channel.topic] += channel.repeated
             publishers = sum(is_latched([each]) for each in profiles(channel.qos))
             count = MAX_PER_TOPIC if channel.type in ACCUMULATED else max(publishers, repeats[channel.topic], 1)
-            latched.keep(Lot(channel.topic, channel.type, '', [Taken(cdr, publish_ns, None, sequence, log_ns)], count))
+            latched.keep(MessageBatch(channel.topic, channel.type, '', [Taken(cdr, publish_ns, None, sequence, log_ns)], count))
         kept = [
-            RecordedMessage(replace(channels[lot.topic, lot.type], repeated=True), start_ns, source_ns, number or 0, cdr)
-            for lot in latched for cdr, source_ns, _, number, *_ in lot.messages
+            RecordedMessage(replace(channels[batch.topic, batch.type], repeated=True), start_ns, source_ns, number or 0, cdr)
+            for batch in latched for cdr, source_ns, _, number, *_ in batch.messages
         ]  # fmt: skip
         found = [message for message in kept if self.is_new(message)]
         self.count += len(found)

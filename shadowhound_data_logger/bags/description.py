@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
-from shadowhound_data_logger.bags.naming import SQLITE, natural
+from shadowhound_data_logger.bags.naming import SQLITE, natural_key
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import BagDamaged
@@ -115,7 +115,7 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
     found = Description(
         storage='sqlite3' if any(SQLITE in name for name in infos) else 'mcap', compression='', distro='',
         topics=tuple(topics.values()),
-        parts=tuple(sorted((*parts, *absent), key=lambda part: natural(part.name))),
+        parts=tuple(sorted((*parts, *absent), key=lambda part: natural_key(part.name))),
         messages=sum(one.messages for one in infos.values()) if infos or not absent else None,
         t_start_ns=min((one.t_start_ns for one in filled), default=None),
         t_end_ns=max((one.t_end_ns for one in filled), default=None), absent=tuple(part.name for part in absent), damaged=damaged,
@@ -135,7 +135,8 @@ def of_manifest(manifest: Manifest, there: Container[str], claimed: Description)
     parts = [_part_of(each.file, each) for each in manifest.slices]
     found = replace(
         claimed, topics=tuple(replace(topic, messages=counts.get((topic.name, topic.type), 0)) for topic in topics),
-        parts=tuple(sorted(parts, key=lambda part: natural(part.name))), messages=sum(each.messages for each in manifest.slices),
+        parts=tuple(sorted(parts, key=lambda part: natural_key(part.name))),
+        messages=sum(each.messages for each in manifest.slices),
         t_start_ns=min((part.t_start_ns for part in parts if part.t_start_ns is not None), default=None),
         t_end_ns=max((part.t_end_ns for part in parts if part.t_end_ns is not None), default=None),
         absent=tuple(part.name for part in parts if part.name not in there),

@@ -1,11 +1,11 @@
-"""Events: a trigger makes a bag of the seconds before and after it, from the ring, written by a separate thread.
+"""Events: a trigger records a bag of the seconds before and after it. A separate thread writes it from the ring.
 
-A trigger while an event goes on makes it last longer, and is listed in its manifest; what would be longer than an event may be
-follows in one of its own, without a message between them or in both. The writer takes from the ring piece by piece what it
-writes: there is no second copy of it, and the intake never waits.
+A trigger during an event extends the event and is listed in its manifest. If that would exceed the maximum length, another event
+follows, with no message lost between them and none in both. The writer removes the messages from the ring piece by piece: there
+is no second copy, and the intake never waits.
 
-Counted are the messages that an event asks for, in accounts of their own (EVENT): they are stored, dropped (``ring_full``: gone
-before they were written; ``paused``; what the disk refused) or open. What nobody asks for is in no account.
+The messages that events claim have separate accounts (EVENT): they are stored, dropped (``ring_full``: evicted before they were
+written; ``paused``; rejected by the disk) or open. Messages that no event claims are in no account.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, MissionOf, TriggerOf
-from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.recorder import SYNC_S, Answer
 from shadowhound_data_logger.bags.recording import UNWRITABLE, Recording
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.bags.ring import Claims, Ring
+from shadowhound_data_logger.bags.ring import EventAccounts, Ring
 from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.options import BagSettings, EventSettings
@@ -34,49 +34,49 @@ log = logging.getLogger(__name__)
 
 PREFIX: Final = 'event_'
 NOTICE_S: Final = 1.0
-"""What the ring keeps beyond the time before a trigger: for so long a trigger may be on its way."""
+"""The ring keeps messages this much longer than ``pre_s``, because a trigger may arrive late."""
 STEP_S: Final = 0.2
 IDLE_S: Final = 10.0
-"""A round without an event; well below ``PATIENCE_S``, or the writer would be said to hang while it has nothing to do."""
+"""Maximum wait without an event; well below ``PATIENCE_S``, or the idle writer would be reported as blocked."""
 RETRY_S: Final = 5.0
-"""Between two tries to begin a bag on a disk that takes nothing."""
+"""Time between attempts to create a bag on a disk that accepts no writes."""
 FLUSH_S: Final = 5.0
 MAX_WAIT_NS: Final = 24 * 3600 * SECOND
-"""No trigger waits longer for its event; a difference beyond it is one between two clocks."""
+"""No trigger waits longer than this for its event; a larger difference is one between two clocks."""
 PATIENCE_S: Final = 30.0
 
 
 @dataclass(slots=True)
 class _Event:
-    """One that goes on. ``bag``, ``of`` and ``until_s`` change under the lock; ``recording`` is the writer's."""
+    """The active event. ``bag``, ``of`` and ``until_s`` change under the lock; ``recording`` belongs to the writer."""
 
     bag: str
     of: EventOf
     until_s: float
     at_most_s: float
-    unset: ClockOf | None
-    """The clock, where it was not set when it was triggered."""
+    unset_clock: ClockOf | None
+    """The clock, if it was not set when the event was triggered."""
     recording: Recording | None = None
     again_s: float = 0.0
     refused: str = ''
 
 
 class Events:
-    """Records events: makes a bag of what the ring holds and what follows, for each trigger.
+    """Records events: for each trigger, a bag of the messages in the ring and of those that follow.
 
-    Life: New; open once; ``trigger`` and ``status`` from any thread; ``close`` after the intake is closed.
+    Lifecycle: new; ``open`` once; ``trigger`` and ``status`` from any thread; ``close`` after the intake is closed.
 
-    ``_lock`` guards which event goes on and what is asked of it; the writing belongs to the thread ``event-writer``.
+    ``_lock`` guards the active event and its triggers; the thread ``event-writer`` writes the bags.
     """
 
-    def __init__(self, settings: EventSettings, bag: BagSettings, place: BagPlace, ring: Ring, recovery: BagRecovery,
+    def __init__(self, settings: EventSettings, bag: BagSettings, context: BagContext, ring: Ring, recovery: BagRecovery,
                  poll_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``poll_s``: how late the intake may take a message."""
+        """``poll_s``: maximum delay with which the intake takes a message."""
         self._settings = settings
         self._bag = bag
-        self._place = place
+        self._context = context
         self._ring = ring
-        self.claims = Claims(place.spool.accounts)
+        self.claims = EventAccounts(context.spool.accounts)
         self._recovery = recovery
         self._poll_s = poll_s
         self._monotonic = monotonic
@@ -102,7 +102,7 @@ class Events:
             self._worker.start()
 
     def close(self, deadline_s: float) -> bool:
-        """End the event that goes on, with what the ring has; False when that took too long: the next start goes on with it."""
+        """End the active event with the messages in the ring; False if that timed out: then the next start completes it."""
         end_s = time.monotonic() + deadline_s
         with self._lock:
             self._closed = True
@@ -110,22 +110,22 @@ class Events:
             if self._current is not None:
                 self._current.until_s = min(self._current.until_s, self._monotonic() - self._poll_s)
         self._wake.set()
-        is_whole = self._ended.wait(max(0.0, deadline_s))
+        is_complete = self._ended.wait(max(0.0, deadline_s))
         self._worker.stop()
         self._wake.set()
-        return self._worker.join(max(0.1, end_s - time.monotonic())) and is_whole
+        return self._worker.join(max(0.1, end_s - time.monotonic())) and is_complete
 
     def update(self, settings: EventSettings) -> None:
-        """Go on by other settings, as far as they are live."""
+        """Use new values of the settings that can be changed at run time."""
         self._settings = settings
         self._ring.max_bytes, self._ring.keep_s = settings.max_bytes, settings.pre_s + NOTICE_S
 
     def on_mission(self, mission: MissionOf | None) -> None:
-        """The mission that is active now."""
+        """Set the active mission."""
         self._mission = mission
 
     def status(self) -> EventStatus:
-        """From any thread."""
+        """The status, from any thread."""
         if not self._settings.enabled:
             return EventStatus()
         event, ring = self._current, self._ring
@@ -137,31 +137,33 @@ class Events:
         )  # fmt: skip
 
     def trigger(self, name: str, by: str, detail: str | None = None, age_s: float = 0.0, who: str = '') -> Answer:
-        """Something happened, so long ago: begin an event, or make the one that goes on last longer. Names the bag.
+        """Start an event about something that happened ``age_s`` ago, or extend the active one. The answer names the bag.
 
-        ``who`` is the person who asked for it, where one is known.
+        ``who`` is the person who requested it, if known.
         """
         with self._lock:
             if not self._settings.enabled:
                 return False, 'no events: neither events.topics nor events.regex names a topic to keep'
             if self._closed:
-                return False, 'no more events: the node is closing'
+                return False, 'no event can start: the node is shutting down'
             self._triggers += 1
             now_s, event = self._monotonic(), self._current
-            unset = self._place.unset() if event is None else event.unset
-            said = TriggerOf(name, by, max(0, self._place.now_ns(unset) - round(age_s * SECOND)), detail or None, who or None)
+            unset_clock = self._context.unset_clock() if event is None else event.unset_clock
+            trigger = TriggerOf(
+                name, by, max(0, self._context.now_ns(unset_clock) - round(age_s * SECOND)), detail or None, who or None
+            )
             if event is None:
-                event = self._current = self._begin([said], now_s - age_s)
+                event = self._current = self._begin([trigger], now_s - age_s)
                 self._ended.clear()
-                text = f'{event.bag} begins'
+                text = f'{event.bag} starts'
             elif now_s - age_s + self._settings.post_s <= event.at_most_s:
-                event.of = replace(event.of, triggers=(*event.of.triggers, said))
+                event.of = replace(event.of, triggers=(*event.of.triggers, trigger))
                 event.until_s = max(event.until_s, now_s - age_s + self._settings.post_s)
-                text = f'{event.bag} lasts longer'
+                text = f'{event.bag} is extended'
             else:
-                self._waiting.append(said)
-                text = f'another event follows {event.bag}, which is as long as it may be'
-            self._last = Trigger(name, by, iso(said.at_ns), event.bag)
+                self._waiting.append(trigger)
+                text = f'another event follows {event.bag}, which has reached its maximum length'
+            self._last = Trigger(name, by, iso(trigger.at_ns), event.bag)
             self._wake.set()
         log.info('event %s (%s): %s', name, by, text)
         return True, text
@@ -169,22 +171,22 @@ class Events:
     # -- under the lock --------------------------------------------------------------------------------------------
 
     def _begin(self, triggers: Sequence[TriggerOf], at_s: float, since_s: float | None = None) -> _Event:
-        """An event about a moment; ``since_s`` is the end of the one that it follows."""
+        """An event about the time ``at_s``; ``since_s`` is the end of the event that it follows."""
         settings = self._settings
-        oldest_s = self._ring.claim(at_s - settings.pre_s if since_s is None else since_s, self._place.clock.wall_ns())
+        oldest_s = self._ring.claim(at_s - settings.pre_s if since_s is None else since_s, self._context.clock.wall_ns())
         held_s = 0.0 if oldest_s is None or since_s is not None else min(max(0.0, at_s - oldest_s), settings.pre_s)
         name = safe_type(triggers[0].name)
         if since_s is None:
             self.claims.begin()
-        age_ns = max(0, self._place.clock.wall_ns() - triggers[0].at_ns)
+        age_ns = max(0, self._context.clock.wall_ns() - triggers[0].at_ns)
         age_ns = age_ns if age_ns < MAX_WAIT_NS else 0
-        unset = self._place.unset(age_ns)
-        bag = self._place.name(f'{PREFIX}{name}', unset, age_ns)
+        unset_clock = self._context.unset_clock(age_ns)
+        bag = self._context.name(f'{PREFIX}{name}', unset_clock, age_ns)
         of = EventOf(name, settings.pre_s, round(held_s, 3), settings.post_s, tuple(triggers))
-        return _Event(bag, of, at_s + settings.post_s, at_s + settings.max_s, unset)
+        return _Event(bag, of, at_s + settings.post_s, at_s + settings.max_s, unset_clock)
 
     def _end(self, event: _Event) -> bool:
-        """Whether the event is over; if so another one that waits begins, or the ring is nobody's again."""
+        """Whether the event has ended; if so, the next waiting one starts, or the ring is released."""
         with self._lock:
             now_s = self._monotonic()
             if now_s < event.until_s + self._poll_s:
@@ -202,7 +204,7 @@ class Events:
     # -- the thread ------------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Wait until there is something to write, and write it; sync when it is time."""
+        """Wait for messages and write them; sync when it is due."""
         self._wake.wait(STEP_S if self._current is not None else IDLE_S)
         self._wake.clear()
         event = self._current
@@ -218,12 +220,14 @@ class Events:
             self._close_bag(event)
 
     def _open_bag(self, event: _Event) -> bool:
-        """Make the bag's folder; False while the disk takes nothing."""
+        """Create the bag's folder; False while the disk accepts no writes."""
         now_s = self._monotonic()
         if now_s < event.again_s:
             return False
         try:
-            state = BagState.begin(self._place.root / event.bag, self._place.robot, self._mission, event.of, event.unset)
+            state = BagState.begin(
+                self._context.root / event.bag, self._context.robot, self._mission, event.of, event.unset_clock
+            )
         except OSError as error:
             event.again_s = now_s + RETRY_S
             if not event.refused:
@@ -231,21 +235,21 @@ class Events:
             event.refused = UNWRITABLE
             return False
         event.refused = ''
-        event.recording = Recording(state, self._bag, self._place, self._recovery)
+        event.recording = Recording(state, self._bag, self._context, self._recovery)
         self._due_s = now_s + SYNC_S
         return True
 
     def _write(self, event: _Event) -> None:
-        """All that the ring has of the event until now."""
+        """Write the messages that the ring has for the event."""
         recording = event.recording
         assert recording is not None
-        self._tell_triggers(event, recording)
+        self._store_triggers(event, recording)
         while held := self._ring.next(event.until_s + self._poll_s):
             fresh = self.claims.receive(held)
             if fresh:
-                recording.write(held.lot._replace(messages=fresh))
+                recording.write(held.batch._replace(messages=fresh))
             self._sync(recording)
-        recording.leave_out(self.claims.take_lost())
+        recording.count_dropped(self.claims.take_dropped())
         self._sync(recording)
 
     def _sync(self, recording: Recording) -> None:
@@ -253,7 +257,7 @@ class Events:
             recording.tick()
             self._due_s = self._monotonic() + SYNC_S
 
-    def _tell_triggers(self, event: _Event, recording: Recording) -> None:
+    def _store_triggers(self, event: _Event, recording: Recording) -> None:
         if recording.state.event is not event.of:
             recording.set_event(event.of)
 
@@ -261,16 +265,16 @@ class Events:
         recording = event.recording
         assert recording is not None
         before, mission = recording.state.mission, self._mission
-        self._tell_triggers(event, recording)
+        self._store_triggers(event, recording)
         if mission is not None and before is not None and before.mission_id == mission.mission_id:
             recording.set_mission(mission)
-        is_whole = recording.close(FLUSH_S)
+        is_complete = recording.close(FLUSH_S)
         self._written += 1
-        log.log(logging.INFO if is_whole else logging.WARNING, '%s: %d messages%s', event.bag, recording.messages,
-                '' if is_whole else '; the next start makes it whole')  # fmt: skip
+        log.log(logging.INFO if is_complete else logging.WARNING, '%s: %d messages%s', event.bag, recording.messages,
+                '' if is_complete else '; the next start completes it')  # fmt: skip
 
     def _give_up(self, event: _Event) -> None:
-        """The disk took nothing for as long as it lasted."""
+        """The disk accepted no writes during the event: drop its messages."""
         while held := self._ring.next(event.until_s + self._poll_s):
             self.claims.lose([held], UNWRITABLE)
         if self._end(event):

@@ -10,7 +10,7 @@ from shadowhound_data_logger.bags.contents import described, open_folder
 from shadowhound_data_logger.bags.description import Description, clock_state, of_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, natural
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, natural_key
 from shadowhound_data_logger.bags.remote import (
     FOREIGN,
     GROWING,
@@ -90,7 +90,7 @@ def info_folder(path: Path) -> BagInfo:
 
 def _info(robot: str, name: str, where: Mapping[str, tuple[int, str]], manifest: Manifest | None, description: Description,
           meter: Meter, tags: Mapping[str, str]) -> BagInfo:  # fmt: skip
-    files = RemoteBag(robot, name, tuple(RemoteFile(each, '', where[each][0]) for each in sorted(where, key=natural)))
+    files = RemoteBag(robot, name, tuple(RemoteFile(each, '', where[each][0]) for each in sorted(where, key=natural_key)))
     state = GROWING if any(each.endswith('.open') for each in where) else state_of(files, manifest, tags)
     missing = missing_of(files, manifest) if manifest else description.absent
     return BagInfo(robot, name, state if robot or manifest else FOREIGN, description,

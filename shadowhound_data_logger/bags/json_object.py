@@ -1,4 +1,4 @@
-"""Reads a JSON object that anybody may have written, field by field, each with its type checked."""
+"""Reads an untrusted JSON object field by field, and checks the type of each."""
 
 from __future__ import annotations
 
@@ -6,38 +6,38 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.errors import BagDamaged
 
-MOST: Final = 1 << 64
-"""Times in MCAP have 64 bits without a sign."""
+LIMIT: Final = 1 << 64
+"""All numbers must be below this: times in MCAP are uint64."""
 
 
 class JsonObject:
     """A JSON object from an untrusted file, with typed access to its fields.
 
-    New with what ``json.loads`` gave; what is not as it must be raises BagDamaged with its place.
+    ``value`` is the result of ``json.loads``. Methods raise BagDamaged, with the path of the field, for invalid values.
     """
 
     def __init__(self, value: object, file: str, place: str) -> None:
         self._file, self._place = file, place
         if not isinstance(value, dict):
-            raise BagDamaged(f'{file}: {place or "it"} is not JSON object', path=file)
+            raise BagDamaged(f'{file}: {place or "it"} is not a JSON object', path=file)
         self._fields: dict[str, Any] = value
 
     def text(self, name: str, *, is_any: bool = False) -> str:
-        """Not empty, unless any will do."""
+        """A string; non-empty unless ``is_any``."""
         found = self._fields.get(name)
         if not isinstance(found, str) or not (found or is_any):
             raise self.wrong(name, 'a text')
         return found
 
     def text_or_none(self, name: str) -> str | None:
-        """None for an empty one as well."""
+        """A string; None if it is missing or empty."""
         found = self._fields.get(name)
         return None if found is None or found == '' else self.text(name)
 
     def count(self, name: str) -> int:
         found = self._fields.get(name)
-        if type(found) is not int or not 0 <= found < MOST:
-            raise self.wrong(name, 'a whole number of 0 ... 2^64')
+        if type(found) is not int or not 0 <= found < LIMIT:
+            raise self.wrong(name, 'an integer from 0 to 2^64')
         return found
 
     def count_or_none(self, name: str) -> int | None:
@@ -50,7 +50,7 @@ class JsonObject:
         try:
             return float(found)
         except OverflowError:
-            raise self.wrong(name, 'a number of 64 bits') from None
+            raise self.wrong(name, 'a 64-bit number') from None
 
     def flag(self, name: str) -> bool:
         found = self._fields.get(name)
@@ -63,7 +63,7 @@ class JsonObject:
         return {key: inner.count(key) for key in inner._fields}
 
     def has(self, name: str) -> bool:
-        """Whether something other than null is there."""
+        """Whether the field exists and is not null."""
         return self._fields.get(name) is not None
 
     def object(self, name: str) -> JsonObject:

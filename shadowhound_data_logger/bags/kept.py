@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, MissionOf, SliceEntry, topics_of
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, natural, slice_file
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, natural_key, slice_file
 from shadowhound_data_logger.bags.objects import SENSOR, ros_distro
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.errors import BagDamaged
@@ -44,7 +44,7 @@ class KeptCut:
 
     def __init__(self, home: Path, slices: Sequence[KeptSlice], since_ns: int, until_ns: int, priority: int) -> None:
         """From ``since_ns``, before ``until_ns``, Unix nanoseconds. ``slices`` are of one bag, one at least."""
-        self.slices = sorted(slices, key=lambda each: natural(each.key))
+        self.slices = sorted(slices, key=lambda each: natural_key(each.key))
         self._span = since_ns, until_ns
         self._priority = priority
         self.robot, _, self._of, _ = slices[0].key.split('/')

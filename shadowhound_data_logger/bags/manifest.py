@@ -1,4 +1,4 @@
-"""``manifest.json``: what a bag's writer says of the whole bag. Written once, at its end: a bag without one is still growing.
+"""``manifest.json``: describes a complete bag. The recorder writes it once, at the end: a bag without one is still growing.
 
     {"version": 1, "bag": "patrol_20261121_120000", "robot": "thor", "state": "complete",
      "mission": {"type": "patrol", "mission_id": "...", "run_id": null}, "event": null, "clock": null,
@@ -8,18 +8,18 @@
      "slices": [{"file": "patrol_20261121_120000_0.mcap", "key": "thor/rosbags/...", "bytes": 1, "sha256": "...",
                  "messages": 1, "t_start_ns": 1, "t_end_ns": 1, "counts": {"/imu": 1}, "repeated": {}}]}
 
-``mission`` is null for a bag of no mission, ``run_id`` where it was not known yet. ``missing`` is empty where ``state`` is
-``complete``; its ``messages`` is null where nobody counted them, ``topic`` and ``reason`` where it is not of one topic. Unknown
-fields are a later version's, and ignored. Counts are those of the files, with the messages that a slice repeats.
-``event`` is what made the bag of an event, in the order of the triggers:
+``mission`` is null for a bag without a mission, ``run_id`` if it was unknown. ``missing`` is empty if ``state`` is ``complete``;
+its ``messages`` is null if the number is unknown, ``topic`` and ``reason`` if the loss is not of one topic. Unknown fields belong
+to later versions and are ignored. Counts are those of the files, including the messages that a slice repeats.
+``event`` describes the event that a bag was recorded for, with its triggers in order:
 
     {"name": "low_battery", "pre_s": 30.0, "held_s": 30.0, "post_s": 10.0,
      "triggers": [{"name": "low_battery", "by": "condition", "at_ns": 1, "detail": "low_battery: ...soc < 20: 19", "who": null},
                   {"name": "fall", "by": "page", "at_ns": 2, "detail": null, "who": "operator at 192.168.1.7"}]}
 
-``clock`` is null where the clock of the machine was set. Else all times of the bag are by the clock as it was, and to make UTC
-of them ``offset_ns`` is to be added (null with ``known`` ``unset``: nobody knows); ``wall_ns`` and ``boot_ns`` are what that
-clock and the boot clock showed when the bag began:
+``clock`` is null if the clock of the machine was set. Otherwise all times of the bag are by the unset clock, and ``offset_ns``
+must be added to get UTC (null if ``known`` is ``unset``: then the offset is unknown); ``wall_ns`` and ``boot_ns`` are the times
+of that clock and of the boot clock when the bag started:
 
     {"known": "set_later", "boot_id": "...", "boot_ns": 12000000000, "wall_ns": 22000000000, "offset_ns": 1760788778000000000}
 """
@@ -40,16 +40,16 @@ from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 VERSION: Final = 1
 COMPLETE: Final = 'complete'
 RECOVERED: Final = 'recovered'
-"""The recording did not end by itself: what had not reached the disk is missing, at least."""
+"""The recording was interrupted: at least the messages that had not reached the disk are missing."""
 GAPS: Final = 'gaps'
-"""It did end by itself, but not all that came is in the bag."""
+"""The recording ended normally, but some received messages are not in the bag."""
 STATES: Final = frozenset({COMPLETE, GAPS, RECOVERED})
 _SHA256: Final = re.compile('[0-9a-f]{64}')
 
 
 @dataclass(frozen=True, slots=True)
 class MissionOf:
-    """The mission that a bag was recorded in; ids are None until they are known."""
+    """The mission of a bag; ids are None until they are known."""
 
     type: str
     mission_id: str | None
@@ -58,7 +58,7 @@ class MissionOf:
 
 @dataclass(frozen=True, slots=True)
 class TriggerOf:
-    """What asked for an event.
+    """What triggered an event.
 
     ``by`` is ``command``, ``service``, ``page``, ``log_event`` or ``condition``; ``at_ns`` is Unix nanoseconds.
     """
@@ -68,24 +68,24 @@ class TriggerOf:
     at_ns: int
     detail: str | None
     who: str | None = None
-    """The person who asked for it, where the page knows one."""
+    """The person who requested it, if the live page knows it."""
 
 
 @dataclass(frozen=True, slots=True)
 class EventOf:
-    """What an event's bag was made for; ``pre_s`` and ``post_s`` are what was asked of before and after a trigger."""
+    """The event of a bag; ``pre_s`` and ``post_s`` are the requested times before and after a trigger."""
 
     name: str
     pre_s: float
     held_s: float
-    """How far back from the first trigger the ring went: less than ``pre_s`` where its bytes or its time did not suffice."""
+    """How far before the first trigger the bag starts: less than ``pre_s`` if the ring was too small or too new."""
     post_s: float
     triggers: tuple[TriggerOf, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOf:
-    """The clock by which a bag's times are, where it was not set when the bag began."""
+    """The clock of a bag's times, if it was not set when the bag started."""
 
     known: str
     """``set_later`` or ``unset``, as in the metadata of objects."""
@@ -97,19 +97,19 @@ class ClockOf:
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Something that should have been in the bag; ``file`` is the slice in or after which it is missing."""
+    """A loss; ``file`` is the slice in or after which the messages are missing."""
 
     file: str
     what: str
     messages: int | None
     topic: str | None = None
     reason: str | None = None
-    """Why the messages were dropped, in the words of the ledger."""
+    """Why the messages were dropped, as in the ledger."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic of one type that was recorded, also one without messages."""
+    """A recorded topic with one type; it may have no messages."""
 
     topic: str
     type: str
@@ -118,7 +118,7 @@ class RecordedTopic:
 
 @dataclass(frozen=True, slots=True)
 class SliceEntry:
-    """A slice as it lies in the store; times as in SliceInfo."""
+    """A slice in the store; times as in SliceInfo."""
 
     file: str
     key: str
@@ -129,11 +129,11 @@ class SliceEntry:
     t_end_ns: int
     counts: Mapping[str, int]
     repeated: Mapping[str, int]
-    """Of ``counts``, the latched messages of earlier slices with which this one begins, on channels of their own."""
+    """The messages among ``counts`` that repeat latched messages of earlier slices, on separate channels."""
 
     @property
     def recorded(self) -> Mapping[str, int]:
-        """As in SliceInfo."""
+        """``counts`` without the repeated messages, as in SliceInfo."""
         return {topic: count - self.repeated.get(topic, 0) for topic, count in self.counts.items()}
 
     @classmethod
@@ -144,7 +144,7 @@ class SliceEntry:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """A whole bag."""
+    """The description of a complete bag."""
 
     bag: str
     robot: str
@@ -157,13 +157,13 @@ class Manifest:
     clock: ClockOf | None = None
 
     def to_json(self) -> bytes:
-        """The file's content."""
-        said = {'version': VERSION, **asdict(self)}
-        return json.dumps(said, ensure_ascii=False, indent=1).encode(errors='replace') + b'\n'
+        """The content of the file."""
+        document = {'version': VERSION, **asdict(self)}
+        return json.dumps(document, ensure_ascii=False, indent=1).encode(errors='replace') + b'\n'
 
     @classmethod
     def from_json(cls, content: bytes, name: str = 'manifest.json') -> Manifest:
-        """Raises BagDamaged, naming the first field that is not as it must be; ``name`` is the file's, for that."""
+        """Raises BagDamaged, which names the file (``name``) and the first invalid field."""
         try:
             found = from_json(content)
         except ValueError as error:
@@ -184,7 +184,7 @@ class Manifest:
 
 
 def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
-    """What was recorded, in the order in which it first appeared."""
+    """The recorded topics, in the order of their first slices."""
     counts: dict[tuple[str, str], int] = {}
     for one in slices:
         for channel, count in one.channels.items():
@@ -194,23 +194,23 @@ def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
 
 
 def _topic(one: JsonObject) -> RecordedTopic:
-    """Of another recorder's channel without a schema, the type is empty."""
+    """The type is empty for another recorder's channel without a schema."""
     return RecordedTopic(one.text('topic', is_any=True), one.text('type', is_any=True), one.count('messages'))
 
 
 def read_missing(one: JsonObject) -> Missing:
-    """Raises BagDamaged, as those below."""
+    """Raises BagDamaged if a field is invalid, as do the following functions."""
     return Missing(one.text('file'), one.text('what'), one.count_or_none('messages'), one.text_or_none('topic'),
                    one.text_or_none('reason'))  # fmt: skip
 
 
 def read_mission(one: JsonObject) -> MissionOf:
-    """Whatever an agent calls a mission."""
+    """A mission; its type may be any text."""
     return MissionOf(one.text('type', is_any=True), one.text_or_none('mission_id'), one.text_or_none('run_id'))
 
 
 def read_event(one: JsonObject) -> EventOf:
-    """Whatever an agent calls an event."""
+    """An event; the names of its triggers may be any text."""
     triggers = tuple(
         TriggerOf(each.text('name', is_any=True), each.text('by'), each.count('at_ns'), each.text_or_none('detail'),
                   each.text_or_none('who'))
@@ -220,7 +220,7 @@ def read_event(one: JsonObject) -> EventOf:
 
 
 def read_clock(one: JsonObject) -> ClockOf:
-    """Of a bag that has one."""
+    """The clock of a bag."""
     return ClockOf(one.text('known'), one.text('boot_id'), one.count('boot_ns'), one.count('wall_ns'),
                    one.count_or_none('offset_ns'))  # fmt: skip
 

@@ -13,37 +13,37 @@ from shadowhound_data_logger.missions.folder import safe_type
 
 BUCKET: Final = 'sensor-data'
 BAGS: Final = 'bags'
-"""Of what is being recorded, in SHADOWHOUND_HOME."""
+"""Folder of the bags that are being recorded, in SHADOWHOUND_HOME."""
 RECORDING: Final = 'recording'
-"""What a bag of no mission is called by."""
+"""Name prefix of a bag without a mission."""
 UNSYNCED: Final = '_unsynced_'
-"""Stands in the name of a bag that has no date, or none yet."""
+"""Part of the name of a bag that has no date, or not yet."""
 METADATA, MANIFEST = 'metadata.yaml', 'manifest.json'
 MCAP, SQLITE, PACKED = '.mcap', '.db3', '.zstd'
-"""What the names of files with messages end with; rosbag2 appends the last to one that it compressed."""
+"""Suffixes of files with messages; rosbag2 appends the last one to a file that it compressed."""
 UNSAFE: Final = re.compile(r'[^A-Za-z0-9_.-]+')
-"""What is replaced in the name of a folder or file that becomes part of a key."""
+"""Characters that are replaced in names that become part of a key."""
 SLICES: Final = (MCAP, SQLITE, MCAP + PACKED, SQLITE + PACKED)
 
 
 def bag_name(what: str, now_ns: int, is_taken: Callable[[str], bool]) -> str:
-    """``patrol_20251018_120000``, in UTC; ``_1``, ``_2``, ... when it is taken: two bags may begin in a second.
+    """``patrol_20251018_120000``, in UTC, with ``_1``, ``_2``, ... appended if taken: two bags may start in the same second.
 
-    ``what`` is a mission's type, as it stands in the mission's own name where it cannot be part of a key.
+    ``what`` is a mission's type; characters that are invalid in a key are replaced as in the mission's own name.
     """
     return _free(f'{_safe(what)}_{utc(now_ns):%Y%m%d_%H%M%S}', is_taken)
 
 
 def unsynced_name(what: str, boot_id: str, boot_ns: int, is_taken: Callable[[str], bool]) -> str:
-    """``patrol_unsynced_<boot id>_00000012``: of a bag whose time is known by the boot clock alone, seconds since boot.
+    """``patrol_unsynced_<boot id>_00000012``: the name of a bag whose time is only known in seconds since boot.
 
-    The same is told of an object without a date (``keys.unsynced``); no other boot has the id.
+    Objects without a date have the same form (``keys.unsynced``). The boot id is unique.
     """
     return _free(f'{_safe(what)}{unsynced_mark(boot_id, boot_ns)}', is_taken)
 
 
 def unsynced_mark(boot_id: str, boot_ns: int) -> str:
-    """What such a name has in place of a date."""
+    """The part of such a name that replaces the date."""
     return f'{UNSYNCED}{boot_id}_{boot_ns // SECOND:08d}'
 
 
@@ -57,7 +57,7 @@ def _free(wanted: str, is_taken: Callable[[str], bool]) -> str:
 
 
 def safe_bag(name: str) -> str:
-    """The nearest name that a bag in a store can have, of a folder that may have any."""
+    """A valid bag name for a folder with any name, changed as little as possible."""
     if is_name(name, MAX_BAG_BYTES):
         return name
     return UNSAFE.sub('_', name.replace('..', '_')).strip('_.-')[:MAX_BAG_BYTES] or 'bag'
@@ -69,21 +69,21 @@ def slice_file(bag: str, number: int) -> str:
 
 
 def slice_number(bag: str, file: str) -> int | None:
-    """Of ``<bag>_<N>.mcap``, whatever follows; None for another file."""
+    """The number N of ``<bag>_<N>.mcap``, with any suffix; None for other files."""
     head, found, _ = file.removeprefix(f'{bag}_').partition('.mcap')
     return int(head) if found and file.startswith(f'{bag}_') and head.isascii() and head.isdigit() else None
 
 
 def prefix_of(robot: str, bag: str = '') -> str:
-    """Of the keys of a robot's bags, or of one of them."""
+    """The key prefix of a robot's bags, or of one bag."""
     return f'{robot}/rosbags/{bag}/' if bag else f'{robot}/rosbags/'
 
 
 def key_of(robot: str, bag: str, file: str) -> str:
-    """In the bucket of the bags."""
+    """The key of a bag's file."""
     return f'{prefix_of(robot, bag)}{file}'
 
 
-def natural(name: str) -> list[str | int]:
+def natural_key(name: str) -> list[str | int]:
     """A sort key in which ``bag_10`` comes after ``bag_9``."""
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r'(\d+)', name, flags=re.ASCII))]

@@ -1,4 +1,4 @@
-"""The objects of a bag on their way into the spool: its slices one by one, then ``metadata.yaml`` and ``manifest.json``."""
+"""The objects of a bag for the spool: its slices one by one, then ``metadata.yaml`` and ``manifest.json``."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from shadowhound_data_logger.spool.writer import SpoolWriter
 
 SENSOR: Final = 'bag'
 ENDING_PRIORITY: Final = 1
-"""Metadata and manifest are small, and without them the bag seems to grow still."""
+"""Metadata and manifest are small, and without them the bag appears unfinished."""
 EVICTED: Final = 'the whole slice: the spool was full'
 EVENT_PRIORITY: Final = 1
-"""Of an event's slices: before whatever the sensors keep, and like the ending never evicted."""
+"""Priority of an event's slices: uploaded before sensor data, and never evicted, like metadata and manifest."""
 
 
 def ros_distro() -> str:
-    """What rosbag2 writes of the distribution; empty where ROS is not sourced."""
+    """The distribution as rosbag2 records it; empty if ROS is not sourced."""
     return os.environ.get('ROS_DISTRO', '')
 
 
 def slice_object(state: BagState, info: SliceInfo, priority: int, *, is_kept: bool = False) -> DataObject:
-    """A closed slice; its messages count in the accounts of the bags, or of the events, whose own priority goes first.
+    """The object of a closed slice. Its messages are in the accounts of bags or events; events ignore ``priority``.
 
-    ``is_kept``: it stays on the robot until somebody asks for it, unless it is an event's.
+    ``is_kept``: it stays on the robot until it is requested, unless it belongs to an event.
     """
     is_event = state.event is not None
     file, (start_ns, end_ns) = state.final(info.path.name), _times(state, info.t_start_ns, info.t_end_ns)
@@ -54,9 +54,9 @@ def slice_object(state: BagState, info: SliceInfo, priority: int, *, is_kept: bo
 
 
 def finish(state: BagState, writer: SpoolWriter, deadline_s: float) -> bool:
-    """Have the spool take what makes the bag whole, in one transaction with the end of its rows; the folder is gone then.
+    """Spool metadata and manifest, in one transaction with the removal of the bag's rows; then delete the folder.
 
-    False where the spool did not within so many seconds. Raises OSError or sqlite3.Error.
+    Returns False if the spool did not finish within ``deadline_s``. Raises OSError or sqlite3.Error.
     """
     if not writer.flush(deadline_s):
         return False
@@ -66,7 +66,7 @@ def finish(state: BagState, writer: SpoolWriter, deadline_s: float) -> bool:
         if (state.slices or (state.ended and state.missing)) and key_of(state.robot, state.bag, MANIFEST) not in states:
             _note_evicted(state, states)
             ending = ending_objects(state)
-        writer.put(*ending, rows=[state.whole()], wait=False)
+        writer.put(*ending, rows=[state.completed()], wait=False)
         state.is_ending = True
     if not writer.flush(deadline_s):
         return False
@@ -75,20 +75,22 @@ def finish(state: BagState, writer: SpoolWriter, deadline_s: float) -> bool:
 
 
 def _note_evicted(state: BagState, states: Mapping[str, State]) -> None:
-    """Slices that the full spool gave up are missing. What is given up after the manifest was made is not in it.
+    """Add slices that the full spool evicted to the losses. Evictions after the manifest was written are not in it.
 
-    ``states`` are those of all that is or was of the bag in the spool.
+    ``states`` has the state of every object of the bag that is or was in the spool.
     """
     known = _evicted(state)
-    gone = [info for file, info in state.slices.items()
-            if file not in known and states.get(key_of(state.robot, state.bag, state.final(file))) is State.EVICTED]  # fmt: skip
-    state.add_missing(*(Missing(info.path.name, EVICTED, info.messages, None, NO_ROOM) for info in gone))
+    evicted = [
+        info for file, info in state.slices.items()
+        if file not in known and states.get(key_of(state.robot, state.bag, state.final(file))) is State.EVICTED
+    ]  # fmt: skip
+    state.add_missing(*(Missing(info.path.name, EVICTED, info.messages, None, NO_ROOM) for info in evicted))
 
 
 def ending_objects(state: BagState) -> Iterator[DataObject]:
-    """What makes the bag whole; ``state`` knows all slices. The same state gives the same bytes."""
-    gone = _evicted(state)
-    found = [replace(info, path=Path(state.final(file))) for file, info in state.slices.items() if file not in gone]
+    """Metadata and manifest; ``state`` must have all slices. The same state always gives the same bytes."""
+    evicted = _evicted(state)
+    found = [replace(info, path=Path(state.final(file))) for file, info in state.slices.items() if file not in evicted]
     slices = sorted(found, key=lambda info: slice_number(state.bag, info.path.name) or 0)
     entries = tuple(SliceEntry.of(info, key_of(state.robot, state.bag, info.path.name)) for info in slices)
     how = RECOVERED if not state.ended else GAPS if state.missing else COMPLETE
@@ -98,12 +100,12 @@ def ending_objects(state: BagState) -> Iterator[DataObject]:
         topics=topics_of(slices), slices=entries, event=state.event, clock=state.clock,
     )  # fmt: skip
     span = _times(state, min((one.t_start_ns for one in slices), default=0), max((one.t_end_ns for one in slices), default=0))
-    said = metadata_yaml(slices, ros_distro=ros_distro(), custom_data=_clock_marks(state))
-    yield _small(state, METADATA, said, 'application/yaml', span)
-    yield _small(state, MANIFEST, manifest.to_json(), 'application/json', span)
+    metadata = metadata_yaml(slices, ros_distro=ros_distro(), custom_data=_clock_marks(state))
+    yield _document(state, METADATA, metadata, 'application/yaml', span)
+    yield _document(state, MANIFEST, manifest.to_json(), 'application/json', span)
 
 
-def _small(state: BagState, file: str, body: bytes, content_type: str, span: tuple[int, int]) -> DataObject:
+def _document(state: BagState, file: str, body: bytes, content_type: str, span: tuple[int, int]) -> DataObject:
     return DataObject(
         bucket=BUCKET, key=key_of(state.robot, state.bag, file), body=body, content_type=content_type, sensor=SENSOR, topic=None,
         type='', samples=0, t_start_ns=span[0], t_end_ns=span[1], priority=ENDING_PRIORITY, protected=True,
@@ -131,7 +133,7 @@ def _is_dated(state: BagState) -> bool:
 
 
 def _times(state: BagState, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Log times as UTC; where nobody knows that, by the boot clock, as those of objects are (``stamps.StampRule``)."""
+    """Log times in UTC or, if that is unknown, by the boot clock, like those of other objects (``stamps.StampRule``)."""
     clock = state.clock
     if clock is None:
         return start_ns, end_ns
@@ -140,7 +142,7 @@ def _times(state: BagState, start_ns: int, end_ns: int) -> tuple[int, int]:
 
 
 def _clock_marks(state: BagState, *times_ns: int) -> dict[str, str]:
-    """How the date of a bag is known whose clock was not set, as spool/redating.py tells it of objects; log times since boot."""
+    """For a bag whose clock was not set: how its date is known, as in spool/redating.py, and log times since boot."""
     clock = state.clock
     if clock is None:
         return {}

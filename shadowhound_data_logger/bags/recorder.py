@@ -1,7 +1,7 @@
-"""Decides which bag is recorded, and owns its writing thread: started and stopped by service, by missions, or with the node.
+"""Starts and stops recordings (by service, by missions, or with the node), and owns the thread that writes them.
 
-What the intake hands over lies in a bounded queue; starts, splits and stops lie in it as well, so that each comes between the
-very messages where it was asked for. Nothing runs before the first recording.
+Messages from the intake wait in a bounded queue. Starts, splits and stops are put into the same queue, so that each takes effect
+between the messages where it was requested. The thread starts with the first recording.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.queue import BagQueue, MessageBatch
 from shadowhound_data_logger.bags.recording import Recording
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.state import BagState
@@ -27,41 +27,41 @@ from shadowhound_data_logger.spool.accounts import BAG
 log = logging.getLogger(__name__)
 
 SYNC_S: Final = 0.5
-"""Between two syncs: with a poll of the intake before it a message is less than a second from the disk."""
+"""Time between syncs: with the poll interval of the intake, a message is on the disk in less than a second."""
 IDLE_S: Final = 10.0
-"""Between two looks of a thread that has nothing to do; well below its patience."""
+"""Maximum wait of an idle thread; well below ``PATIENCE_S``."""
 PATIENCE_S: Final = 30.0
-"""A round that lasts longer hangs in the disk."""
+"""A round that takes longer is blocked by the disk."""
 STOP_S: Final = 5.0
 SERVICE, MISSION, ALWAYS = 'service', 'mission', 'always'
-"""Who began a recording; also the settings' words for when one begins."""
+"""What started a recording; also values of the setting ``bag.record``."""
 Answer = tuple[bool, str]
-"""Whether it was done, and what, in words."""
+"""Whether a request was carried out, and a sentence about the result."""
 
 
 @dataclass(slots=True)
 class _Current:
-    """A recording with who began it and when."""
+    """The active recording, with what started it and when."""
 
     recording: Recording
     by: str
-    began_s: float
-    dropped_before: int
+    started_s: float
+    dropped_at_start: int
 
 
 class Recorder:
     """Starts, splits and stops recordings, and writes their messages.
 
-    Life: New; open once; start, stop, ... from any thread; ``close`` before the intake is closed.
+    Lifecycle: new; ``open`` once; ``start``, ``stop``, ... from any thread; ``close`` before the intake is closed.
 
-    ``_control`` makes each of these one step; the recording itself belongs to the thread ``bag-writer``.
+    ``_control`` serializes these calls; the recording itself belongs to the thread ``bag-writer``.
     """
 
-    def __init__(self, settings: BagSettings, place: BagPlace, queue: BagQueue, recovery: BagRecovery,
+    def __init__(self, settings: BagSettings, context: BagContext, queue: BagQueue, recovery: BagRecovery,
                  listen: Callable[[bool, float], bool]) -> None:  # fmt: skip
-        """``listen`` has the intake begin (True) or end, and says whether that was done within so many seconds."""
+        """``listen(on, timeout_s)`` starts or stops the recording in the intake; False if that timed out."""
         self._settings = settings
-        self._place = place
+        self._context = context
         self._queue = queue
         self._recovery = recovery
         self._listen = listen
@@ -75,17 +75,17 @@ class Recorder:
 
     @property
     def workers(self) -> Sequence[Worker]:
-        """Those that have something to do."""
+        """The workers that are running."""
         return *([self._worker] if self._started else []), *([self._recovery.worker] if self._recovery.is_busy else [])
 
     def open(self) -> None:
-        """After the intake: make whole what was cut off, and begin if that is wanted."""
+        """Complete interrupted bags, and start recording if the settings say so. Call it after the intake is open."""
         self._recovery.open()
         if self._settings.record == ALWAYS:
-            self._begin_by(ALWAYS)
+            self._start_by(ALWAYS)
 
     def close(self, deadline_s: float) -> bool:
-        """End the bag and the threads; False when that took too long, and the next start goes on with it."""
+        """End the bag and the threads; False if that timed out: then the next start completes the bag."""
         end_s = time.monotonic() + deadline_s
         with self._control:
             ended = self._current is None or self._stop(deadline_s)[0]
@@ -95,7 +95,7 @@ class Recorder:
             return self._worker.join(max(0.1, end_s - time.monotonic())) and ended
 
     def status(self) -> BagStatus:
-        """From any thread."""
+        """The status, from any thread."""
         current = self._current
         if current is None:
             return BagStatus()
@@ -103,28 +103,28 @@ class Recorder:
         return BagStatus(
             recording=True, paused=self._queue.paused, bag=recording.state.bag, slice=max(0, recording.number),
             messages=recording.messages, bytes=recording.bytes,
-            dropped=recording.dropped + self._queue.dropped - current.dropped_before,
-            duration_s=round(time.monotonic() - current.began_s, 1), queue_bytes=self._queue.bytes, refused=recording.refused,
+            dropped=recording.dropped + self._queue.dropped - current.dropped_at_start,
+            duration_s=round(time.monotonic() - current.started_s, 1), queue_bytes=self._queue.bytes, refused=recording.refused,
         )  # fmt: skip
 
-    # -- what can be asked -----------------------------------------------------------------------------------------
+    # -- requests --------------------------------------------------------------------------------------------------
 
     def start(self) -> Answer:
-        """Begin a bag, of the mission where one is active."""
+        """Start a bag, of the active mission if there is one."""
         with self._control:
             if self._current is not None:
-                return False, f'{self._current.recording.state.bag} is recorded already'
+                return False, f'{self._current.recording.state.bag} is being recorded already'
             return self._start(SERVICE, self._mission)
 
     def stop(self, deadline_s: float = STOP_S) -> Answer:
-        """End the bag; it is whole in the spool then."""
+        """End the bag, and wait until it is complete in the spool."""
         with self._control:
             if self._current is None:
                 return False, 'nothing is recorded'
             return self._stop(deadline_s)
 
     def split(self, deadline_s: float = STOP_S) -> Answer:
-        """End the slice; the next message begins another."""
+        """End the slice and start another one."""
         with self._control:
             if self._current is None:
                 return False, 'nothing is recorded'
@@ -136,19 +136,19 @@ class Recorder:
 
             self._queue.mark(split)
             if not done.wait(deadline_s):
-                return False, f'the slice was not closed within {deadline_s:g} s; it is as soon as that is possible'
-            return True, f'{recording.state.bag} has {len(recording.state.slices)} slices that are closed'
+                return False, f'the slice was not closed within {deadline_s:g} s; it will be closed as soon as possible'
+            return True, f'{recording.state.bag} has {len(recording.state.slices)} closed slices'
 
     def pause(self, *, paused: bool) -> Answer:
-        """Begin or end a pause: what comes meanwhile is counted, and dropped."""
+        """Pause or resume: messages during a pause are counted and dropped."""
         with self._control:
             if self._current is None:
                 return False, 'nothing is recorded'
             self._queue.paused = paused
-            return True, f'{self._current.recording.state.bag} is {"paused" if paused else "recorded"}'
+            return True, f'{self._current.recording.state.bag} is {"paused" if paused else "being recorded"}'
 
     def on_mission(self, mission: MissionOf | None) -> None:
-        """The mission that is active now."""
+        """Set the active mission, and start or end the bag that follows it."""
         with self._control:
             before, self._mission = self._mission, mission
             current = self._current
@@ -159,65 +159,65 @@ class Recorder:
                     recording = current.recording
                     self._queue.mark(lambda: recording.set_mission(mission))
             elif self._settings.record != SERVICE and (current is None or current.by != SERVICE):
-                self._turn(mission)
+                self._follow_mission(mission)
 
-    def look(self) -> None:
-        """Every second or so: what began before the clock was set ends when it is, and another bag follows without a pause."""
+    def check_clock(self) -> None:
+        """Call about once per second: after the clock was set, end a bag that started before, and start another one at once."""
         if not self._control.acquire(blocking=False):
-            return  # somebody begins or ends one now
+            return  # another thread is starting or stopping a recording
         try:
             current = self._current
-            if current is not None and self._place.is_due(current.recording.state):
+            if current is not None and self._context.can_be_dated(current.recording.state):
                 self._start(current.by, current.recording.state.mission, after=current)
         finally:
             self._control.release()
 
     # -- starts and stops, under the lock --------------------------------------------------------------------------
 
-    def _turn(self, mission: MissionOf | None) -> None:
-        """A mission began or ended, and bags follow missions. One bag follows the other without a message between them."""
+    def _follow_mission(self, mission: MissionOf | None) -> None:
+        """A mission started or ended: end its bag, and start the next one without losing a message between them."""
         current = self._current
         if mission is None and self._settings.record == MISSION:
             if current is not None:
                 self._stop(STOP_S)
             return
         if current is None and self._settings.record == ALWAYS:
-            return  # somebody stopped it
+            return  # the operator stopped it
         self._start(ALWAYS if mission is None else MISSION, mission, after=current)
 
-    def _begin_by(self, by: str) -> None:
+    def _start_by(self, by: str) -> None:
         with self._control:
             self._start(by, self._mission)
 
     def _start(self, by: str, mission: MissionOf | None, *, after: _Current | None = None) -> Answer:
         """``after``: the recording that this one follows."""
-        place = self._place
-        unset = place.unset()
-        name = place.name(mission.type if mission is not None else '', unset)
+        context = self._context
+        unset_clock = context.unset_clock()
+        name = context.name(mission.type if mission is not None else '', unset_clock)
         try:
-            state = BagState.begin(place.root / name, place.robot, mission, clock=unset)
+            state = BagState.begin(context.root / name, context.robot, mission, clock=unset_clock)
         except OSError as error:
-            log.error('no bag is recorded: %s', error)  # noqa: TRY400 - an operator's matter
+            log.error('no bag is recorded: %s', error)  # noqa: TRY400 - for the operator, without a traceback
             if after is not None:
                 self._stop(STOP_S)
-            return False, f'no bag can be made in {place.root}: {error.strerror}'
-        goes_on = by == ALWAYS or after is not None or (mission is not None and mission.mission_id in self._recovery.missions)
-        if not goes_on:
-            self._place.spool.accounts.rebase_all(BAG)
-        recording = Recording(state, self._settings, place, self._recovery)
+            return False, f'no bag can be created in {context.root}: {error.strerror}'
+        continues = by == ALWAYS or after is not None or (mission is not None and mission.mission_id in self._recovery.missions)
+        if not continues:
+            self._context.spool.accounts.rebase_all(BAG)
+        recording = Recording(state, self._settings, context, self._recovery)
         self._current = _Current(recording, by, time.monotonic(), self._queue.dropped)
         self._queue.paused = self._queue.paused and after is not None
         if after is None:
-            self._queue.take_lost()
+            self._queue.take_dropped()
         if not self._started:
             self._started = True
             self._worker.start()
         if after is None:
             self._queue.mark(lambda: self._write_to(recording))
         else:
-            self._end_after(after.recording, STOP_S, then=recording)
+            self._stop_after(after.recording, STOP_S, then=recording)
         if not self._listen(True, STOP_S):
-            log.warning('the intake did not begin to record within %.0f s; it will as soon as it can', STOP_S)
+            log.warning('the intake did not start recording within %.0f s; it will start as soon as possible', STOP_S)
         log.info('recording bag %s', name)
         return True, name
 
@@ -225,25 +225,25 @@ class Recorder:
         current, end_s = self._current, time.monotonic() + deadline_s
         assert current is not None
         if not self._listen(False, deadline_s):
-            log.warning('the intake did not end the recording within %.1f s', deadline_s)
-        done = self._end_after(current.recording, max(0.5, end_s - time.monotonic()))
+            log.warning('the intake did not stop recording within %.1f s', deadline_s)
+        done = self._stop_after(current.recording, max(0.5, end_s - time.monotonic()))
         self._current = None
         recording = current.recording
         if not done.wait(max(0.0, end_s - time.monotonic())):
-            return False, f'{recording.state.bag} is not whole within {deadline_s:g} s; it is as soon as that is possible'
+            return False, f'{recording.state.bag} was not completed within {deadline_s:g} s; it will be as soon as possible'
         text = f'{recording.state.bag}: {recording.messages:,} messages in {len(recording.state.slices)} slices'
         if not recording.state.is_named:
-            text += '; it waits for the clock of this machine to be set'
+            text += '; it waits until the clock of this machine is set'
         log.info('%s', text)
         return True, text
 
-    def _end_after(self, recording: Recording, deadline_s: float, then: Recording | None = None) -> threading.Event:
-        """Have the thread end a bag after all that waits for it, and write to the next one without a message between them."""
+    def _stop_after(self, recording: Recording, deadline_s: float, then: Recording | None = None) -> threading.Event:
+        """Have the thread end a bag after the queued messages, and write the following ones to the next bag."""
         done = threading.Event()
 
         def end() -> None:
             self._writing = None
-            recording.leave_out(self._queue.take_lost())
+            recording.count_dropped(self._queue.take_dropped())
             try:
                 if recording.close(deadline_s):
                     done.set()
@@ -261,22 +261,22 @@ class Recorder:
         self._due_s = time.monotonic() + SYNC_S
 
     def _step(self) -> None:
-        """Wait until there is something to write, and write it; sync when it is time."""
+        """Wait for messages and write them; sync when it is due."""
         self._queue.wait(self._due_s - time.monotonic() if self._writing is not None else IDLE_S)
         while (item := self._queue.next()) is not None:
-            if not isinstance(item, Lot):
+            if not isinstance(item, MessageBatch):
                 item()
             elif self._writing is not None:
                 self._writing.write(item)
             elif not item.paused:
                 messages = item.messages
-                self._place.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].times,
+                self._context.spool.accounts.drop(f'{BAG}{item.topic}', 'stopped', len(messages), messages[0].times,
                                                 messages[-1].times)  # fmt: skip
             self._sync()
         self._sync()
 
     def _sync(self) -> None:
         if self._writing is not None and time.monotonic() >= self._due_s:
-            self._writing.leave_out(self._queue.take_lost())
+            self._writing.count_dropped(self._queue.take_dropped())
             self._writing.tick()
             self._due_s = time.monotonic() + SYNC_S

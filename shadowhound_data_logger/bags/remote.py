@@ -13,7 +13,7 @@ from typing import Final
 
 from shadowhound_data_logger.bags.description import clock_state
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural, prefix_of
+from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural_key, prefix_of
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.errors import UnknownBag
 from shadowhound_data_logger.formats.mcap.ranges import StoredFile, read_whole
@@ -123,4 +123,4 @@ def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[
 
 
 def _ordered(files: Iterable[RemoteFile]) -> tuple[RemoteFile, ...]:
-    return tuple(sorted(files, key=lambda file: natural(file.name)))
+    return tuple(sorted(files, key=lambda file: natural_key(file.name)))

@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.contents import SqliteFile, files_of, no_bag, 
 from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
 from shadowhound_data_logger.bags.fetch import on_disk
 from shadowhound_data_logger.bags.manifest import RECOVERED, Manifest, Missing, SliceEntry, topics_of
-from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural
+from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural_key
 from shadowhound_data_logger.bags.sqlite_repair import LEFT, salvage_tables
 from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
@@ -115,7 +115,7 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
     files = {name: each for name, each in files_of(path).items() if not name.endswith(UNFINISHED)}
     claimed, raw, remarks = _metadata(files)
     open_slices = [name for name in files if name.endswith(MCAP + OPEN_SUFFIX) and name.removesuffix(OPEN_SUFFIX) not in files]
-    names = sorted({*slices_of(list(files), claimed), *open_slices}, key=natural)
+    names = sorted({*slices_of(list(files), claimed), *open_slices}, key=natural_key)
     if not names:
         raise no_bag(path)
     progress.begin(sum(files[name].stat().st_size for name in names))
@@ -324,7 +324,7 @@ def _describe(folder: Path, raw: Mapping[str, Any], files: Mapping[str, Path], f
             if each.name != each.out_name:
                 each.path.unlink()
     sync(folder)
-    slices = [replace(info, path=Path(name)) for name, info in sorted(infos.items(), key=lambda each: natural(each[0]))]
+    slices = [replace(info, path=Path(name)) for name, info in sorted(infos.items(), key=lambda each: natural_key(each[0]))]
     custom = raw.get('custom_data')
     said = bagfile_information(
         slices, ros_distro=str(raw.get('ros_distro') or ''),

@@ -1,8 +1,8 @@
-"""The last seconds of some topics, serialized as they came: bounded in bytes, filled by the intake, which never waits for it.
+"""The last seconds of some topics, serialized, in memory: bounded in bytes, filled by the intake, which never waits for it.
 
-It holds references to what was taken, never a copy. An event claims what is in it and what comes, and takes it out piece by
-piece: what an event has taken is no longer in the ring, so that no message is in two events' bags. Latched messages are the
-exception: the last one of each publisher stays, however old it is, and each event begins with them.
+The ring holds references to the received messages, not copies. An event claims the messages in the ring and those that follow,
+and removes them piece by piece, so that no message is in the bags of two events. Latched messages are the exception: the last
+one of each publisher is kept regardless of its age, and each event starts with them.
 """
 
 from __future__ import annotations
@@ -13,48 +13,48 @@ from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from shadowhound_data_logger.bags.latched import MESSAGE_BYTES, Latched
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.spool.accounts import EVENT, Accounts, Losses
 
 PIECE_BYTES: Final = 1 << 20
-"""A lot that is larger is kept in pieces: what goes, goes by pieces, and what is written as well."""
+"""Larger batches are split into pieces of this size, which are evicted and written separately."""
 RING_FULL: Final = 'ring_full'
-"""Why messages are dropped that had to go from the ring before an event that asked for them could write them."""
+"""Reason for dropping messages that were evicted before the event that claimed them could write them."""
 
 
-class Held(NamedTuple):
-    """A piece of what one drain took of a topic."""
+class RingItem(NamedTuple):
+    """A piece of the messages that one drain took from a topic."""
 
-    lot: Lot
+    batch: MessageBatch
     lost: Losses
-    """What is estimated to have been lost before the last of it; None where it is not known."""
+    """Estimated losses before the last message; None if unknown."""
     at_s: float
-    """When it was drained, by the monotonic clock."""
+    """Time of the drain, monotonic clock."""
     size: int
-    again: bool = False
-    """Whether it is latched and came before all that is in the ring; it may have been in an event already."""
+    repeated: bool = False
+    """Whether it is a latched message from before everything in the ring; an earlier event may have it already."""
 
 
 class Ring:
-    """The latest messages of some topics, in memory, bounded in seconds and bytes.
+    """The latest messages of some topics, bounded in seconds and bytes.
 
-    Thread-safe. ``put`` by the intake; ``claim``, ``next`` and ``release`` by whoever writes events.
+    Thread-safe. ``put`` by the intake; ``claim``, ``next`` and ``release`` by the thread that writes events.
     """
 
     def __init__(self, max_bytes: int, keep_s: float) -> None:
         self._max_bytes = max_bytes
         self.keep_s = keep_s
-        """For how long what nobody claimed stays, as far as its bytes have room."""
+        """How long unclaimed messages are kept, if there is room."""
         self._lock = threading.Lock()
-        self._items: deque[Held] = deque()
+        self._items: deque[RingItem] = deque()
         self._latched = Latched(max_bytes // 2)
-        """Of what left the ring."""
-        self._first: deque[Held] = deque()
-        """What is latched, for the event that goes on."""
+        """The latched messages among those that were removed from the ring."""
+        self._first: deque[RingItem] = deque()
+        """The latched messages with which the active event starts."""
         self._claimed = False
         self._bytes = 0
-        """Of ``_items``."""
+        """Size of ``_items``."""
 
     @property
     def max_bytes(self) -> int:
@@ -66,24 +66,24 @@ class Ring:
 
     @property
     def bytes(self) -> int:
-        """Of the messages in it, with what Python needs for them."""
+        """Size of the messages, including Python's overhead."""
         return self._bytes + self._latched.bytes
 
     @property
     def claimed(self) -> bool:
-        """Whether an event asks for all that is in it."""
+        """Whether an event has claimed the messages."""
         return self._claimed
 
     @property
     def seconds(self) -> float:
-        """From the oldest to the newest."""
+        """Time from the oldest message to the newest one."""
         with self._lock:
             return self._items[-1].at_s - self._items[0].at_s if self._items else 0.0
 
-    def put(self, lot: Lot, lost: Losses, now_s: float) -> list[Held]:
-        """Take in messages; whatever is too old or too much goes, the oldest first. What an event asked for of that."""
+    def put(self, batch: MessageBatch, lost: Losses, now_s: float) -> list[RingItem]:
+        """Add messages and evict the oldest ones beyond the limits; returns evicted messages that an event had claimed."""
         with self._lock:
-            for piece in _pieces(lot, lost, now_s):
+            for piece in _pieces(batch, lost, now_s):
                 self._items.append(piece)
                 self._bytes += piece.size
             gone = []
@@ -95,30 +95,32 @@ class Ring:
             return []
 
     def claim(self, since_s: float, now_ns: int = 0) -> float | None:
-        """All of ``since_s`` and after is asked for now; returns the time of the oldest, None for an empty ring.
+        """Claim all messages since ``since_s``; returns the time of the oldest one, None if the ring is empty.
 
-        What is latched comes first, as if it had been received with the oldest, or now (``now_ns``).
+        Latched messages come first, with the arrival time of the oldest message, or ``now_ns`` if there is none.
         """
         with self._lock:
             self._age(since_s)
             self._claimed = True
             oldest = self._items[0] if self._items else None
-            start_ns, at_s = (oldest.lot.messages[0].received_ns, oldest.at_s) if oldest else (now_ns, since_s)
+            start_ns, at_s = (oldest.batch.messages[0].received_ns, oldest.at_s) if oldest else (now_ns, since_s)
             self._first = deque(
-                Held(single._replace(messages=[single.messages[0]._replace(received_ns=start_ns)]), {}, at_s, 0, again=True)
+                RingItem(
+                    single._replace(messages=[single.messages[0]._replace(received_ns=start_ns)]), {}, at_s, 0, repeated=True
+                )
                 for single in self._latched
             )
             return oldest.at_s if oldest else None
 
-    def next(self, until_s: float) -> Held | None:
-        """Take out the oldest piece; None when there is none that was drained until then."""
+    def next(self, until_s: float) -> RingItem | None:
+        """Remove the oldest piece; None if none was drained until then."""
         with self._lock:
             if self._first:
                 return self._first.popleft()
             return self._pop() if self._items and self._items[0].at_s <= until_s else None
 
     def release(self) -> None:
-        """Nobody asks for what is left in it."""
+        """End the claim on the remaining messages."""
         with self._lock:
             self._claimed = False
             self._first.clear()
@@ -127,68 +129,65 @@ class Ring:
         while self._items and self._items[0].at_s < since_s:
             self._pop()
 
-    def _pop(self) -> Held:
+    def _pop(self) -> RingItem:
         held = self._items.popleft()
         self._bytes -= held.size
-        if held.lot.latched:
-            self._latched.keep(held.lot)
+        if held.batch.latched:
+            self._latched.keep(held.batch)
         return held
 
 
-def _pieces(lot: Lot, lost: Losses, now_s: float) -> Iterator[Held]:
-    """A lot in parts of about ``PIECE_BYTES``; what was lost belongs to the last of them."""
+def _pieces(batch: MessageBatch, lost: Losses, now_s: float) -> Iterator[RingItem]:
+    """A batch in pieces of about ``PIECE_BYTES``; the losses are attributed to the last piece."""
     part: list[Taken] = []
     size = 0
-    for message in lot.messages:
+    for message in batch.messages:
         cost = len(message.cdr) + MESSAGE_BYTES
         if part and size + cost > PIECE_BYTES:
-            yield Held(lot._replace(messages=part), None if lost is None else {}, now_s, size)
+            yield RingItem(batch._replace(messages=part), None if lost is None else {}, now_s, size)
             part, size = [], 0
         part.append(message)
         size += cost
     if part:
-        yield Held(lot._replace(messages=part), lost, now_s, size)
+        yield RingItem(batch._replace(messages=part), lost, now_s, size)
 
 
-class Claims:
-    """Accounts for the messages that events claim of the ring.
-
-    New; from any thread.
-    """
+class EventAccounts:
+    """Accounts for the messages that events claim from the ring. Thread-safe."""
 
     def __init__(self, accounts: Accounts) -> None:
         self._accounts = accounts
         self._lost: deque[tuple[tuple[str, str], int]] = deque()
 
     def begin(self) -> None:
-        """What was published since the last event was not asked for, and is not missed."""
+        """Start an event: messages published since the last event were not claimed, so they do not count as missed."""
         self._accounts.rebase_all(EVENT)
 
-    def receive(self, held: Held) -> list[Taken]:
-        """An event has it now; what is not a repeat of it."""
-        with self._accounts.entry(f'{EVENT}{held.lot.topic}') as account:
-            account.type = held.lot.type
-            if held.again:
-                for each in held.lot.messages:
+    def receive(self, held: RingItem) -> list[Taken]:
+        """Account for messages that an event received; returns those that are not duplicates."""
+        with self._accounts.entry(f'{EVENT}{held.batch.topic}') as account:
+            account.type = held.batch.type
+            if held.repeated:
+                for each in held.batch.messages:
                     account.receive_again(each.publisher, each.number)
-                return list(held.lot.messages)
+                return list(held.batch.messages)
             unknown = account.unknown
-            fresh = [each for each in held.lot.messages if account.receive(each.publisher, each.number, each.times)]
-            newest = held.lot.messages[-1].times
+            fresh = [each for each in held.batch.messages if account.receive(each.publisher, each.number, each.times)]
+            newest = held.batch.messages[-1].times
             account.appraise(account.unknown - unknown, held.lost, newest)
             account.gaps.heard = newest
         return fresh
 
-    def lose(self, held: Iterable[Held], reason: str = RING_FULL) -> None:
-        """An event asked for it and cannot have it."""
+    def lose(self, held: Iterable[RingItem], reason: str = RING_FULL) -> None:
+        """Account for claimed messages that the event cannot write."""
         for each in held:
             fresh = self.receive(each)
             if fresh:
-                self._accounts.drop(f'{EVENT}{each.lot.topic}', reason, len(fresh), fresh[0].times, fresh[-1].times)
-                self._lost.append(((each.lot.topic, reason), len(fresh)))
+                self._accounts.drop(f'{EVENT}{each.batch.topic}', reason, len(fresh), fresh[0].times, fresh[-1].times)
+                self._lost.append(((each.batch.topic, reason), len(fresh)))
 
-    def take_lost(self) -> Counter[tuple[str, str]]:
-        """What was lost since the last call, by topic and reason."""
+    def take_dropped(self) -> Counter[tuple[str, str]]:
+        """The messages lost since the last call, by topic and reason."""
         found = Counter[tuple[str, str]]()
         while self._lost:
             what, count = self._lost.popleft()

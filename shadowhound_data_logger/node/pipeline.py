@@ -12,10 +12,10 @@ from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.kept import KeptCut, sweep
 from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.naming import BAGS
-from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
@@ -127,7 +127,7 @@ class Pipeline:
         self.writer = SpoolWriter(self.spool, expects=queue.is_busy)
         self.uploader = Uploader(self.spool, self._store, settings.upload, self.writer.settle)
         accounts, node, types = self.spool.accounts, self._node, MessageTypes(os.environ.get('AMENT_PREFIX_PATH', '').split(':'))
-        place = BagPlace(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
+        place = BagContext(settings.home / BAGS / settings.robot, settings.robot, self._clock, self.writer, settings.clock.hold_s,
                          self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
         recovery = BagRecovery(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, recovery, types)
@@ -257,7 +257,7 @@ class Pipeline:
         self._due_s = now_s + PERIOD_S
         self._name_held()
         self.uploader.wait_for(self._rules.look())
-        self.recorder.look()
+        self.recorder.check_clock()
         self._spool_parts(self._catalog.due)
         self._look_at_link()
         self._tell()

@@ -12,9 +12,9 @@ from typing import Any
 from bags.recording import ROBOT, STRING, WAIT_S, BoundedSpool, manifest, messages, numbers
 from clocks import Clocks
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
-from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.core.config import SpoolSettings
@@ -53,7 +53,7 @@ class Buffer:
         return self.home / 'bags' / ROBOT
 
     def hear(self, numbers: range, topic: str = '/talk', size: int = 0, lost: Losses = None) -> None:
-        gone = self.ring.put(Lot(topic, STRING, '', messages(numbers, size)), lost, self.now_s[0])
+        gone = self.ring.put(MessageBatch(topic, STRING, '', messages(numbers, size)), lost, self.now_s[0])
         self.events.claims.lose(gone)
 
     def pass_s(self, seconds: float) -> None:
@@ -99,7 +99,7 @@ def buffer(home: Path, clock: Clocks | None = None, **settings: Any) -> Iterator
     writer = SpoolWriter(spool, 0.01)
     writer.open()
     now_s, made = [1000.0], list[Buffer]()
-    place = BagPlace(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
+    place = BagContext(home / 'bags' / ROBOT, ROBOT, clocks, writer, 600.0)
     ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
     recovery = BagRecovery(place, 8)
     events = Events(options, bag, place, ring, recovery, POLL_S, lambda: now_s[0])

@@ -14,9 +14,9 @@ from typing import Any
 from clocks import Clocks
 from mcap.reader import make_reader
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, Lot
+from shadowhound_data_logger.bags.queue import MAX_BYTES, BagQueue, MessageBatch
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.core.config import SpoolSettings
@@ -49,8 +49,8 @@ def messages(numbers: range, size: int = 0) -> list[Taken]:
     ]
 
 
-def lot(numbers: range, topic: str = '/talk', size: int = 0, type_name: str = STRING) -> Lot:
-    return Lot(topic, type_name, '', messages(numbers, size))
+def batch(numbers: range, topic: str = '/talk', size: int = 0, type_name: str = STRING) -> MessageBatch:
+    return MessageBatch(topic, type_name, '', messages(numbers, size))
 
 
 class BoundedSpool(Spool):
@@ -85,7 +85,7 @@ class Desk:
 
     def hear(self, numbers: range, topic: str = '/talk', size: int = 0, *, numbered: bool = True, latched: int = 0,
              publisher: str = 'p') -> None:  # fmt: skip
-        heard = lot(numbers, topic, size)._replace(latched=latched)
+        heard = batch(numbers, topic, size)._replace(latched=latched)
         heard = heard._replace(messages=[message._replace(publisher=publisher) for message in heard.messages])
         if not numbered:
             heard = heard._replace(messages=[message._replace(publisher=None, number=None) for message in heard.messages])
@@ -133,7 +133,7 @@ def desk(home: Path, clock: Clocks | None = None, *, offsets: Mapping[str, int] 
         made[0].listening.append(on)
         return True
 
-    place = BagPlace(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
+    place = BagContext(root, ROBOT, time, writer, HOLD_S, lambda: offsets or {})
     recorder = Recorder(bag, place, queue, BagRecovery(place, bag.priority), listen)
     made.append(Desk(spool, writer, queue, recorder, home))
     try:
@@ -195,7 +195,7 @@ def write_out(it: Desk) -> None:
 
     def sync() -> None:
         assert it.recorder._writing is not None
-        it.recorder._writing.leave_out(it.queue.take_lost())
+        it.recorder._writing.count_dropped(it.queue.take_dropped())
         it.recorder._writing.tick()
         done.set()
 

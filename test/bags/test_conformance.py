@@ -14,7 +14,7 @@ from mcap.reader import NonSeekingReader
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import info_folder, info_of
-from shadowhound_data_logger.bags.naming import natural
+from shadowhound_data_logger.bags.naming import natural_key
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
 from shadowhound_data_logger.bags.upload import planned, upload_now
@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
-FOUND = tuple(sorted(variants(), key=lambda each: natural(f'{each[0]}.mcap')))
+FOUND = tuple(sorted(variants(), key=lambda each: natural_key(f'{each[0]}.mcap')))
 FILLED = [each for each in FOUND if each[1].messages]
 BAG = 'conformance'
 

@@ -10,7 +10,7 @@ from bags.eventing import buffer, hear_each_second, in_bag, only_bag
 from bags.recording import ROBOT, STRING, WAIT_S, manifest, messages, mission
 from spool.making import NOON_NS
 
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.core.model import DataObject, RecordingRows
 from shadowhound_data_logger.core.options import EventSettings
 from shadowhound_data_logger.core.status import EventStatus
@@ -24,7 +24,7 @@ def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
         hear_each_second(it, range(20, 25))
         it.written()
         bag = only_bag(it)
-        assert (done, text) == (True, f'{bag} begins')
+        assert (done, text) == (True, f'{bag} starts')
         assert bag.startswith('event_fall_2025')
         assert in_bag(it, bag) == list(range(15, 23))
         said = manifest(it.objects(), bag)
@@ -72,7 +72,7 @@ def test_triggers_that_overlap_are_one_event(tmp_path: Path) -> None:
         hear_each_second(it, range(11, 15))
         it.written()
         bag = only_bag(it)
-        assert (done, text) == (True, f'{bag} lasts longer')
+        assert (done, text) == (True, f'{bag} is extended')
         assert in_bag(it, bag) == list(range(5, 14))
         event = manifest(it.objects(), bag)['event']
         assert event['name'] == 'fall'
@@ -88,7 +88,7 @@ def test_an_event_is_no_longer_than_it_may_be(tmp_path: Path) -> None:
         hear_each_second(it, range(10, 12))
         done, text = it.events.trigger('again', 'service')
         first = it.events.status().bag
-        assert (done, text) == (True, f'another event follows {first}, which is as long as it may be')
+        assert (done, text) == (True, f'another event follows {first}, which has reached its maximum length')
         for second in range(12, 20):
             hear_each_second(it, range(second, second + 1))
             it.written(1)
@@ -151,7 +151,7 @@ def test_repeats_are_in_it_once(tmp_path: Path) -> None:
 def test_what_is_latched_is_in_each_event(tmp_path: Path) -> None:
     """Though it came long before; each time it counts as received, and nothing of it is missed."""
     with buffer(tmp_path) as it:
-        it.ring.put(Lot('/tf_static', STRING, '', messages(range(40, 42)), 1), None, it.now_s[0])
+        it.ring.put(MessageBatch('/tf_static', STRING, '', messages(range(40, 42)), 1), None, it.now_s[0])
         it.pass_s(60.0)
         for number, name in enumerate(('one', 'two'), 1):
             it.hear(range(number, number + 1))
@@ -227,7 +227,7 @@ def test_a_close_ends_the_event(tmp_path: Path) -> None:
         it.hear(range(5, 8))
         assert it.events.close(WAIT_S)
         assert in_bag(it, only_bag(it)) == list(range(8))
-        assert it.events.trigger('late', 'service') == (False, 'no more events: the node is closing')
+        assert it.events.trigger('late', 'service') == (False, 'no event can start: the node is shutting down')
 
 
 def test_without_topics_there_is_nothing(tmp_path: Path) -> None:

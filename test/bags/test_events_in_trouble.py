@@ -11,7 +11,7 @@ from bags.recording import WAIT_S, journaled, manifest, missing
 from bags.test_recorder import kill
 from clocks import Clocks
 
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.recording import Recording
 
 
@@ -23,9 +23,9 @@ class Disk:
         self.works.set()
         write = Recording.write
 
-        def waiting(recording: Recording, lot: Lot) -> None:
+        def waiting(recording: Recording, batch: MessageBatch) -> None:
             assert self.works.wait(WAIT_S)
-            write(recording, lot)
+            write(recording, batch)
 
         monkeypatch.setattr(Recording, 'write', waiting)
 
@@ -132,7 +132,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(tmp_path: Path, monk
         assert in_bag(it, bag) == list(range(10))
         said = manifest(it.objects(), bag)
         assert said['state'] == 'recovered'
-        assert said['missing'][-1]['what'].startswith('what was in memory')
+        assert said['missing'][-1]['what'].startswith('messages in memory')
         assert [one['name'] for one in said['event']['triggers']] == ['fall', 'low_battery']
         row = it.rows()['/talk']
         assert (row['received'], row['stored'], row['open'], row['dropped']) == (15, 10, 0, {'restart': 5})

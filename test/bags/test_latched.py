@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from bags.recording import STRING, Desk, desk, journaled, lot, manifest, messages, mission, start, write_out
+from bags.recording import STRING, Desk, batch, desk, journaled, manifest, messages, mission, start, write_out
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from shadowhound_data_logger.bags.latched import MAX_PER_TOPIC, MESSAGE_BYTES, Latched
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.recording import REPEAT_LEAD_NS
 from shadowhound_data_logger.bags.verify import verify_folder
 
@@ -170,7 +170,7 @@ def test_what_is_latched_in_a_pause_is_in_the_slices_after_it(tmp_path: Path) ->
     with desk(tmp_path) as it:
         bag = start(it.recorder)
         it.hear(range(1, 2), STATIC, latched=1)
-        it.queue.put(lot(range(2, 3), STATIC)._replace(latched=1, paused=True))
+        it.queue.put(batch(range(2, 3), STATIC)._replace(latched=1, paused=True))
         assert it.recorder.split()[0]
         it.hear(range(10, 20))
         it.recorder.stop()
@@ -191,7 +191,7 @@ def test_what_is_latched_while_the_disk_is_full_is_in_the_slices_after_it(tmp_pa
         it.hear(range(2, 3), STATIC, latched=1)
         write_out(it)
         it.room[0] = True
-        it.recorder._current.recording._again_s = 0.0  # type: ignore[union-attr]
+        it.recorder._current.recording._retry_at_s = 0.0  # type: ignore[union-attr]
         it.hear(range(10, 20))
         it.recorder.stop()
         assert it.row(STATIC)['dropped'] == {'no_room': 1}
@@ -213,12 +213,12 @@ def test_a_large_map_does_not_end_slices_early(tmp_path: Path) -> None:
 
 
 def kept(latched: Latched) -> list[tuple[str, str | None, int | None]]:
-    return [(lot.topic, lot.messages[0].publisher, lot.messages[0].number) for lot in latched]
+    return [(batch.topic, batch.messages[0].publisher, batch.messages[0].number) for batch in latched]
 
 
-def of(publisher: str | None, number: int, topic: str = STATIC, size: int = 0, publishers: int = 2) -> Lot:
+def of(publisher: str | None, number: int, topic: str = STATIC, size: int = 0, publishers: int = 2) -> MessageBatch:
     (message,) = messages(range(number, number + 1), size)
-    return Lot(topic, STRING, '', [message._replace(publisher=publisher)], publishers)
+    return MessageBatch(topic, STRING, '', [message._replace(publisher=publisher)], publishers)
 
 
 def test_one_message_per_publisher() -> None:

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 from bags.eventing import until
-from bags.recording import ROBOT, STRING, Desk, desk, journaled, lot, manifest, mission, numbers, start, write_out
+from bags.recording import ROBOT, STRING, Desk, batch, desk, journaled, manifest, mission, numbers, start, write_out
 from clocks import Clocks
 from mcap.reader import make_reader
 
@@ -49,7 +49,7 @@ def test_both_stamps_and_the_number_are_kept(tmp_path: Path) -> None:
         it.recorder.stop()
         with it.objects()[f'{name}/{name}_0.mcap'].open('rb') as file:
             ((schema, channel, message),) = make_reader(file).iter_messages()
-        (sent,) = lot(range(7, 8)).messages
+        (sent,) = batch(range(7, 8)).messages
         assert (message.log_time, message.publish_time, message.sequence) == (sent.received_ns, sent.source_ns, 7)
         assert (channel.topic, message.data) == ('/talk', sent.cdr)
         assert schema is not None
@@ -80,7 +80,7 @@ def test_what_is_asked_out_of_turn_is_refused(tmp_path: Path) -> None:
         for ask in (it.recorder.stop, it.recorder.split, lambda: it.recorder.pause(paused=True)):
             assert ask() == (False, 'nothing is recorded')
         name = start(it.recorder)
-        assert it.recorder.start() == (False, f'{name} is recorded already')
+        assert it.recorder.start() == (False, f'{name} is being recorded already')
 
 
 def test_bags_of_one_second_have_names_of_their_own(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_what_a_kill_leaves_is_made_whole_by_the_next_start(
         ]
         said = manifest(found, name)
         assert said['state'] == 'recovered'
-        assert said['missing'][-1]['what'].startswith('what was in memory')
+        assert said['missing'][-1]['what'].startswith('messages in memory')
         row = it.row()
         assert (row['stored'], row['open'], row['dropped']) == ((30, 0, {}) if synced else (10, 0, {'restart': 20}))
         assert journaled(it.spool.root, 'bags') == ({} if synced else {('/talk', 'restart'): 20})

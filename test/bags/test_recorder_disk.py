@@ -75,7 +75,7 @@ def _retry(it: Desk) -> None:
 
     def again() -> None:
         assert it.recorder._writing is not None
-        it.recorder._writing._again_s = 0.0
+        it.recorder._writing._retry_at_s = 0.0
         done.set()
 
     it.queue.mark(again)
@@ -129,7 +129,7 @@ def test_what_did_not_get_in_is_in_the_manifest(tmp_path: Path) -> None:
         it.hear(range(2))
         write_out(it)
         it.hear(range(2, 4), '/large', size=200)
-        it.queue.leave_out('/talk', 'paused', 3)
+        it.queue.count_dropped('/talk', 'paused', 3)
         it.room[0] = False
         write_out(it)
         it.hear(range(5, 7))

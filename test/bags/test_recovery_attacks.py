@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from bags.recording import ROBOT, desk, lot, manifest, start
+from bags.recording import ROBOT, batch, desk, manifest, start
 from bags.slices import closed, fill, messages
 from bags.test_recorder import kill, lose_index
 from bags.test_wrong_clock import hear, is_whole
@@ -49,7 +49,7 @@ def test_what_was_dropped_after_the_last_slice_is_missing_without_the_index(tmp_
         start(it.recorder)
         hear(it, clock, range(3))
         it.recorder.split()
-        assert it.queue.put(lot(range(3, 8), size=1000)) == 5
+        assert it.queue.put(batch(range(3, 8), size=1000)) == 5
         it.recorder.stop()
         assert it.writer.flush(60)
         left, lost = kill(home), kill(home, 1)

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import BagRow, bag_overview, named_ns
-from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural
+from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural_key
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
@@ -105,7 +105,7 @@ def test_info_of_a_folder(tmp_path: Path) -> None:
 
 def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     """The eleventh after the tenth, not after the first."""
-    assert sorted(['a_10.mcap', 'a_9.mcap', 'a_1.mcap'], key=natural) == ['a_1.mcap', 'a_9.mcap', 'a_10.mcap']
+    assert sorted(['a_10.mcap', 'a_9.mcap', 'a_1.mcap'], key=natural_key) == ['a_1.mcap', 'a_9.mcap', 'a_10.mcap']
     store = MemoryStore()
     write_ours(tmp_path / NAME, slices=11, each=1)
     stored(store, tmp_path / NAME)

@@ -6,10 +6,10 @@ import subprocess
 import sys
 
 import pytest
-from bags.recording import lot, messages
+from bags.recording import batch, messages
 
-from shadowhound_data_logger.bags.queue import Lot
-from shadowhound_data_logger.bags.ring import MESSAGE_BYTES, PIECE_BYTES, Held, Ring
+from shadowhound_data_logger.bags.queue import MessageBatch
+from shadowhound_data_logger.bags.ring import MESSAGE_BYTES, PIECE_BYTES, Ring, RingItem
 
 KEEP_S = 10.0
 
@@ -20,15 +20,15 @@ def kept(ring: Ring) -> list[int]:
     return [number for held in iter(lambda: ring.next(float('inf')), None) for number in told(held)]
 
 
-def told(held: Held) -> list[int]:
-    return [message.number for message in held.lot.messages if message.number is not None]
+def told(held: RingItem) -> list[int]:
+    return [message.number for message in held.batch.messages if message.number is not None]
 
 
 def test_what_is_too_old_goes() -> None:
     """Of what nobody asked for the last seconds are kept, in the order of arrival."""
     ring = Ring(1 << 20, KEEP_S)
     for second in range(30):
-        assert ring.put(lot(range(second, second + 1)), None, float(second)) == []
+        assert ring.put(batch(range(second, second + 1)), None, float(second)) == []
     assert ring.seconds == KEEP_S
     assert kept(ring) == list(range(19, 30))
     assert ring.bytes == 0
@@ -38,7 +38,7 @@ def test_what_is_too_much_goes_the_oldest_first() -> None:
     """Whatever the time: the bytes count, with what Python needs for each message."""
     ring = Ring(10 * (12 + MESSAGE_BYTES), KEEP_S)
     for number in range(25):
-        assert ring.put(lot(range(number, number + 1)), None, 0.0) == []
+        assert ring.put(batch(range(number, number + 1)), None, 0.0) == []
         assert ring.bytes <= ring.max_bytes
     assert kept(ring) == list(range(15, 25))
 
@@ -46,7 +46,7 @@ def test_what_is_too_much_goes_the_oldest_first() -> None:
 def test_a_large_lot_goes_in_pieces() -> None:
     """One drain of a fast camera does not push out a whole second; what was lost with it belongs to its end."""
     ring = Ring(8 * PIECE_BYTES, KEEP_S)
-    ring.put(lot(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
+    ring.put(batch(range(10), size=PIECE_BYTES // 2), {'transport': 3}, 0.0)
     ring.claim(0.0)
     pieces = list(iter(lambda: ring.next(0.0), None))
     assert [told(piece) for piece in pieces] == [[number] for number in range(10)]
@@ -56,37 +56,37 @@ def test_a_large_lot_goes_in_pieces() -> None:
 def test_a_message_that_is_larger_than_the_ring_is_not_kept() -> None:
     """Nor does it leave anything else there."""
     ring = Ring(1 << 20, KEEP_S)
-    ring.put(lot(range(3)), None, 0.0)
-    ring.put(lot(range(3, 4), size=2 << 20), None, 0.0)
+    ring.put(batch(range(3)), None, 0.0)
+    ring.put(batch(range(3, 4), size=2 << 20), None, 0.0)
     assert (kept(ring), ring.bytes) == ([], 0)
 
 
 def test_messages_are_not_copied() -> None:
     """What comes out is what went in, the very same bytes."""
     ring, taken = Ring(1 << 20, KEEP_S), messages(range(5), 100)
-    ring.put(Lot('/talk', 'std_msgs/msg/String', '', taken), None, 0.0)
+    ring.put(MessageBatch('/talk', 'std_msgs/msg/String', '', taken), None, 0.0)
     ring.claim(0.0)
     held = ring.next(0.0)
     assert held is not None
-    assert all(out.cdr is given.cdr for out, given in zip(held.lot.messages, taken, strict=True))
+    assert all(out.cdr is given.cdr for out, given in zip(held.batch.messages, taken, strict=True))
 
 
 def test_while_it_is_claimed_nothing_grows_old() -> None:
     """What an event asked for waits for it, until it is taken or somebody else needs its place, which is told."""
     ring = Ring(5 * (12 + MESSAGE_BYTES), KEEP_S)
     for second in range(3):
-        ring.put(lot(range(second, second + 1)), None, float(second))
+        ring.put(batch(range(second, second + 1)), None, float(second))
     assert ring.claim(1.0) == 1.0
     assert ring.claimed
-    assert ring.put(lot(range(3, 6)), None, 100.0) == []
-    gone = ring.put(lot(range(6, 8)), None, 101.0)
+    assert ring.put(batch(range(3, 6)), None, 100.0) == []
+    gone = ring.put(batch(range(6, 8)), None, 101.0)
     assert [told(held) for held in gone] == [[1], [2]]
     held = ring.next(100.0)
     assert held is not None
     assert told(held) == [3, 4, 5]
     assert ring.next(100.0) is None
     ring.release()
-    assert ring.put(lot(range(8, 9)), None, 120.0) == []
+    assert ring.put(batch(range(8, 9)), None, 120.0) == []
     assert kept(ring) == [8]
 
 
@@ -94,19 +94,19 @@ PROGRAM = f"""
 import sys
 from pathlib import Path
 sys.path.insert(0, {str(__file__).rpartition('/test/')[0] + '/test'!r})
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.core.model import Taken
 size, limit = int(sys.argv[1]), 32 << 20
 def rss():
     return int(Path('/proc/self/statm').read_text().split()[1]) * 4096
-def lot(first, count):
+def batch(first, count):
     made = [Taken(bytes(size), 10**18 + n, 'p', 10**6 + n, 10**18 + n) for n in range(first, first + count)]
-    return Lot('/t', 'T', '', made)
+    return MessageBatch('/t', 'T', '', made)
 ring, count, at = Ring(limit, 1e9), max(1, 200_000 // (size + 200)), 0
 before = rss()
 for turn in range(4 * limit // (count * (size + 256))):
-    ring.put(lot(at, count), None, float(turn))
+    ring.put(batch(at, count), None, float(turn))
     at += count
 print((rss() - before) / limit, ring.bytes / limit)
 """
@@ -125,15 +125,15 @@ def test_memory_is_bounded_by_the_limit_of_bytes(size: int) -> None:
     assert grown <= 1.1
 
 
-def latched(*numbers: int, publisher: str | None = 'p', size: int = 0, publishers: int = 2) -> Lot:
-    found = lot(range(min(numbers), max(numbers) + 1), '/tf_static', size)
+def latched(*numbers: int, publisher: str | None = 'p', size: int = 0, publishers: int = 2) -> MessageBatch:
+    found = batch(range(min(numbers), max(numbers) + 1), '/tf_static', size)
     return found._replace(messages=[each._replace(publisher=publisher) for each in found.messages], latched=publishers)
 
 
 def of_event(ring: Ring) -> list[tuple[str, str | None, list[int], bool]]:
     """What an event gets: topic, publisher, numbers, and whether it is there once more."""
     found = list(iter(lambda: ring.next(float('inf')), None))
-    return [(held.lot.topic, held.lot.messages[0].publisher, told(held), held.again) for held in found]
+    return [(held.batch.topic, held.batch.messages[0].publisher, told(held), held.repeated) for held in found]
 
 
 def test_what_is_latched_is_at_the_start_of_each_event() -> None:
@@ -141,15 +141,15 @@ def test_what_is_latched_is_at_the_start_of_each_event() -> None:
     ring = Ring(1 << 20, KEEP_S)
     ring.put(latched(1, 2), None, 0.0)
     ring.put(latched(5, publisher='q'), None, 0.0)
-    ring.put(lot(range(7, 8)), None, 50.0)
+    ring.put(batch(range(7, 8)), None, 50.0)
     for _ in range(2):
-        ring.put(lot(range(8, 9)), None, 100.0)
+        ring.put(batch(range(8, 9)), None, 100.0)
         ring.claim(95.0)
         first = ring.next(100.0)
         assert first is not None
-        assert (first.lot.messages[0].number, first.again) == (2, True)
-        assert first.lot.messages[0].received_ns == messages(range(8, 9))[0].received_ns
-        assert first.lot.messages[0].source_ns == messages(range(2, 3))[0].source_ns
+        assert (first.batch.messages[0].number, first.repeated) == (2, True)
+        assert first.batch.messages[0].received_ns == messages(range(8, 9))[0].received_ns
+        assert first.batch.messages[0].source_ns == messages(range(2, 3))[0].source_ns
         assert of_event(ring) == [('/tf_static', 'q', [5], True), ('/talk', 'p', [8], False)]
         ring.release()
     ring.put(latched(3), None, 100.0)
@@ -177,7 +177,7 @@ def test_an_event_without_anything_else_begins_with_what_is_latched() -> None:
         ring.release()
     ring.claim(50.0, 79)
     (held,) = iter(lambda: ring.next(60.0), None)
-    assert held.lot.messages[0].received_ns == 79
+    assert held.batch.messages[0].received_ns == 79
 
 
 def test_what_is_latched_counts_as_bytes() -> None:
@@ -186,7 +186,7 @@ def test_what_is_latched_counts_as_bytes() -> None:
     for number in range(12):
         ring.put(latched(number, publisher=str(number), size=100_000), None, 0.0)
         assert ring.bytes <= ring.max_bytes
-    ring.put(lot(range(3)), None, 50.0)
+    ring.put(batch(range(3)), None, 50.0)
     assert 500_000 < ring.bytes < 600_000
     ring.claim(0.0)
     assert [numbers for topic, _, numbers, _ in of_event(ring) if topic == '/tf_static'] == [[7], [8], [9], [10], [11]]

@@ -73,7 +73,7 @@ def test_a_record_takes_a_hundredth_of_a_slice(tmp_path: Path, size: int) -> Non
     assert len(found.slices) >= (1500 if size > 1 << 20 else 10)
     assert found.missing[1:] == state.missing[1 - len(found.missing) :]
     left_out = 4000 - len(found.slices) - len(found.missing[1:])
-    assert found.missing[0].what == f'the index was lost: {left_out} slices or losses of before are not listed here'
+    assert found.missing[0].what == f'the index was lost: {left_out} earlier slices or losses are not listed here'
 
 
 def test_what_a_slice_says_later_counts(tmp_path: Path) -> None:

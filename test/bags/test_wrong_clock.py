@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.overview import bag_overview
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import unsynced
@@ -33,7 +33,7 @@ def hear(it: Desk, clock: Clocks, numbers: range) -> None:
     with it.spool.accounts.entry(f'{BAG}/talk') as account:
         for message in heard:
             assert account.receive(message.publisher, message.number)
-    it.queue.put(Lot('/talk', STRING, '', heard))
+    it.queue.put(MessageBatch('/talk', STRING, '', heard))
 
 
 def log_times(path: Path) -> list[int]:
@@ -61,14 +61,14 @@ def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) 
         assert it.recorder.status().bag == UNSET
         hear(it, clock, range(5))
         it.recorder.split()
-        it.recorder.look()
+        it.recorder.check_clock()
         hear(it, clock, range(5, 10))
         assert it.objects() == {}
         clock.wait(30.0)
         clock.set(NOON_NS)
         hear(it, clock, range(10, 12))
-        it.recorder.look()
-        it.recorder.look()
+        it.recorder.check_clock()
+        it.recorder.check_clock()
         hear(it, clock, range(12, 15))
         it.recorder.stop()
         found = it.objects()
@@ -111,7 +111,7 @@ def test_a_bag_that_ends_before_the_clock_is_set_waits_for_it(tmp_path: Path) ->
         name = start(it.recorder)
         hear(it, clock, range(3))
         done, text = it.recorder.stop()
-        assert (done, text) == (True, f'{name}: 3 messages in 1 slices; it waits for the clock of this machine to be set')
+        assert (done, text) == (True, f'{name}: 3 messages in 1 slices; it waits until the clock of this machine is set')
         assert it.recorder._recovery.is_busy
         assert it.objects() == {}
         assert it.row()['open'] == 3
@@ -134,7 +134,7 @@ def test_a_clock_that_is_not_set_for_too_long(tmp_path: Path) -> None:
     with desk(tmp_path, clock, record='always') as it:
         hear(it, clock, range(3))
         clock.wait(601.0)
-        it.recorder.look()
+        it.recorder.check_clock()
         hear(it, clock, range(3, 5))
         assert it.recorder.status().bag == 'recording_unsynced_this-boot_00000661'
         it.recorder.split()
@@ -204,7 +204,7 @@ def test_a_name_that_was_decided_stays(tmp_path: Path, monkeypatch: pytest.Monke
         broken = Mock(side_effect=OSError('the disk refuses'))
         with monkeypatch.context() as patch, desk(left, clock) as it:
             if not hour:
-                patch.setattr(BagRecovery, '_hand_over', broken)
+                patch.setattr(BagRecovery, '_spool_slice', broken)
                 until(partial(getattr, broken, 'called'), 'the bag is named')
             else:
                 is_whole(it)
@@ -236,13 +236,15 @@ def test_an_event_before_the_clock_is_set(tmp_path: Path) -> None:
     clock = Clocks()
     with buffer(tmp_path, clock) as it:
         came_ns = clock.wall_ns()
-        it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 1, came_ns, 'p', 1, came_ns)]), None, it.now_s[0])
+        it.ring.put(MessageBatch('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 1, came_ns, 'p', 1, came_ns)]), None, it.now_s[0])
         text = it.events.trigger('fall', 'service')[1]
         assert text == 'event_fall_unsynced_this-boot_00000060 begins'
         it.taken()
         clock.set(NOON_NS)
         clock.wait(1.0)
-        it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 2, 0, 'p', 2, clock.wall_ns())]), None, it.now_s[0])
+        it.ring.put(
+            MessageBatch('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 2, 0, 'p', 2, clock.wall_ns())]), None, it.now_s[0]
+        )
         it.events.trigger('again', 'service')
         it.pass_s(5.0)
         it.written()
@@ -262,8 +264,8 @@ def test_two_events_wait_at_the_same_time(tmp_path: Path) -> None:
     clock = Clocks()
     with buffer(tmp_path, clock) as it:
         for number, name in enumerate(('one', 'two'), 1):
-            it.ring.put(Lot('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % number, 0, 'p', number, clock.wall_ns())]), None,
-                        it.now_s[0])  # fmt: skip
+            taken = Taken(b'\0\1\0\0%08d' % number, 0, 'p', number, clock.wall_ns())
+            it.ring.put(MessageBatch('/talk', STRING, '', [taken]), None, it.now_s[0])
             it.events.trigger(name, 'service')
             it.pass_s(5.0)
             clock.wait(5.0)

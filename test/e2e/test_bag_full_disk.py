@@ -67,12 +67,12 @@ def test_a_disk_that_is_full_for_a_while(processes: Processes, disk: Path, seawe
     filler.unlink()
     until(lambda: node.topic('/imu')['received'] >= before + FULL_S * 40, 'the intake went on')
     until(lambda: node.ledger()['bags']['/imu']['dropped'], 'the ledger says why')
-    until(lambda: 'goes on' in node.log, 'the bag goes on')
+    until(lambda: 'recording continues' in node.log, 'the recording continues')
     until(lambda: node.ledger()['bags']['/imu']['received'] > before + 300, 'more is recorded')
     sim.signal(2)
     said = published(sim)
     ledger = node.stop()
-    assert node.log.count('nothing is recorded while the disk takes nothing') == 1
+    assert node.log.count('nothing is recorded while the disk accepts no writes') == 1
     store = S3Store(seaweed.store_settings(), UploadSettings())
     store.open()
     try:

@@ -71,7 +71,7 @@ def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
     done, text = station.event()
     assert done, text
     publisher.publish(TOPIC, texts(range(20, 30)))
-    assert station.event()[1].endswith('lasts longer')
+    assert station.event()[1].endswith('is extended')
     bag = event_of(node, processes, store, processes.folder / 'bags')
     publisher.publish(TOPIC, texts(range(30, 40)))
     assert bag.folder.name.startswith('event_manual_')

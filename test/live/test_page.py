@@ -206,7 +206,7 @@ def test_an_operator_acts(page: Page, watching: Watching) -> None:
     page.get_by_label('Name of the event').fill('bump')
     page.get_by_label('Note', exact=True).fill('against the shelf')
     for act, words in (
-        ('bag start', ''), ('event', 'event_bump_'), ('bag split', 'has 1 slices that are closed'), ('pause', 'are counted'),
+        ('bag start', ''), ('event', 'event_bump_'), ('bag split', 'has 1 closed slices'), ('pause', 'are counted'),
         ('resume', 'messages are stored again'), ('bag stop', ' messages in 2 slices'), ('flush', ' spooled'),
     ):  # fmt: skip
         if act in {'bag split', 'bag stop'}:  # there is something in the slice

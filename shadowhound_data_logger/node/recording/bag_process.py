@@ -26,10 +26,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.local import RECORDS, local_files
 from shadowhound_data_logger.bags.manifest import Manifest, MissionOf
 from shadowhound_data_logger.bags.naming import MANIFEST, unsynced_mark
-from shadowhound_data_logger.bags.place import BagPlace
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
@@ -202,7 +202,7 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     bags = BagConsumer(node, settings.bag, accounts, queue)
     stamps = StampRule(clock, round(settings.clock.max_offset_s * SECOND))
     intake = Intake(node, {}, accounts, MessageTypes(), stamps, [bags])
-    place = BagPlace(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
+    place = BagContext(settings.home / RECORDS / settings.robot, settings.robot, clock, writer)
     recovery = BagRecovery(place, settings.bag.priority)
     recorder = Recorder(settings.bag, place, queue, recovery, partial(intake.listen, bags))
     writer.open()

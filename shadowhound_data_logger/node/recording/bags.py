@@ -11,7 +11,7 @@ from typing import Final
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, Lot
+from shadowhound_data_logger.bags.queue import QUEUE_FULL, BagQueue, MessageBatch
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import BagSettings
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import offered_qos
@@ -65,10 +65,10 @@ class BagConsumer(Consumer):
         if not fresh:
             return
         if paused:
-            self._queue.leave_out(topic, PAUSED, len(fresh))
+            self._queue.count_dropped(topic, PAUSED, len(fresh))
         qos, latched = self._offers.of(topic, type_name, fresh[-1].publisher)
         if not paused or latched:  # slices after the pause begin with what was latched in it
-            dropped = self._queue.put(Lot(topic, type_name, qos, fresh, latched, paused))
+            dropped = self._queue.put(MessageBatch(topic, type_name, qos, fresh, latched, paused))
             if dropped and not paused:
                 self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].times, fresh[-1].times)
 

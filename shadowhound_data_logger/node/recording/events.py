@@ -11,12 +11,12 @@ from pathlib import Path
 
 from rclpy.node import Node
 
+from shadowhound_data_logger.bags.context import BagContext
 from shadowhound_data_logger.bags.events import NOTICE_S, Events
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.place import BagPlace
-from shadowhound_data_logger.bags.queue import Lot
+from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.bags.ring import Claims, Held, Ring
+from shadowhound_data_logger.bags.ring import EventAccounts, Ring, RingItem
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import EventSettings
@@ -32,7 +32,7 @@ from shadowhound_data_logger.spool.accounts import PAUSED
 class EventConsumer(Consumer):
     """Hands messages to the ring and the conditions; it counts nothing and copies nothing."""
 
-    def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: Claims) -> None:
+    def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: EventAccounts) -> None:
         watched = [(node.resolve_topic_name(each.test.source), each) for each in conditions(settings.conditions)]
         named = [node.resolve_topic_name(topic) for topic in settings.topics if topic]
         self.inbox = Inbox(watched)
@@ -51,12 +51,12 @@ class EventConsumer(Consumer):
         if topic in self._unkept:
             return
         qos, latched = self._offers.of(topic, drained.type, messages[-1].publisher)
-        lot = Lot(topic, drained.type, qos, messages, latched)
+        batch = MessageBatch(topic, drained.type, qos, messages, latched)
         if not drained.paused:
-            if gone := self._ring.put(lot, drained.lost, now_s):
+            if gone := self._ring.put(batch, drained.lost, now_s):
                 self._claims.lose(gone)
         elif self._ring.claimed:
-            self._claims.lose([Held(lot, drained.lost, now_s, 0)], PAUSED)
+            self._claims.lose([RingItem(batch, drained.lost, now_s, 0)], PAUSED)
 
 
 class EventBuffer:
@@ -65,7 +65,7 @@ class EventBuffer:
     Life: New; open once; ``close`` after the intake.
     """
 
-    def __init__(self, node: Node, settings: Settings, place: BagPlace, recovery: BagRecovery,
+    def __init__(self, node: Node, settings: Settings, place: BagContext, recovery: BagRecovery,
                  types: MessageTypes) -> None:  # fmt: skip
         options, home = settings.events, settings.home
         ring = Ring(options.max_bytes, options.pre_s + NOTICE_S)
@@ -106,7 +106,7 @@ class EventBuffer:
         if self._watch is not None:
             self._watch.on_mission(mission)
 
-    def _make_watch(self, options: EventSettings, home: Path, place: BagPlace, types: MessageTypes) -> EventWatch | None:
+    def _make_watch(self, options: EventSettings, home: Path, place: BagContext, types: MessageTypes) -> EventWatch | None:
         if self.consumer is None:
             return None
         return EventWatch(self.consumer.inbox, types, home, place.clock, options.log_event, self.events.trigger)

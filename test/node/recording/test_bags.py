@@ -11,7 +11,7 @@ pytest.importorskip('rclpy')
 
 from node.intake.test_stream import NOON_NS, TOPIC, TYPE, Batches
 
-from shadowhound_data_logger.bags.queue import BagQueue, Lot
+from shadowhound_data_logger.bags.queue import BagQueue, MessageBatch
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.model import Taken
@@ -79,7 +79,7 @@ class Ear:
         """The numbers of what the bag got."""
         numbers = []
         while (item := self.queue.next()) is not None:
-            assert isinstance(item, Lot)
+            assert isinstance(item, MessageBatch)
             assert (item.topic, item.type) == (TOPIC, TYPE)
             assert item.qos.count('history') == 1
             numbers += [message.number for message in item.messages]
@@ -197,9 +197,9 @@ def test_what_is_latched_is_marked(durability: int, lifespan_ns: int, latched: i
     ear = Ear(own=True, graph=Graph(durability, lifespan_ns))
     for number in range(3):
         ear.add(messages(number))
-        lot = ear.queue.next()
-        assert isinstance(lot, Lot)
-        assert (lot.latched, lot.paused) == (latched, False)
+        batch = ear.queue.next()
+        assert isinstance(batch, MessageBatch)
+        assert (batch.latched, batch.paused) == (latched, False)
     assert ear.graph.asked == (3 if latched else 1)
 
 
@@ -209,9 +209,9 @@ def test_what_is_latched_in_a_pause_is_remembered() -> None:
     ear.queue.paused = True
     ear.add(messages(1))
     ear.add(messages(2))
-    lot = ear.queue.next()
-    assert isinstance(lot, Lot)
-    assert ([message.number for message in lot.messages], lot.paused) == ([1], True)
+    batch = ear.queue.next()
+    assert isinstance(batch, MessageBatch)
+    assert ([message.number for message in batch.messages], batch.paused) == ([1], True)
     assert ear.queue.next() is None
     assert (ear.account.received, ear.account.dropped, ear.queue.dropped) == (2, {'paused': 2}, 0)
 

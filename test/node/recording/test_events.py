@@ -11,12 +11,12 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from bags.recording import NOON_NS, lot, messages
+from bags.recording import NOON_NS, batch, messages
 from clocks import Clocks
 from e2e.reading import STRING
 
 from shadowhound_data_logger.bags.manifest import MissionOf
-from shadowhound_data_logger.bags.ring import Held, Ring
+from shadowhound_data_logger.bags.ring import Ring, RingItem
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import EventSettings
@@ -45,13 +45,13 @@ class Graph:
 
 
 class Losses:
-    """Claims of no event: it notes what could not be had."""
+    """EventAccounts of no event: it notes what could not be had."""
 
     def __init__(self) -> None:
         self.lost: list[tuple[str, list[int | None]]] = []
 
-    def lose(self, held: Sequence[Held], reason: str = 'ring_full') -> None:
-        self.lost += [(reason, [message.number for message in each.lot.messages]) for each in held]
+    def lose(self, held: Sequence[RingItem], reason: str = 'ring_full') -> None:
+        self.lost += [(reason, [message.number for message in each.batch.messages]) for each in held]
 
 
 class Ear:
@@ -76,7 +76,7 @@ def test_it_wants_what_is_kept_and_what_conditions_look_at() -> None:
     assert ear.wanted('/odom', '/other') == {'/r0/imu', '/odom', '/r0/lowstate'}
     for topic in ('/r0/imu', '/odom', '/r0/lowstate'):
         ear.take(topic, messages(range(3)))
-    kept = [held.lot.topic for held in iter(lambda: ear.ring.next(float('inf')), None)]
+    kept = [held.batch.topic for held in iter(lambda: ear.ring.next(float('inf')), None)]
     assert kept == ['/r0/imu', '/odom']
     assert [len(list(ear.consumer.inbox.take(topic))) for topic in ('/r0/imu', '/r0/lowstate')] == [3, 3]
 
@@ -105,10 +105,10 @@ def test_what_an_event_asked_for_and_has_to_go_is_told() -> None:
     """Only then: without an event the oldest go in silence."""
     ear = Ear(topics=('/talk',))
     for number in range(20):
-        ear.take('/talk', lot(range(number, number + 1), size=100_000).messages)
+        ear.take('/talk', batch(range(number, number + 1), size=100_000).messages)
     assert ear.claims.lost == []
     ear.ring.claim(0.0)
-    ear.take('/talk', lot(range(20, 21), size=100_000).messages)
+    ear.take('/talk', batch(range(20, 21), size=100_000).messages)
     assert ear.claims.lost == [('ring_full', [10])]
 
 
