@@ -238,7 +238,7 @@ def test_an_event_before_the_clock_is_set(tmp_path: Path) -> None:
         came_ns = clock.wall_ns()
         it.ring.put(MessageBatch('/talk', STRING, '', [Taken(b'\0\1\0\0%08d' % 1, came_ns, 'p', 1, came_ns)]), None, it.now_s[0])
         text = it.events.trigger('fall', 'service')[1]
-        assert text == 'event_fall_unsynced_this-boot_00000060 begins'
+        assert text == 'event_fall_unsynced_this-boot_00000060 starts'
         it.taken()
         clock.set(NOON_NS)
         clock.wait(1.0)

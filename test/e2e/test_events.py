@@ -75,7 +75,7 @@ def test_what_came_before_a_trigger_and_after_it_is_in_a_bag(
     bag = event_of(node, processes, store, processes.folder / 'bags')
     publisher.publish(TOPIC, texts(range(30, 40)))
     assert bag.folder.name.startswith('event_manual_')
-    assert text == f'{bag.folder.name} begins'
+    assert text == f'{bag.folder.name} starts'
     assert bag.check() == {TOPIC: 30}
     assert numbers(bag) == list(range(30))
     event = bag.manifest['event']

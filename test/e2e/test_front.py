@@ -108,7 +108,7 @@ def answers(station: Station) -> Iterator[Any]:
         yield words[0], words[1].replace(bag, 'BAG')
     yield from (station.bag('stop'), station.bag('split'), station.bag_pause(paused=True))
     done, event = station.event()
-    yield 'event', done, event.startswith('event_manual_'), event.endswith(' begins')
+    yield 'event', done, event.startswith('event_manual_'), event.endswith(' starts')
 
 
 def test_each_service_answers_as_the_node_would(stations: dict[str, Station]) -> None:
