@@ -92,7 +92,7 @@ def filled(root: Path, rows: int, bucket: str) -> Spool:
     with spool._connections.transaction() as index:  # without the syncing of commits, which is not what is measured here
         for number, (_, sensor, priority) in enumerate(itertools.islice(arrivals(0.0, float(rows)), rows)):
             item = make(number, sensor, priority, bucket)
-            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
             lying[priority] = lying.get(priority, 0) + 1
             if lying[priority] <= WITH_FILES or number < WITH_FILES:
                 path = root / 'ready' / item.bucket / item.key

@@ -53,7 +53,7 @@ def pending(root: Path, rows: int) -> dict[str, float]:
     with spool._connections.transaction() as index:  # without the syncing of commits, which is not what is measured here
         for number in range(rows):
             item = make(number)
-            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, {'sha256': '0' * 64}, NOON_NS)
             path = root / 'ready' / item.bucket / item.key
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(item.body)

@@ -24,11 +24,11 @@ from spool_commits import make, opened
 
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.request_table import CANCELLED, RequestRow
-from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
+from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 
 PROFILES: Final = {
     'default profile': (3, 40_000, 0.1), 'every message stored': (20, 100_000, 0.1),
-    'the largest commit': (MOST_OBJECTS, 130_000, 0.1),
+    'the largest commit': (MAX_OBJECTS, 130_000, 0.1),
 }  # fmt: skip
 """Objects of so many bytes in a commit, and the seconds from one to the next."""
 BAR_MS: Final = 50.0
@@ -125,7 +125,7 @@ def asked(root: Path) -> dict[str, object]:
             ((f'thor/camera/{number:08d}.jpg',) for number in range(ASKED)),
         )  # fmt: skip
     chosen = [(item.id, item.bytes) for item in spool.requests.selectable()]
-    row = RequestRow(id='0' * 32, requester='bench', priority=5, made_ns=1, expires_ns=1 << 62, received_ns=1, wanted='{}')
+    row = RequestRow(id='0' * 32, requester='bench', priority=5, made_ns=1, expires_ns=1 << 62, received_ns=1, selection='{}')
     with timed(spool._connections.writing) as found:
         begun = perf_counter()
         row = spool.requests.accept(row, chosen)

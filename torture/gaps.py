@@ -35,11 +35,11 @@ from e2e.processes import Node, Processes, Publisher, until
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import WRONG_TYPE
 from shadowhound_data_logger.spool.control import connect
 from shadowhound_data_logger.spool.gaps import OBJECTS, Gap
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import retry
+from shadowhound_data_logger.spool.topic_account import WRONG_TYPE
 from torture._command import Bar, parser, progress, verdict, workshop
 from torture._disks import Disk, NotAllowed, small_disk
 from torture.losses import quiet

@@ -28,8 +28,8 @@ from domains import free_domain
 from e2e.numbered import told
 from e2e.processes import Node, Processes, Publisher, until
 
-from shadowhound_data_logger.spool.accounts import EXACT
 from shadowhound_data_logger.spool.estimator import RESTART
+from shadowhound_data_logger.spool.gaps import EXACT
 from torture._command import Bar, parser, progress, verdict, workshop
 
 ROUNDS: Final = 10

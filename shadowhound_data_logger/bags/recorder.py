@@ -22,7 +22,7 @@ from shadowhound_data_logger.bags.state import BagState
 from shadowhound_data_logger.core.options import BagSettings
 from shadowhound_data_logger.core.status import BagStatus
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.topic_account import BAG
 
 log = logging.getLogger(__name__)
 

@@ -141,7 +141,7 @@ class BagRecovery:
             self._wake.wait(LOOK_S)
 
     def _settle(self) -> None:
-        lost = self._context.spool.accounts.drop_carried(RESTART)
+        lost = self._context.spool.accounts.carried.drop_rest(RESTART)
         if lost:
             log.warning('%d messages of bags were lost: they were in memory when the previous node stopped', lost)
 
@@ -256,7 +256,7 @@ class BagRecovery:
             return
         if state.folder not in self._own:
             runs, newest = _number_runs(path)
-            self._context.spool.accounts.find(
+            self._context.spool.accounts.carried.recover(
                 item.counts,
                 {f'{state.sink}{topic}': found for topic, found in runs.items()},
                 {f'{state.sink}{topic}': times for topic, times in newest.items()},

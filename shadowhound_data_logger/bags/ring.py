@@ -15,7 +15,8 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.bags.latched import MESSAGE_BYTES, Latched
 from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.core.model import Taken
-from shadowhound_data_logger.spool.accounts import EVENT, Accounts, Losses
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.topic_account import EVENT, Losses
 
 PIECE_BYTES: Final = 1 << 20
 """Larger batches are split into pieces of this size, which are evicted and written separately."""
@@ -174,8 +175,8 @@ class EventAccounts:
             unknown = account.unknown
             fresh = [each for each in held.batch.messages if account.receive(each.publisher, each.number, each.times)]
             newest = held.batch.messages[-1].times
-            account.appraise(account.unknown - unknown, held.lost, newest)
-            account.gaps.heard = newest
+            account.add_estimate(account.unknown - unknown, held.lost, newest)
+            account.gaps.newest = newest
         return fresh
 
     def lose(self, held: Iterable[RingItem], reason: str = RING_FULL) -> None:

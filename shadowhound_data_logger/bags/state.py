@@ -41,7 +41,7 @@ from shadowhound_data_logger.core.model import MissingRow, RecordingRows, SliceR
 from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo, count_by_channel
 from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
-from shadowhound_data_logger.spool.accounts import BAG, EVENT
+from shadowhound_data_logger.spool.topic_account import BAG, EVENT
 
 log = logging.getLogger(__name__)
 

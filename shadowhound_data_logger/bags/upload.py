@@ -27,7 +27,7 @@ from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.shipping.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
+from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.verify import compare
@@ -115,8 +115,8 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
                 link = Path(work) / str(place)
                 _link_or_copy(file.path, link)
                 objects.append(_object(file, link))
-            for begin in range(0, len(objects), MOST_OBJECTS):  # the manifest is the last
-                placed += spool.commit(objects[begin : begin + MOST_OBJECTS])
+            for begin in range(0, len(objects), MAX_OBJECTS):  # the manifest is the last
+                placed += spool.commit(objects[begin : begin + MAX_OBJECTS])
         except sqlite3.Error as error:
             raise spool.unwritable(error) from error
     if len(placed) < len(objects):

@@ -23,7 +23,7 @@ def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> 
     """Ask the store that the environment names; 0 when all is there as it was delivered, else 1."""
     with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
-        earlier, known = deliveries.noted(), deliveries.known()
+        earlier, known = deliveries.verified(), deliveries.known()
         with progress('read back' if deep else 'checked', known, of='objects') as bar:
             bar.have(earlier)
             found = audit(deliveries, store, deep=deep, tell=bar.have)

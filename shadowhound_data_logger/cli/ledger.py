@@ -30,7 +30,6 @@ from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.dataclass_json import parse
 from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.spool.accounts import GRADES, RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT, Gap
 from shadowhound_data_logger.spool.ledger import (
     ClockFigures,
@@ -46,6 +45,7 @@ from shadowhound_data_logger.spool.ledger import (
 from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.local_robot import local_robots, robots
 from shadowhound_data_logger.spool.status import not_logged
+from shadowhound_data_logger.spool.topic_account import GRADES, RECEIVED_ONLY
 
 COLUMNS: Final = ('published', 'received', 'missed', 'skipped', 'rejected', 'dropped', 'stored', 'open')
 ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored'})

@@ -17,8 +17,8 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.stamps import BY_RECEIVED
 from shadowhound_data_logger.core.untrusted import visible
-from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.gaps import ESTIMATED
+from shadowhound_data_logger.spool.topic_account import RECEIVED_ONLY
 
 BAR_COLUMNS: Final = 10
 WIDEST: Final = 1000

@@ -26,7 +26,7 @@ from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import Uploader, UploadStatus, delivering
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.listing import HERE, SensorUsage, objects, usage_by_sensor
+from shadowhound_data_logger.spool.listing import STATES_IN_SPOOL, SensorUsage, objects, usage_by_sensor
 from shadowhound_data_logger.spool.listing import resend_gaps as resend_all_gaps
 from shadowhound_data_logger.spool.listing import retry as retry_objects
 from shadowhound_data_logger.spool.local_robot import robots
@@ -63,7 +63,7 @@ def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitC
     epilog=examples('spool list --state quarantined', 'spool list sensor-data/thor/camera/'),
 )
 @click.argument('prefix', default='', metavar='[BUCKET/PREFIX]')
-@click.option('--state', type=click.Choice([state.value for state in HERE]), help='Only objects in this state.')
+@click.option('--state', type=click.Choice([state.value for state in STATES_IN_SPOOL]), help='Only objects in this state.')
 @click.option('--sensor', metavar='NAME', help='Only of this sensor.')
 @click.option('--limit', type=click.IntRange(1), default=MOST, show_default=True, help='At most N results.', metavar='N')
 @as_json

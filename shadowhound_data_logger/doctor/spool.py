@@ -16,7 +16,6 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, o
 from shadowhound_data_logger.node.intake.unheard import REMEDY
 from shadowhound_data_logger.spool import ledger, status
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.usage import usage_of
 
 NAME: Final = 'spool'
 OLD_S: Final = 600.0
@@ -65,7 +64,7 @@ def _index(path: Path) -> tuple[SpoolStatus, dict[str, int]]:
     try:
         index.open()
         index.check()
-        return usage_of(index, path.parent, time.time_ns()), index.overview.quarantine_reasons()
+        return index.usage(time.time_ns()), index.overview.quarantine_reasons()
     finally:
         index.close()
 

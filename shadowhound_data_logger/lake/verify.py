@@ -131,7 +131,7 @@ class Unfinished:
             if left := [one for one in page if self._page[one[0]] not in self._known]:
                 yield left
 
-    def note(self, ids: Iterable[int]) -> None:
+    def set_verified(self, ids: Iterable[int]) -> None:
         """Record that these are valid."""
         if self._file is not None:
             try:

@@ -207,7 +207,7 @@ _Answer = TypeVar('_Answer')
 def _of_index(index: Index) -> list[KeptRequest]:
     found = []
     for row in index.requests.rows()[-MAX_REQUESTS:]:
-        sent, size = index.requests.progress(row.id).outcomes.get('delivered', (0, 0))
-        want = json.loads(row.wanted)
+        sent, size = index.requested.progress(row.id).outcomes.get('delivered', (0, 0))
+        want = json.loads(row.selection)
         found.append(KeptRequest(row.id, row.requester, row.state, row.why, want, row.objects, row.bytes, sent, size))
     return found

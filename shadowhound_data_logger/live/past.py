@@ -38,7 +38,7 @@ from shadowhound_data_logger.formats.rows.gaps import GAP
 from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.listing import HERE
+from shadowhound_data_logger.spool.listing import STATES_IN_SPOOL
 from shadowhound_data_logger.spool.overview_table import MAX_NS
 from shadowhound_data_logger.spool.status import read as read_status
 from shadowhound_data_logger.spool.table import after
@@ -447,7 +447,7 @@ class SpoolPast:
         offset_ns = late_ns if by == BY_RECEIVED else 0
         if offset_ns:
             begin_ns, end_ns = received_ns, received_end_ns or received_ns
-        is_here = State(state) in HERE
+        is_here = State(state) in STATES_IN_SPOOL
         path = f'{self._folder(state, reason, bucket)}/{key}' if is_here else ''
         return PastObject(
             bucket, content or key, sensor, topic or '', kind or '', size, begin_ns, max(begin_ns, end_ns), mission or '',

@@ -26,7 +26,7 @@ from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.uploader import delivering
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
+from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 from shadowhound_data_logger.spool.status import limits
 
 FRAME_PRIORITY: Final = 6
@@ -125,8 +125,8 @@ class Spooler:
         with self._using(self._opened()) as spool, closing(Index(spool.root / 'index.db', read_only=True)) as known:
             known.open()
             new = [item for item in objects if not _has(known, item)]
-            for begin in range(0, len(new), MOST_OBJECTS):
-                spool.commit(new[begin : begin + MOST_OBJECTS])
+            for begin in range(0, len(new), MAX_OBJECTS):
+                spool.commit(new[begin : begin + MAX_OBJECTS])
 
     def bind(self, mission_id: str, run_id: str) -> bool:
         """Give the held objects of a mission their final keys; returns whether there were any. Raises SpoolError."""

@@ -58,11 +58,11 @@ from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.act_record import ActRecord
 from shadowhound_data_logger.spool.clock_record import ClockRecord
 from shadowhound_data_logger.spool.redating import Redating
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.topic_account import SINKS
 from shadowhound_data_logger.spool.writer import SpoolWriter
 from shadowhound_data_logger.stores import open_store
 

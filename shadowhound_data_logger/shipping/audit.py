@@ -27,7 +27,7 @@ class Delivered(Protocol):
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]: ...
 
-    def note(self, ids: Iterable[int]) -> None: ...
+    def set_verified(self, ids: Iterable[int]) -> None: ...
 
 
 @dataclass(slots=True)
@@ -88,7 +88,7 @@ def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor
                 findings.append(finding)
             tell()
     finally:
-        source.note(sound)
+        source.set_verified(sound)
         found.sound += len(sound)
         found.asked += len(sound)
     if findings:

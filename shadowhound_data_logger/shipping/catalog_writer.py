@@ -189,9 +189,9 @@ class _GapParts:
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
             with index.snapshot():
-                told, again = index.gaps.told(self._robot)
+                reported, again = index.gaps.reported(self._robot)
                 if self._version is None:
-                    self._version, self._again = told, again
+                    self._version, self._again = reported, again
                 newest, began_ns, others = index.gaps.extent(self._robot)
                 is_dated_now = not self._boots.issuperset(offsets) and index.gaps.has_undated()
                 self._boots = frozenset(offsets)

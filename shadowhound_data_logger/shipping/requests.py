@@ -199,7 +199,7 @@ class RequestServer:
         rows = [row for row in rows if row.is_open and row.expires_ns > now_ns]
         is_busy = self._may_send() and self._release(rows) | self._cut({row.id for row in rows})
         for row in self._spool.requests.rows():
-            if row.told != row.state or row.is_open:
+            if row.answered_state != row.state or row.is_open:
                 self._answer(row)
         if now_s >= self._tidy_at_s:
             self._tidy_at_s = now_s + TIDY_S
@@ -234,7 +234,7 @@ class RequestServer:
 
     def _look(self) -> None:
         """At how much is asked for."""
-        count, size = self._spool.requests.awaited()
+        count, size = self._spool.requests.open()
         mbps = self._mbps()
         self.status = RequestStatus(count, size, mbps, round(8e-6 * size / mbps) if mbps else None)
 
@@ -275,7 +275,7 @@ class RequestServer:
             row = known.get(read.id)
             if isinstance(read, PullCancel):
                 cancels.append(read)
-            elif row is None or (not row.is_open and row.told == row.state and read.made_ns != row.made_ns):
+            elif row is None or (not row.is_open and row.answered_state == row.state and read.made_ns != row.made_ns):
                 new.setdefault(read.id, read)
         if (beyond := len(known) + len(new) - MAX_REQUESTS) > 0:
             self._spool.requests.forget(self._clock.wall_ns(), beyond)
@@ -312,9 +312,9 @@ class RequestServer:
             is_late = request.expires_ns <= now_ns
             row = self._spool.requests.accept(RequestRow(
                 id=request.id, requester=request.by, priority=request.priority, made_ns=request.made_ns,
-                expires_ns=request.expires_ns, received_ns=now_ns, wanted=json.dumps(request.want.to_json()),
+                expires_ns=request.expires_ns, received_ns=now_ns, selection=json.dumps(request.want.to_json()),
                 state=REFUSED if is_late else ACTIVE, why='it has expired already' if is_late else '',
-                answers=answers[request.id], gone=json.dumps(_gone(gone[request.id])),
+                answers=answers[request.id], unavailable=json.dumps(_gone(gone[request.id])),
             ), [] if is_late else chosen[request.id])  # fmt: skip
             log.info('%s asks for %d objects that are kept (request %s)', row.requester, row.objects, row.id)
             yield row
@@ -341,7 +341,7 @@ class RequestServer:
         if not rows or count > WINDOW // 2 or size > window // 2:
             return False
         room, room_bytes = WINDOW - count, window - size
-        queues = {row.id: deque(self._spool.requests.waiting(row.id, room)) for row in rows}
+        queues = {row.id: deque(self._spool.requests.unreleased(row.id, room)) for row in rows}
         chosen: dict[int, int] = {}
         while len(chosen) < room and (row := self._next([row for row in rows if queues[row.id]])) is not None:
             number, size, is_cut = queues[row.id].popleft()
@@ -363,7 +363,7 @@ class RequestServer:
         if self._cutting is not None or not (slices := self._spool.requests.to_cut(row.id)):
             return
         folder = slices[0].key.rpartition('/')[0]
-        wanted = json.loads(row.wanted)
+        wanted = json.loads(row.selection)
         cut = self._cutter([each for each in slices if each.key.rpartition('/')[0] == folder], wanted.get('since_ns', 0),
                            wanted.get('until_ns', LATEST_NS), row.priority)  # fmt: skip
         if self._spool.has(*cut.places[-1]):  # for another request, or before the node died
@@ -429,12 +429,12 @@ class RequestServer:
         """Spool the next answer of a request, if one is due."""
         if self._answering.get(row.id, 0) > row.answers:
             return
-        if row.is_open and self._spool.requests.is_over(row.id):
+        if row.is_open and self._spool.requests.is_settled(row.id):
             self._spool.requests.close(row.id, DONE)
             self._finished()
             row = replace(row, state=DONE)
         now_ns = self._clock.wall_ns()
-        if row.told == row.state and (not row.is_open or now_ns - row.told_ns < TELL_S * SECOND):
+        if row.answered_state == row.state and (not row.is_open or now_ns - row.answered_ns < TELL_S * SECOND):
             return
         if not row.is_open:
             self._spool.requests.let_go(row.id)
@@ -445,9 +445,9 @@ class RequestServer:
         self._answering[row.id] = number
         answer = RequestAnswer(
             id=row.id, number=number, robot=self._robot, by=row.requester,
-            state='accepted' if row.is_open and not row.told else 'sending' if row.is_open else row.state,
-            time=iso(now_ns), made_ns=row.made_ns, expires=iso(row.expires_ns), why=row.why, want=json.loads(row.wanted),
-            objects=row.objects, bytes=row.bytes, gone=json.loads(row.gone), mbps=self._mbps(),
+            state='accepted' if row.is_open and not row.answered_state else 'sending' if row.is_open else row.state,
+            time=iso(now_ns), made_ns=row.made_ns, expires=iso(row.expires_ns), why=row.why, want=json.loads(row.selection),
+            objects=row.objects, bytes=row.bytes, gone=json.loads(row.unavailable), mbps=self._mbps(),
             outcomes={state: ObjectCount(*counts) for state, counts in progress.outcomes.items()},
             lost=tuple(LostObject(key, state, reason, iso(settled_ns) if settled_ns else None)
                        for key, state, reason, settled_ns in progress.lost),

@@ -1,4 +1,4 @@
-"""The accounts at one instant: what a group commit writes of them, and what the status shows of them."""
+"""The rows of the accounts, as a group commit writes them and the index returns them."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class PublisherRow:
     published: int
     received: int
     missed: Mapping[str, int]
-    heard: Times = NO_TIMES
-    """Those of the message ``last``; zeros if they are unknown."""
+    last_times: Times = NO_TIMES
+    """Those of the message with the number ``last``; zeros if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class OtherTypeRow:
-    """A type that a topic was published under, and that was not logged."""
+    """A type under which a topic was published but not logged."""
 
     topic: str
     type: str
     publishers: tuple[str, ...]
-    """Nodes, some of them where there were many."""
+    """Node names; only the first few if there were many."""
     messages: int | None
-    """Counted among the topic's ``rejected``; None where nobody listened to all of them."""
+    """Included in the topic's ``rejected``; None if they were not all received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,25 +49,25 @@ class TopicRow:
     rejected: Mapping[str, int]
     dropped: Mapping[str, int]
     last_kept: Times
-    """Those of the newest durable sample; zeros if there is none."""
+    """Times of the newest durable sample; zeros if there is none."""
     estimated: int = 0
-    """Of ``received``, those without numbers whose losses are estimated."""
+    """Messages in ``received`` without sequence numbers whose losses are estimated."""
     unknown: int = 0
-    """Of ``received``, those of which only that is known."""
+    """Messages in ``received`` whose losses are unknown."""
     missed: Mapping[str, int] = field(default_factory=dict)
-    """Estimated losses by cause; those that numbers tell are in the rows of the publishers."""
+    """Estimated losses by cause; those known from sequence numbers are in the publishers' rows."""
     first_ns: int = 0
-    """Stamp of a message from which on all are counted, the first by a clock that was set; 0 where it is not known."""
-    heard: Times = NO_TIMES
-    """Those of the newest message; zeros if they are unknown."""
+    """Stamp of the first message after which every message is counted, by a clock that was set; 0 if unknown."""
+    newest: Times = NO_TIMES
+    """Times of the newest message; zeros if unknown."""
     complete_ns: int = 0
     """No message up to this stamp can still be lost on its way into the spool."""
     by_arrival: Mapping[str, int] = field(default_factory=dict)
-    """Messages that were dated by their arrival, by the reason why their own time was not trusted."""
+    """Messages dated by their arrival, by the reason why their own time was not trusted."""
     corrected: Mapping[str, int] = field(default_factory=dict)
-    """Stored messages that had to be corrected, by what was wrong with them."""
+    """Stored messages that had to be corrected, by fault."""
     stamps: StampReport | None = None
-    """What was unusual about the stamps of its publishers in the end."""
+    """What was last unusual about the stamps of its publishers."""
 
     @property
     def open(self) -> int:
@@ -76,15 +76,15 @@ class TopicRow:
 
 @dataclass(frozen=True, slots=True)
 class RhythmRow:
-    """What is known of the rhythm of a topic without numbers (``estimator``), for the next session."""
+    """The rhythm of a topic without sequence numbers (``estimator``), for the next session."""
 
     topic: str
     publisher: str
-    """The gid of its only one; '' where there are several, or where that is not known."""
-    of: str
-    """What has the rhythm: ``stamps``, or ``counter:FIELD``."""
+    """The gid of its only publisher; '' if there are several or it is unknown."""
+    source: str
+    """What is regular: ``stamps``, or ``counter:FIELD``."""
     period: float
-    """ns, or counts; 0 where it is not known."""
+    """In ns, or in counts; 0 if unknown."""
     last: int
     """The newest stamp or count."""
 
@@ -97,7 +97,7 @@ class AccountSnapshot:
     publishers: tuple[PublisherRow, ...]
     other_types: tuple[OtherTypeRow, ...] = ()
     rhythms: tuple[RhythmRow, ...] = ()
-    gone: tuple[tuple[str, str], ...] = ()
-    """(account, publisher) whose rows of this session are in the sums of a row of their own now."""
+    removed: tuple[tuple[str, str], ...] = ()
+    """(account, publisher) pairs whose rows of this session have been added to the sum of former publishers."""
     gaps: tuple[GapRow, ...] = ()
     taken_back: tuple[TakenBack, ...] = ()

@@ -1,4 +1,4 @@
-"""Accounts: sessions, and what each of them counted by topic and publisher."""
+"""Sessions, and what each of them counted by topic and publisher."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class AccountTable(Table):
         return int(cursor.lastrowid or 0)
 
     def begin_after(self, session: int, number: int) -> None:
-        """Give the next session and the next object greater numbers than these."""
+        """Make the numbers of the next session and the next object larger than these."""
         for table, last in (('sessions', session), ('objects', number)):
             self._db.execute('INSERT INTO sqlite_sequence SELECT ?, 0 WHERE NOT EXISTS'
                              ' (SELECT 1 FROM sqlite_sequence WHERE name = ?)', (table, table))  # fmt: skip
@@ -38,18 +38,18 @@ class AccountTable(Table):
         self._db.execute('UPDATE sessions SET ended_ns = ? WHERE id = ?', (now_ns, session))
 
     def first_session(self) -> tuple[int, str] | None:
-        """(started_ns, boot_id): tells one index from another."""
+        """(started_ns, boot_id), which identifies an index."""
         found = self._db.execute('SELECT started_ns, boot_id FROM sessions ORDER BY id LIMIT 1').fetchone()
         return found and tuple(found)
 
     def last_session(self, robot: str, pid: int) -> tuple[int, int | None] | None:
-        """(started_ns, ended_ns) of a robot's last session, of this process where it has one."""
+        """(started_ns, ended_ns) of a robot's last session, preferably of the process ``pid``."""
         query = 'SELECT started_ns, ended_ns FROM sessions WHERE robot = ? ORDER BY pid = ? DESC, id DESC LIMIT 1'
         found = self._db.execute(query, (robot, pid)).fetchone()
         return found and tuple(found)
 
     def sessions_with_open(self, robot: str, sink: str) -> list[int]:
-        """A robot's ended sessions that left messages of a sink open."""
+        """A robot's ended sessions with open messages of a sink."""
         columns = 'SELECT session, received - skipped - stored, rejected, dropped FROM accounts JOIN sessions ON id = session'
         rows = self._db.execute(f'{columns} WHERE robot = ? AND ended_ns IS NOT NULL AND topic GLOB ?', (robot, f'{sink}*'))
         return sorted({
@@ -57,7 +57,7 @@ class AccountTable(Table):
         })  # fmt: skip
 
     def take_over(self, session: int, topic: str, received: int, estimated: int, unknown: int) -> None:
-        """These messages of an ended session are another one's to account for; so many of them estimated, or unknown."""
+        """Subtract messages from an ended session, because another session accounts for them now."""
         query = 'UPDATE accounts SET received = received - ? WHERE session = ? AND topic = ?'
         self._db.execute(query, (received, session, topic))
         query = 'UPDATE estimates SET estimated = estimated - ?, unknown = unknown - ? WHERE session = ? AND topic = ?'
@@ -70,15 +70,14 @@ class AccountTable(Table):
             ((session, row.topic, row.type, row.accounting, row.received, row.skipped, row.stored,
               _json(row.rejected), _json(row.dropped), _json(row.by_arrival), _json(row.corrected),
               _json(fields_of(row.stamps)), *row.last_kept,
-              row.first_ns, *row.heard, row.complete_ns) for row in snapshot.topics),
+              row.first_ns, *row.newest, row.complete_ns) for row in snapshot.topics),
         )  # fmt: skip
-        self._db.executemany(
-            'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?', ((session, *row) for row in snapshot.gone)
-        )
+        query = 'DELETE FROM publishers WHERE session = ? AND topic = ? AND publisher = ?'
+        self._db.executemany(query, ((session, *row) for row in snapshot.removed))
         self._db.executemany(
             'INSERT OR REPLACE INTO publishers VALUES (?,?,?,?,?,?,?,?,?,?)',
             ((session, row.topic, row.publisher, row.first, row.last, row.published, row.received, _json(row.missed),
-              *row.heard) for row in snapshot.publishers),
+              *row.last_times) for row in snapshot.publishers),
         )  # fmt: skip
         self._db.executemany(
             'INSERT OR REPLACE INTO estimates VALUES (?,?,?,?,?)',
@@ -87,7 +86,7 @@ class AccountTable(Table):
         )  # fmt: skip
         self._db.executemany(
             'INSERT OR REPLACE INTO rhythms VALUES (?,?,?,?,?)',
-            ((row.topic, row.publisher, row.of, row.period, row.last) for row in snapshot.rhythms),
+            ((row.topic, row.publisher, row.source, row.period, row.last) for row in snapshot.rhythms),
         )
         self._db.executemany(
             'INSERT OR REPLACE INTO other_types VALUES (?,?,?,?,?)',
@@ -100,48 +99,49 @@ class AccountTable(Table):
         return [row[0] for row in self._db.execute(f'SELECT id FROM sessions WHERE ended_ns IS {condition} ORDER BY id')]  # noqa: S608
 
     def topics(self, session: int | None = None, *, robot: str | None = None) -> list[TopicRow]:
-        """Accounts of one session, of those that a robot goes on with, or of all in the order of the sessions."""
+        """The accounts of one session, those that a robot's next session continues, or all; in the order of the sessions."""
         where, values = ('WHERE session = ?', (session,)) if session is not None else _continued_by(robot)
         columns = ('topic, type, accounting, received, skipped, stored, last_kept_ns, last_kept_received_ns, rejected, dropped,'
                    ' ifnull(estimated, 0),'
-                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, heard_ns, heard_received_ns, complete_ns, by_arrival,"
+                   " ifnull(unknown, 0), ifnull(missed, '{}'), first_ns, newest_ns, newest_received_ns, complete_ns, by_arrival,"
                    ' corrected, stamps')  # fmt: skip
         query = f'SELECT {columns} FROM accounts LEFT JOIN estimates USING (session, topic) {where} ORDER BY session'  # noqa: S608
         return [
             TopicRow(topic, kind, accounting, received, skipped, stored, json.loads(rejected), json.loads(dropped), Times(*kept),
-                     estimated, unknown, json.loads(missed), first_ns, Times(heard_ns, heard_received_ns), complete_ns,
+                     estimated, unknown, json.loads(missed), first_ns, Times(newest_ns, newest_received_ns), complete_ns,
                      json.loads(by_arrival), json.loads(corrected), _stamps(stamps))
             for topic, kind, accounting, received, skipped, stored, *kept, rejected, dropped, estimated, unknown, missed,
-            first_ns, heard_ns, heard_received_ns, complete_ns, by_arrival, corrected, stamps in self._db.execute(query, values)
+            first_ns, newest_ns, newest_received_ns, complete_ns, by_arrival, corrected, stamps
+            in self._db.execute(query, values)
         ]  # fmt: skip
 
     def publishers(self, *, robot: str | None = None) -> list[PublisherRow]:
-        """All spans, or those that a robot goes on with, in the order of the sessions.
+        """All publishers' rows, or those that a robot's next session continues; in the order of the sessions.
 
-        The last row of a publisher says where its numbers stand.
+        The last row of a publisher has its newest sequence number.
         """
         where, values = _continued_by(robot)
-        columns = 'topic, publisher, first, last, published, received, missed, heard_ns, heard_received_ns'
+        columns = 'topic, publisher, first, last, published, received, missed, last_ns, last_received_ns'
         rows = self._db.execute(f'SELECT {columns} FROM publishers {where} ORDER BY session', values)  # noqa: S608
         return [
-            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), Times(*heard))
-            for topic, publisher, first, last, published, received, missed, *heard in rows
+            PublisherRow(topic, publisher, first, last, published, received, json.loads(missed), Times(*times))
+            for topic, publisher, first, last, published, received, missed, *times in rows
         ]
 
     def other_types(self) -> list[OtherTypeRow]:
-        """Of all sessions, in their order."""
+        """The rows of all sessions, in the order of the sessions."""
         rows = self._db.execute('SELECT topic, type, publishers, messages FROM other_types ORDER BY session')
         return [OtherTypeRow(topic, kind, tuple(json.loads(nodes)), count) for topic, kind, nodes, count in rows]
 
     def rhythms(self) -> list[RhythmRow]:
-        """What is known of topics without numbers, one row each."""
-        return [RhythmRow(*row) for row in self._db.execute('SELECT topic, publisher, of, period, last FROM rhythms')]
+        """The rhythms of topics without sequence numbers, one row per topic."""
+        return [RhythmRow(*row) for row in self._db.execute('SELECT topic, publisher, source, period, last FROM rhythms')]
 
 
 def _continued_by(robot: str | None) -> tuple[str, tuple[str | int, ...]]:
-    """Which accounts a new session continues: those of the topics, and of bags and events those of its own robot.
+    """The condition for accounts that a robot's new session continues: those of all topics, and its own of bags and events.
 
-    ``bag record`` counts as a separate robot: next to a node, the same numbers are taken twice, and each loses others.
+    ``bag record`` counts as a separate robot: it takes the same numbers as a node that runs, and loses other messages.
     """
     if robot is None:
         return '', ()
@@ -149,11 +149,11 @@ def _continued_by(robot: str | None) -> tuple[str, tuple[str | int, ...]]:
 
 
 def _stamps(text: str) -> StampReport | None:
-    """None for a report of another shape: it is information, and no reason to refuse an account."""
+    """None for a report with other fields: it is informative, so it must not make an account unreadable."""
     found = json.loads(text)
     return StampReport(**found) if found.keys() == StampReport.__dataclass_fields__.keys() else None
 
 
 def _json(by_reason: Mapping[str, Any]) -> str:
-    """Nearly all are empty."""
+    """The JSON of counts by reason; nearly all are empty."""
     return json.dumps(by_reason) if by_reason else '{}'

@@ -1,7 +1,7 @@
-"""Gives rows to files that have none: those of a lost index, files that came back, and files that somebody copied into the spool.
+"""Adopts files that have no row: those of a lost index, files that reappeared, and files that an operator copied into the spool.
 
-What a file says of itself is believed only as far as it makes sense; a file that cannot be an object is set aside in
-``foreign/``, and nothing is ever deleted but the file of an object that had left the spool already.
+A file's description is used only where it is plausible. A file that cannot be an object is moved to ``foreign/``. Only files of
+objects that have left the spool are deleted.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from shadowhound_data_logger.core.keys import check_key, check_name
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.core.stamps import NO_TIMES
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
-from shadowhound_data_logger.spool.accounts import RECEIVED_ONLY
 from shadowhound_data_logger.spool.files import Tree, description_of
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.object_table import MISSING
+from shadowhound_data_logger.spool.topic_account import RECEIVED_ONLY
 
 log = logging.getLogger(__name__)
 
 GROUP_FILES: Final = 256
-"""Files adopted in one transaction: one at a time, 100,000 of them would take minutes of syncing."""
+"""Files adopted per transaction: one transaction each would take minutes for 100,000 files."""
 _IN_SPOOL: Final = frozenset({State.PENDING.value, State.HELD.value, State.QUARANTINED.value, State.KEPT.value})
-_LARGEST: Final = (1 << 63) - 1
+_MAX_INTEGER: Final = (1 << 63) - 1
 
 
 @dataclass(slots=True)
 class Recovery:
-    """Counts what recovery did, by word; all zero after a clean stop."""
+    """What recovery did: description -> count; all zero after a clean shutdown."""
 
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -59,7 +59,10 @@ class _Found(NamedTuple):
 
 
 class Adoption:
-    """Makes index and files agree after a crash, in one run over the tree: New; run once. The caller holds the recovery lock."""
+    """Adds missing rows to the index, in one pass over the tree.
+
+    Lifecycle: new; run once. The caller holds the recovery lock.
+    """
 
     def __init__(self, tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
         self._tree = tree
@@ -72,7 +75,7 @@ class Adoption:
 
     def run(self) -> None:
         for state, reason, bucket, key, path in self._tree.objects(self._in_place):
-            if not _can_be_named(bucket, key):
+            if not _is_valid_name(bucket, key):
                 self._foreign(path)
                 continue
             row = self._index.objects.row(bucket, key)
@@ -81,7 +84,7 @@ class Adoption:
             try:
                 size, sha256 = fingerprint(path)
             except FileNotFoundError:
-                continue  # another process has delivered it meanwhile
+                continue  # delivered by another process in the meantime
             except OSError as error:
                 log.warning('cannot read %s: %s', path, error)
                 self._report.counts['unreadable files left alone'] += 1
@@ -97,8 +100,8 @@ class Adoption:
         self._adopt()
 
     def _in_place(self, bucket: str, prefix: str) -> frozenset[str]:
-        """Keys of objects in the spool that begin so. A query a file would make a start with 100,000 of them take seconds."""
-        if not _can_be_named(bucket, f'{prefix}x'):
+        """Keys of objects in the spool with this prefix, in one query: one per file would take seconds for 100,000 files."""
+        if not _is_valid_name(bucket, f'{prefix}x'):
             return frozenset()
         return self._index.objects.keys_in_spool(bucket, prefix)
 
@@ -109,7 +112,7 @@ class Adoption:
         elif row['state'] in _IN_SPOOL:
             if path == ready or self._tree.place(path, ready):
                 with self._index.transaction():
-                    self._index.objects.set_found(row['id'])
+                    self._index.states.set_found(row['id'])
                 self._report.counts['missing files back'] += 1
         else:
             self._tree.remove(path)  # delivered, but the process died before it removed the file
@@ -120,7 +123,7 @@ class Adoption:
         self._report.counts['foreign files set aside'] += 1
 
     def _adopt(self) -> None:
-        """Make rows of the group, and the account of each topic whose only witnesses are its files."""
+        """Insert the rows of the group, and add its messages to the accounts of a session of recovered messages."""
         if not self._group:
             return
         with self._index.transaction():
@@ -128,9 +131,9 @@ class Adoption:
             for found in self._group:
                 item = found.item
                 if self._index.objects.has(item.bucket, item.key):
-                    self._foreign(found.path)  # the same key lies in two folders: the first one counts
+                    self._foreign(found.path)  # the same key was in two folders: the first one counts
                     continue
-                self._index.objects.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
+                self._index.states.insert(item, item.key, found.sha256, found.state, found.reason, item.metadata, self._now_ns)
                 for account, count in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():
                     self._topics[account] = _more(self._topics.get(account), account, count, item)
                 self._report.counts['files adopted'] += 1
@@ -140,18 +143,18 @@ class Adoption:
 
 
 def recorded_place(tree: Tree, part: Path) -> Path | None:
-    """Where a part belongs by its own description; None when its content is not what that says, or the place is taken."""
-    said = description_of(part)
-    bucket, key, held = _word(said, 'bucket', ''), _word(said, 'key', ''), _word(said, 'held', '')
-    if not _can_be_named(bucket, key) or fingerprint(part)[1] != said.get('sha256'):
+    """Where a part belongs according to its description; None if its content does not match it, or the place is taken."""
+    described = description_of(part)
+    bucket, key, held = _text(described, 'bucket', ''), _text(described, 'key', ''), _text(described, 'held', '')
+    if not _is_valid_name(bucket, key) or fingerprint(part)[1] != described.get('sha256'):
         return None
-    metadata = said.get('metadata')
+    metadata = described.get('metadata')
     is_kept = isinstance(metadata, dict) and metadata.get(words.SHIP) == words.ON_REQUEST
     place = tree.path(State.HELD if held else State.KEPT if is_kept else State.PENDING, held, bucket, key)
     return None if os.path.lexists(place) else place
 
 
-def _can_be_named(bucket: str, key: str) -> bool:
+def _is_valid_name(bucket: str, key: str) -> bool:
     try:
         check_name(bucket, 'the bucket')
         check_key(key)
@@ -161,43 +164,44 @@ def _can_be_named(bucket: str, key: str) -> bool:
 
 
 def _described(bucket: str, key: str, body: FileBody) -> DataObject | None:
-    """The object that a file says it is; None when its content is not what it says."""
-    said, sha256 = description_of(body.path), body.sha256
-    if _word(said, 'sha256', sha256) != sha256:
+    """The object that a file's description describes; None if its content does not match."""
+    described, sha256 = description_of(body.path), body.sha256
+    if _text(described, 'sha256', sha256) != sha256:
         return None
     changed_ns = body.path.stat().st_mtime_ns
-    metadata = said.get('metadata')
+    metadata = described.get('metadata')
     own = metadata.items() if isinstance(metadata, dict) else ()
     return DataObject(
-        bucket=bucket, key=key, body=body, content_type=_word(said, 'content_type', 'application/octet-stream'),
-        sensor=_word(said, 'sensor', 'unknown'), topic=_word(said, 'topic', '') or None, type=_word(said, 'type', ''),
-        samples=_number(said, 'samples', 0), t_start_ns=_number(said, 't_start_ns', changed_ns),
-        t_end_ns=_number(said, 't_end_ns', changed_ns), priority=min(_number(said, 'priority', 5), 9),
-        protected=said.get('protected') is True,
-        metadata={**{name: value for name, value in own if isinstance(value, str)}, words.SHA256: sha256}, counts=_counts(said),
+        bucket=bucket, key=key, body=body, content_type=_text(described, 'content_type', 'application/octet-stream'),
+        sensor=_text(described, 'sensor', 'unknown'), topic=_text(described, 'topic', '') or None,
+        type=_text(described, 'type', ''), samples=_number(described, 'samples', 0),
+        t_start_ns=_number(described, 't_start_ns', changed_ns), t_end_ns=_number(described, 't_end_ns', changed_ns),
+        priority=min(_number(described, 'priority', 5), 9), protected=described.get('protected') is True,
+        metadata={**{name: value for name, value in own if isinstance(value, str)}, words.SHA256: sha256},
+        counts=_counts(described),
     )  # fmt: skip
 
 
-def _word(said: dict[str, Any], name: str, default: str) -> str:
-    value = said.get(name)
+def _text(described: dict[str, Any], name: str, default: str) -> str:
+    value = described.get(name)
     return value if isinstance(value, str) and value.isprintable() else default
 
 
-def _number(said: dict[str, Any], name: str, default: int) -> int:
-    value = said.get(name)
-    return value if type(value) is int and 0 <= value <= _LARGEST else default
+def _number(described: dict[str, Any], name: str, default: int) -> int:
+    value = described.get(name)
+    return value if type(value) is int and 0 <= value <= _MAX_INTEGER else default
 
 
-def _counts(said: dict[str, Any]) -> dict[str, int]:
-    """By account; empty for an object of one topic."""
-    found = said.get('counts')
-    if not isinstance(found, dict) or _word(said, 'topic', ''):
+def _counts(described: dict[str, Any]) -> dict[str, int]:
+    """Messages by account; empty for an object of one topic."""
+    found = described.get('counts')
+    if not isinstance(found, dict) or _text(described, 'topic', ''):
         return {}
     return {name: _number(found, name, 0) for name in found if name and name.isprintable()}
 
 
 def _more(row: TopicRow | None, topic: str, samples: int, item: DataObject) -> TopicRow:
-    """The account with the samples of one more file."""
+    """The account with the samples of another file added."""
     count, newest = (row.stored, row.last_kept) if row else (0, NO_TIMES)
     count += samples
     return TopicRow(topic, item.type, RECEIVED_ONLY, count, 0, count, {}, {}, max(newest, item.last_times), unknown=count)

@@ -1,8 +1,8 @@
-"""Binding: gives held objects their final names; from then on they may be shipped, as may kept ones that are released.
+"""Makes held objects pending by binding them to their final names, and kept objects by releasing them.
 
-All of it is one step in the index. Before its transaction ends the files lie as ``incoming/<id>.part`` and describe themselves as
-what they become, so that a death leaves them where recovery looks for the file of any row: it puts back what was not
-committed, and gives its final name to what was.
+Each call is one transaction of the index. Until it is committed, the files are named ``incoming/<id>.part`` and carry their new
+description, so that after a crash recovery finds them: it moves a file back if the transaction was not committed, and to its
+final name if it was.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.object_table import MISSING, spooled
 
 _Row = Mapping[str, Any]
-"""As of ``Index.full_row``."""
+"""As ``ObjectTable.full_row`` returns it."""
 
 
 def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> list[SpooledObject]:
-    """Make what is still held pending under its final key. The caller holds the spool's lock.
+    """Make held objects pending under their final keys. The caller holds the spool's lock.
 
-    An object that is not held any more (evicted meanwhile, bound by another process) is left out.
-    Raises NameRefused for a key that cannot be one, OSError or sqlite3.OperationalError when nothing was bound.
+    Skips objects that are no longer held (evicted, or bound by another process).
+    Raises NameRefused for an invalid key, OSError or sqlite3.OperationalError if nothing was bound.
     """
     for binding in bindings:
         check_key(binding.key)
@@ -47,14 +47,14 @@ def bind(index: Index, tree: Tree, bindings: Sequence[Binding], now_ns: int) -> 
 
 
 def release(index: Index, tree: Tree, wanted: Sequence[tuple[int, int]]) -> list[SpooledObject]:
-    """Make what is still kept pending, with these priorities. As of ``bind``, which gives the reasons."""
+    """Make kept objects pending, given as (id, priority); otherwise as ``bind``."""
     before: list[_Row] = []
     with index.transaction(undo=lambda: _put_back(tree, before)):
         for number, priority in wanted:
             row = index.objects.full_row(number)
             if row is not None and row['state'] == State.KEPT.value and _to_part(tree, row):
                 before.append(row)
-                index.objects.release(number, priority)
+                index.states.release(number, priority)
                 renew(index, number, tree.part(number))
         if before:
             tree.sync_incoming()
@@ -62,27 +62,28 @@ def release(index: Index, tree: Tree, wanted: Sequence[tuple[int, int]]) -> list
 
 
 def _placed(index: Index, tree: Tree, before: Sequence[_Row]) -> list[SpooledObject]:
-    """It is durable: give the files their names; returns what may be shipped."""
+    """After the commit: give the files their final names. Returns the objects that may be shipped."""
     pending = []
     for row in (row for old in before if (row := index.objects.full_row(old['id'])) is not None):
         if row['state'] == State.KEPT.value:
             tree.place(tree.part(row['id']), tree.path(State.KEPT, None, row['bucket'], row['key']))
         elif row['state'] == State.PENDING.value:
-            pending.append(spooled(row, tree.waiting(row['id'], row['bucket'], row['key'])))
+            pending.append(spooled(row, tree.place_pending(row['id'], row['bucket'], row['key'])))
     return pending
 
 
 def renew(index: Index, number: int, path: Path) -> None:
-    """Have a file say what its row says now. A file that is gone says nothing; raises OSError when the disk fails."""
+    """Update a file's description from its row; ignores a missing file. Raises OSError if the disk fails."""
     row = index.objects.full_row(number)
     if row is not None:
         _describe(path, row)
 
 
 def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> str:
-    """The wanted key or the first of its ``_1``, ``_2``, ... that was never given out, or is the object's ``own``.
+    """The wanted key, or the first of its variants ``_1``, ``_2``, ... that was never used or is the object's ``own``.
 
-    They are given out in turn, so few are asked for: an agent whose frames all have one number must not hold up other writers.
+    Variants are used in order, so a binary search finds the first free one: many objects with the same wanted key must not
+    block other writers.
     """
 
     def is_free(attempt: int) -> bool:
@@ -100,7 +101,7 @@ def free_key(index: Index, bucket: str, wanted: str, own: str | None = None) -> 
 
 
 def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
-    """Whether this content was given the wanted key, or one of its ``_1``, ``_2``, ..., and its file is not missing."""
+    """Whether an object with this content has the wanted key or one of its variants, and its file is not missing."""
     attempt = 0
     while (row := index.objects.row(bucket, unique(wanted, attempt))) is not None:
         if row['sha256'] == sha256 and row['reason'] != MISSING:
@@ -110,7 +111,7 @@ def knows(index: Index, bucket: str, wanted: str, sha256: str) -> bool:
 
 
 def _to_part(tree: Tree, row: _Row) -> bool:
-    """Whether a held file does not lie under its provisional name any more. One that is gone is the uploader's to notice."""
+    """Move an object's file to its part; True also if the file is missing, which the uploader will report."""
     path = _own_path(tree, row)
     return tree.place(path, tree.part(row['id'])) or tree.size(path) is None
 
@@ -123,14 +124,14 @@ def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
     key = free_key(index, row['bucket'], binding.key, row['key'])
     metadata = {**binding.metadata, words.SHA256: row['sha256']}
     created_ns = row['created_ns']
-    if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set: for how long it waits is told from this
+    if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set; the waiting time is computed from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
     state = State.KEPT if metadata.get(words.SHIP) == words.ON_REQUEST else State.PENDING
-    index.objects.set_bound(row, key, binding, metadata, created_ns, state)
+    index.states.set_bound(row, key, binding, metadata, created_ns, state)
 
 
 def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
-    """After a failure, with the transaction still open. What fails here as well is found in its part."""
+    """After a failure, inside the transaction: move the files back. If that fails too, recovery finds them as parts."""
     for row in before:
         with suppress(OSError):
             _describe(tree.part(row['id']), row)
@@ -138,7 +139,7 @@ def _put_back(tree: Tree, before: Sequence[_Row]) -> None:
 
 
 def _describe(path: Path, row: _Row) -> None:
-    said: Mapping[str, object] = {
+    description: Mapping[str, object] = {
         'bucket': row['bucket'], 'key': row['key'], 'sha256': row['sha256'], 'content_type': row['content_type'],
         'sensor': row['sensor'], 'topic': row['topic'], 'type': row['type'], 'samples': row['samples'],
         't_start_ns': row['t_start_ns'], 't_end_ns': row['t_end_ns'], 'priority': row['priority'],
@@ -146,4 +147,4 @@ def _describe(path: Path, row: _Row) -> None:
         'metadata': json.loads(row['metadata']), **({'counts': row['counts']} if row['counts'] else {}),
     }  # fmt: skip
     with suppress(FileNotFoundError):
-        describe(path, said)
+        describe(path, description)

@@ -1,4 +1,4 @@
-"""What the catalog does not describe yet: delivered objects, changes of kept objects, and the statistics for their rows."""
+"""Objects that the catalog does not describe yet: delivered ones, changes of kept ones, and the statistics for their rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OF_SENSOR: Final = 'bucket = ? AND sensor = ? AND key >= ? AND key < ?'
 
 
 class UncatalogedObject(NamedTuple):
-    """An object as the store holds it; of a repeat its own times, and the key that holds its content."""
+    """An object as it is in the store; a repeat has its own times, and the key of the object that holds its content."""
 
     id: int
     bucket: str
@@ -24,22 +24,22 @@ class UncatalogedObject(NamedTuple):
     content_type: str
     metadata: Mapping[str, str]
     statistics: bytes = b''
-    """As its encoder packed them; empty if there are none."""
+    """As packed by its encoder; empty if there are none."""
 
 
 class CatalogTable(Table):
-    """Lists of objects for the catalog's next parts; an object leaves a list in the transaction that spools its part."""
+    """Lists of objects for the catalog's next parts. An object is removed from a list in the transaction that spools its part."""
 
     def __init__(self, connection: Callable[[], sqlite3.Connection], gaps: GapTable) -> None:
         super().__init__(connection)
         self._gaps = gaps
 
     def add_statistics(self, number: int, packed: bytes) -> None:
-        """Of a new object; an index that is rebuilt from the files has none."""
+        """Add the statistics of a new object; an index that was rebuilt from the files has none."""
         self._db.execute('INSERT INTO statistics VALUES (?,?)', (number, packed))
 
     def follow(self, ids: Iterable[int]) -> None:
-        """These objects are new, or have a new state."""
+        """Update the lists for objects that are new or have a new state."""
         rows = [(number,) for number in ids]
         self._db.executemany(
             "INSERT OR IGNORE INTO uncataloged SELECT id FROM objects WHERE id = ? AND state IN ('delivered', 'deduplicated')"
@@ -54,7 +54,7 @@ class CatalogTable(Table):
         )
 
     def uncataloged(self, limit: int) -> list[UncatalogedObject]:
-        """Delivered objects without a row in any part of the catalog, the oldest first."""
+        """Delivered objects without a row in any part of the catalog, oldest first."""
         rows = self._db.execute(
             'SELECT id, bucket, key, bytes, content_type, packed, metadata FROM uncataloged JOIN objects USING (id)'
             ' LEFT JOIN statistics USING (id) ORDER BY id LIMIT ?', (limit,),
@@ -64,7 +64,7 @@ class CatalogTable(Table):
                 for number, bucket, key, size, kind, packed, metadata in found]  # fmt: skip
 
     def take_uncataloged(self, ids: Collection[int]) -> bool:
-        """Take these off the list. False, and nothing is changed, if one was taken before."""
+        """Remove objects from the list; False, and nothing changes, if one is not on it."""
         if not ids:
             return True
         listed = {number for (number,) in self._db.execute('SELECT id FROM uncataloged')}
@@ -75,11 +75,11 @@ class CatalogTable(Table):
         return True
 
     def report(self, number: int, state: str) -> None:
-        """The table of kept objects must get this state of an object."""
+        """List a state of an object for the table of kept objects."""
         self._db.execute('INSERT INTO unreported VALUES (?, ?)', (number, state))
 
     def unreported(self, limit: int) -> list[tuple[str, str | None, UncatalogedObject]]:
-        """What the table of kept objects lacks: the change (``kept``, ``lost``, a step of thinning), its reason, the object."""
+        """Changes for the table of kept objects: (``kept``, ``lost`` or a step of thinning; reason; object)."""
         rows = self._db.execute(
             'SELECT unreported.state, reason, id, bucket, key, bytes, content_type, metadata FROM unreported'
             ' JOIN objects USING (id) ORDER BY id LIMIT ?', (limit,),
@@ -88,7 +88,7 @@ class CatalogTable(Table):
                 for state, reason, number, bucket, key, size, content_type, metadata in rows]  # fmt: skip
 
     def take_unreported(self, reported: Collection[tuple[int, str]]) -> bool:
-        """As ``take_uncataloged``, of rows of the table of kept objects."""
+        """As ``take_uncataloged``, for the changes of kept objects."""
         if not reported:
             return True
         query = 'SELECT count(*) FROM unreported WHERE id = ? AND state = ?'
@@ -98,7 +98,7 @@ class CatalogTable(Table):
         return True
 
     def clear(self) -> None:
-        """No part will describe what is delivered, kept or lost by now."""
+        """Empty all lists, because the catalog is off."""
         for table in ('uncataloged', 'statistics', 'unreported'):
             self._db.execute(f'DELETE FROM {table}')  # noqa: S608 - own constants only
         self._gaps.set_all_reported()
@@ -112,6 +112,6 @@ class CatalogTable(Table):
         return self._db.execute(query, values).fetchone() is not None
 
     def missing(self, bucket: str, prefix: str, *, sensor: str) -> frozenset[int]:
-        """Of the parts with this prefix, those whose files are gone."""
+        """Ids of the parts with this prefix whose files are missing."""
         query = f"SELECT id FROM objects WHERE state = 'quarantined' AND reason = 'missing' AND {_OF_SENSOR}"  # noqa: S608
         return frozenset(number for (number,) in self._db.execute(query, (bucket, sensor, prefix, after(prefix))))

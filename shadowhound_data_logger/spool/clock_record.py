@@ -1,6 +1,6 @@
-"""What is known of the clock beyond one process: ``spool/clock-<robot>.json``, with steps and the offsets of the last boots.
+"""What a robot's nodes recorded about its clock, in ``spool/clock-<robot>.json``: its steps, and the offsets of the last boots.
 
-It is not a promise: without the file the steps begin at 0 again, and what an earlier boot left goes without a date.
+It is best effort: without the file the steps start at 0 again, and objects that an earlier boot left are shipped without a date.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ log = logging.getLogger(__name__)
 
 BOOTS: Final = 8
 SLEWED_NS: Final = 100_000_000
-"""An offset is noted again once it has moved so far."""
+"""An offset is recorded again once it has changed by this much."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownClock:
-    """What is known of the wall clock of a robot."""
+    """What is known about a robot's wall clock."""
 
     is_set: bool | None = None
-    """None if no node has looked yet."""
+    """None if no node has checked yet."""
     steps: int = 0
     last_step_s: float | None = None
     last_step_time: str | None = None
     offsets: Mapping[str, int] = field(default_factory=dict)
-    """UTC minus the boot clock, ns, by boot id, of boots whose clock was set."""
+    """UTC minus the boot clock in ns, by boot id, for boots whose clock was set."""
 
 
 def file(spool: Path, robot: str) -> Path:
-    """Where the node of a robot keeps it."""
+    """The file of a robot's node."""
     return spool / f'clock-{robot}.json'
 
 
 def read(spool: Path, robot: str) -> KnownClock:
-    """The content of the file; nothing is known if it is missing or damaged."""
+    """The content of the file; all defaults if it is missing or damaged."""
     try:
         return parse(KnownClock, json.loads(file(spool, robot).read_bytes()))
     except (OSError, ValueError, RecursionError):
@@ -51,9 +51,9 @@ def read(spool: Path, robot: str) -> KnownClock:
 
 
 class ClockRecord:
-    """Keeps the clock's steps and offsets in a file.
+    """Records the clock's steps and offsets in a file.
 
-    New when the spool is open; one thread. A failed write is logged, and has no other effect.
+    Lifecycle: new when the spool is open; used by one thread. A failed write is logged and has no other effect.
     """
 
     def __init__(self, spool: Path, robot: str) -> None:
@@ -65,17 +65,17 @@ class ClockRecord:
         return self._known.steps
 
     def offsets(self) -> Mapping[str, int]:
-        """UTC minus the boot clock by boot id, of the boots whose clock was set; the others are missing."""
+        """UTC minus the boot clock in ns, by boot id; boots whose clock was never set are missing."""
         return self._known.offsets
 
     def knows(self, boot_id: str, offset_ns: int | None) -> bool:
-        """Whether there is nothing new in this offset."""
+        """Whether the offset is recorded, within ``SLEWED_NS``."""
         if offset_ns is None:
             return self._known.is_set is False
         return self._known.is_set is True and abs(offset_ns - self._known.offsets.get(boot_id, 0)) < SLEWED_NS
 
     def note(self, watch: ClockWatch) -> None:
-        """Keep what is known now."""
+        """Record the current state of the clock."""
         state, offset_ns, offsets = watch.state(), watch.offset_ns(), dict(self._known.offsets)
         if offset_ns is not None:
             offsets.pop(watch.boot_id, None)
@@ -90,4 +90,4 @@ class ClockRecord:
             with replacing(self._path, mode=0o600) as file:
                 file.write(dumps(known))
         except OSError as error:
-            log.warning('what is known of the clock cannot be kept: %s', error)
+            log.warning('cannot record the state of the clock: %s', error)

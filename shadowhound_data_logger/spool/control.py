@@ -1,9 +1,10 @@
-"""The client of a running node's control socket: where the socket is, and how to ask.
+"""The client of a running node's control socket.
 
-It is a Unix stream socket in the spool, for its owner alone (mode 0600). A request is a line of JSON, ``{"do": "flush"}``, and so
-is its answer: ``{"ok": true, "robot": "thor", ...}``, or ``{"ok": false, "robot": "thor", "error": "..."}``. One connection takes
-any number of them, one after the other. The node that starts first has ``control.sock``; another one that shares the spool with
-it has ``control-ROBOT.sock``. docs/architecture.md lists what can be asked.
+It is a Unix stream socket in the spool, accessible only to its owner (mode 0600). A request is a line of JSON, such as
+``{"do": "flush"}``, and so is its answer: ``{"ok": true, "robot": "thor", ...}``, or
+``{"ok": false, "robot": "thor", "error": "..."}``. A connection may send any number of requests, one after the other. The node
+that starts first has ``control.sock``; another one that shares the spool has ``control-ROBOT.sock``. docs/architecture.md lists
+the requests.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from shadowhound_data_logger.core.errors import NodeUnavailable
 
 NAME: Final = 'control.sock'
 MAX_REQUEST_BYTES: Final = 1 << 16
-"""Of a line that asks; the longest that the command line sends has some hundred."""
+"""Per request line; the longest one that the command line sends has a few hundred."""
 MAX_ANSWER_BYTES: Final = 1 << 24
-"""Of a line that answers; that with all parameters and their texts has some 60 KB."""
+"""Per answer line; the answer with all parameters and their descriptions has some 60 KB."""
 ANSWER_S: Final = 30.0
-"""Within which the node answers: a flush takes 5 s at most, and what was asked before it as long again."""
+"""Time limit for an answer: a flush takes up to 5 s, and earlier requests as long again."""
 PATIENCE_S: Final = ANSWER_S + 5.0
-"""For how long a client waits."""
+"""How long a client waits."""
 _START: Final = 'start one: ros2 run shadowhound_data_logger sensor_logger_node'
 
 
 def name_of(robot: str) -> str:
-    """Of the socket of a node that shares the spool with one that came first."""
+    """The name of the socket of a node that shares the spool with one that started first."""
     return f'control-{robot}.sock'
 
 
 @contextmanager
 def address(spool: Path, name: str) -> Iterator[str]:
-    """What a socket there can be bound and connected to by: unix(7) allows 107 bytes, and the path of a spool may be longer."""
+    """A short path to bind or connect the socket: unix(7) allows 107 bytes, and the path of a spool may be longer."""
     folder = os.open(spool, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f'/proc/self/fd/{folder}/{name}'
@@ -49,19 +50,19 @@ def address(spool: Path, name: str) -> Iterator[str]:
 class Connection:
     """A connection to a node's control socket.
 
-    Open from the start; ``ask`` any number of times, from one thread; close once.
+    Lifecycle: open when new; ``ask`` any number of times, from one thread; close once.
     """
 
     def __init__(self, spool: Path, name: str, deadline_s: float = PATIENCE_S) -> None:
-        """Raises OSError where nobody listens there, or where it is not for us."""
+        """Raises OSError if no node listens there, or this user may not connect."""
         self._path = spool / name
         self._deadline_s = deadline_s
         self._rest = b''
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         try:
             self._socket.settimeout(deadline_s)
-            with address(spool, name) as there:
-                self._socket.connect(there)
+            with address(spool, name) as path:
+                self._socket.connect(path)
         except BaseException:
             self._socket.close()
             raise
@@ -70,12 +71,12 @@ class Connection:
         self._socket.close()
 
     def ask(self, do: str, **arguments: Any) -> dict[str, Any]:
-        """The answer; ``ok`` says whether it was done. Raises NodeUnavailable when there is none, and is of no use after that."""
+        """The answer; ``ok`` is whether it was done. Raises NodeUnavailable without an answer; close the connection then."""
         try:
             self._socket.settimeout(self._deadline_s)
             self._socket.sendall(json.dumps({'do': do, **arguments}).encode() + b'\n')
         except (BrokenPipeError, ConnectionResetError):
-            pass  # refused, and why is there to be read
+            pass  # the node has refused the connection; its answer has the reason
         except OSError as error:
             raise self._lost(error) from error
         try:
@@ -83,17 +84,17 @@ class Connection:
         except (OSError, ValueError) as error:
             raise self._lost(error) from error
         if not isinstance(answer, dict) or 'ok' not in answer:
-            raise self._lost(ValueError('what it says is not an answer'))
+            raise self._lost(ValueError('its answer is invalid'))
         return answer
 
     def _line(self) -> bytes:
-        """The next one; raises OSError or ValueError."""
+        """The next line. Raises OSError or ValueError."""
         end_s = time.monotonic() + self._deadline_s
         while b'\n' not in self._rest:
             self._socket.settimeout(max(0.001, end_s - time.monotonic()))
             more = self._socket.recv(1 << 16)
             if not more:
-                raise ConnectionResetError('it ended')
+                raise ConnectionResetError('it closed the connection')
             self._rest += more
             if len(self._rest) > MAX_ANSWER_BYTES:
                 raise ValueError(f'its answer has more than {MAX_ANSWER_BYTES} bytes')
@@ -103,12 +104,12 @@ class Connection:
     def _lost(self, error: Exception) -> NodeUnavailable:
         if isinstance(error, TimeoutError):
             text = f'the node behind {self._path} did not answer within {self._deadline_s:g} s'
-            return NodeUnavailable(text, remedy='see what it does: shadowhound-data status')
+            return NodeUnavailable(text, remedy='check what it is doing: shadowhound-data status')
         return NodeUnavailable(f'the node behind {self._path} no longer answers: {error}')
 
 
 def connect(spool: Path, robot: str | None = None, deadline_s: float = PATIENCE_S) -> Connection:
-    """To the node of a robot; without a name to the only one that runs. Raises NodeUnavailable, which says which ones run."""
+    """Connect to a robot's node; without a name, to the only running one. Raises NodeUnavailable with the running ones."""
     with ExitStack() as others:
         found = {}
         for connection in _running(spool, deadline_s):
@@ -125,12 +126,12 @@ def connect(spool: Path, robot: str | None = None, deadline_s: float = PATIENCE_
 
 
 def _running(spool: Path, deadline_s: float) -> Iterator[Connection]:
-    """A connection to each node of the spool that runs."""
+    """A connection to each running node of the spool."""
     for path in sorted(spool.glob('control*.sock')):
         try:
             connection = Connection(spool, path.name, deadline_s)
         except PermissionError as error:
-            raise NodeUnavailable(f'{path} is not for this user', remedy='ask as the user of the node') from error
+            raise NodeUnavailable(f'this user may not use {path}', remedy='run this as the user of the node') from error
         except OSError:  # left behind by a node that was killed
             continue
         yield connection
@@ -138,10 +139,15 @@ def _running(spool: Path, deadline_s: float) -> Iterator[Connection]:
 
 def _none_chosen(spool: Path, robot: str | None, running: list[str]) -> NodeUnavailable:
     if robot and running:
-        return NodeUnavailable(f'no node of {robot} runs here; those that run: {", ".join(running)}', remedy='--robot NAME')
+        return NodeUnavailable(
+            f'no node of {robot} is running here, only those of {", ".join(running)}', remedy='name one: --robot NAME'
+        )
     if running:
-        return NodeUnavailable(f'several nodes run here: {", ".join(running)}', remedy='name one: --robot NAME')
+        return NodeUnavailable(f'several nodes are running here: {", ".join(running)}', remedy='name one: --robot NAME')
     if not os.access(spool, os.R_OK | os.X_OK) and spool.exists():
-        return NodeUnavailable(f'the spool {spool} is not for this user', remedy='ask as the user of the node')
+        return NodeUnavailable(f'this user may not use the spool {spool}', remedy='run this as the user of the node')
     whose = f' of {robot}' if robot else ''
-    return NodeUnavailable(f'no node{whose} runs with the spool {spool}', remedy=f'{_START}; SHADOWHOUND_HOME names its folder')
+    return NodeUnavailable(
+        f'no node{whose} is running with the spool {spool}',
+        remedy=f'{_START}; or set SHADOWHOUND_HOME to the folder of its spool',
+    )

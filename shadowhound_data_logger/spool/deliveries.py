@@ -1,8 +1,8 @@
-"""What the index calls delivered, for an audit that may be interrupted.
+"""The delivered objects of an index, for an audit that may be interrupted.
 
-It reads the index as any viewer does, also while a node delivers. What was found sound is remembered in ``verify.db`` beside
-it, by number, so that the next run asks for the rest and for what was delivered meanwhile; after a run that came to its end
-the file is gone. One audit at a time: SQLite's own lock on that file sees to it.
+It only reads the index, so a node may deliver at the same time. Ids of objects that were verified are remembered in
+``verify.db``, next to the index, so the next run checks the rest and newer deliveries; a run that finishes removes the file.
+SQLite's lock on that file ensures that only one audit runs at a time.
 """
 
 from __future__ import annotations
@@ -19,132 +19,133 @@ from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.spool.index import Index
 
 PAGE: Final = 256
-"""Objects asked for between two notes of what was sound: what an interruption costs."""
+"""Objects read at a time: an interruption loses at most the results of so many."""
 BUSY_TIMEOUT_S: Final = 1.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS audit (name TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS sound (id INTEGER PRIMARY KEY);
+CREATE TABLE IF NOT EXISTS verified (id INTEGER PRIMARY KEY);
 """
 
 _Answer = TypeVar('_Answer')
 
 
 class Deliveries:
-    """What the store confirmed, for an audit, and how far the audit came.
+    """The deliveries that the store confirmed, and the progress of an audit.
 
-    Life: New; open once; use from one thread; close once. Errors are SpoolError, naming the file and what to do.
+    Lifecycle: new; open once; use from one thread; close once. Raises SpoolError, which names the file and what to do.
     """
 
     def __init__(self, spool: Path) -> None:
         self._index_path = spool / 'index.db'
         self._index = Index(self._index_path, read_only=True)
-        self._notes = spool / 'verify.db'
+        self._progress = spool / 'verify.db'
         self._connection: sqlite3.Connection | None = None
 
     def open(self, audit: str, *, again: bool = False) -> None:
-        """``audit`` says what is asked of whom: what is noted of another one, or of another index, is forgotten.
+        """``audit`` identifies the audit and its store: progress of another audit or another index is discarded.
 
-        ``again`` forgets an interrupted run in any case.
+        ``again`` discards the progress of an interrupted run.
         """
         if not self._index_path.is_file():
             raise SpoolError(f'there is no spool in {self._index_path.parent}',
-                             remedy='has the node run here? SHADOWHOUND_HOME names its folder')  # fmt: skip
+                             remedy='has the node run here? set SHADOWHOUND_HOME to its folder')  # fmt: skip
         if again:
-            self._notes.unlink(missing_ok=True)
-        with self._telling():
+            self._progress.unlink(missing_ok=True)
+        with self._translating():
             self._index.open()
             connection = self._connection = sqlite3.connect(
-                self._notes.absolute().as_uri(), uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)  # fmt: skip
+                self._progress.absolute().as_uri(), uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)  # fmt: skip
             connection.execute('PRAGMA locking_mode = EXCLUSIVE')
             connection.execute('PRAGMA synchronous = NORMAL')
             connection.executescript(_SCHEMA)
             name = f'{audit} {self._index.accounts.first_session()}'
             if connection.execute('SELECT name FROM audit').fetchall() != [(name,)]:
-                connection.executescript('BEGIN; DELETE FROM audit; DELETE FROM sound; COMMIT')
+                connection.executescript('BEGIN; DELETE FROM audit; DELETE FROM verified; COMMIT')
                 connection.execute('INSERT INTO audit VALUES (?)', (name,))
 
     def close(self) -> None:
-        """What is noted stays for the next run."""
+        """Close, keeping the progress for the next run."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
         self._index.close()
 
     def finish(self) -> None:
-        """The audit came to its end: the next one starts again."""
+        """Close and remove the progress of a finished audit: the next one starts again."""
         self.close()
-        self._notes.unlink(missing_ok=True)
+        self._progress.unlink(missing_ok=True)
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
-        """What is delivered and not noted yet, as the store has to describe it: at first what has a full row, by number.
+        """Delivered objects that are not verified yet, as the store must describe them: first those with full rows, by id.
 
-        A row that becomes a short one meanwhile is asked for once.
+        An object whose row is shortened during the run is returned only once.
         """
         last = 0
-        asked: set[int] = set()
-        while page := self._of_index(partial(self._index.history.delivered, last, PAGE)):
+        returned: set[int] = set()
+        while page := self._read(partial(self._index.history.delivered, last, PAGE)):
             last = page[-1][0]
-            asked.update(number for number, _ in page)
-            yield from self._not_noted(page)
+            returned.update(number for number, _ in page)
+            yield from self._unverified(page)
         place = (0, '')
         while True:
-            page, place = self._of_index(partial(self._index.history.delivered_compact, place, PAGE))
+            page, place = self._read(partial(self._index.history.delivered_compact, place, PAGE))
             if not page:
                 return
-            yield from self._not_noted([(number, item) for number, item in page if number not in asked])
+            yield from self._unverified([(number, item) for number, item in page if number not in returned])
 
-    def _not_noted(self, page: list[tuple[int, ObjectInfo]]) -> Iterator[list[tuple[int, ObjectInfo]]]:
-        noted = {number for number, _ in page if self._ask('SELECT 1 FROM sound WHERE id = ?', number)}
-        if left := [(number, item) for number, item in page if number not in noted]:
+    def _unverified(self, page: list[tuple[int, ObjectInfo]]) -> Iterator[list[tuple[int, ObjectInfo]]]:
+        verified = {number for number, _ in page if self._query('SELECT 1 FROM verified WHERE id = ?', number)}
+        if left := [(number, item) for number, item in page if number not in verified]:
             yield left
 
-    def note(self, ids: Iterable[int]) -> None:
-        """These are sound."""
-        with self._telling():
+    def set_verified(self, ids: Iterable[int]) -> None:
+        """Remember that these objects were verified."""
+        with self._translating():
             self._db.execute('BEGIN')
-            self._db.executemany('INSERT OR IGNORE INTO sound VALUES (?)', ((number,) for number in ids))
+            self._db.executemany('INSERT OR IGNORE INTO verified VALUES (?)', ((number,) for number in ids))
             self._db.execute('COMMIT')
 
-    def noted(self) -> int:
-        """How many were found sound so far, in this run and in those that it goes on from."""
-        return int(self._ask('SELECT count(*) FROM sound')[0][0])
+    def verified(self) -> int:
+        """How many objects were verified so far, in this run and in the runs that it continues."""
+        return int(self._query('SELECT count(*) FROM verified')[0][0])
 
     def known(self) -> int:
-        """Delivered objects that the index remembers; those of longer ago are forgotten (``spool.remember_days``)."""
-        return self._of_index(self._index.history.delivered_count)
+        """Delivered objects that the index remembers; it forgets them after ``spool.remember_days``."""
+        return self._read(self._index.history.delivered_count)
 
     def forgotten(self) -> int:
-        """Delivered objects of longer ago, which the index counts but cannot name any more; parts of the catalog among them."""
-        return self._of_index(self._index.history.forgotten_count)
+        """Earlier deliveries, which the index counts but can no longer name; including parts of the catalog."""
+        return self._read(self._index.history.forgotten_count)
 
     def since_ns(self) -> int | None:
-        """When the first of those that the index remembers was delivered; None without any."""
-        return self._of_index(self._index.history.delivered_since_ns)
+        """When the first remembered object was delivered; None if there is none."""
+        return self._read(self._index.history.delivered_since_ns)
 
     @property
     def _db(self) -> sqlite3.Connection:
         if self._connection is None:
-            raise SpoolError('the deliveries are not open')
+            raise SpoolError('the progress of the audit is not open')
         return self._connection
 
-    def _ask(self, query: str, *values: object) -> list[tuple[Any, ...]]:
-        with self._telling():
+    def _query(self, query: str, *values: object) -> list[tuple[Any, ...]]:
+        with self._translating():
             return self._db.execute(query, values).fetchall()
 
-    def _of_index(self, question: Callable[[], _Answer]) -> _Answer:
-        with self._telling():
-            return question()
+    def _read(self, read: Callable[[], _Answer]) -> _Answer:
+        with self._translating():
+            return read()
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _translating(self) -> Iterator[None]:
+        """Close and raise SpoolError after an SQLite error."""
         try:
             yield
         except sqlite3.Error as error:
             self.close()
             busy = 'locked' in str(error)
             raise SpoolError(
-                f'{self._index_path} and {self._notes} cannot be used: {error}',
-                remedy='does another --verify run?'
+                f'{self._index_path} and {self._progress} cannot be used: {error}',
+                remedy='is another --verify running?'
                 if busy
-                else 'is the folder yours to write? --again starts from the beginning',
+                else 'may this user write to the folder? --again starts from the beginning',
             ) from error

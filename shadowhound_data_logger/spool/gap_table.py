@@ -1,4 +1,4 @@
-"""The table of the gap journal (gaps.py): every statement that reads or writes it, except the triggers in schema.sql."""
+"""The table of the gap journal (gaps.py): all statements that read or write it, except the triggers in schema.sql."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.spool.gaps import FORGOTTEN, LATELY_NS, OBJECTS, UNTIMED, Gap, GapRow, TakenBack, Watermark, split
 from shadowhound_data_logger.spool.table import Table
 
-MOST_WAITING: Final = 5_000
-"""Objects of a bucket that are looked at for the first stamp of each account: some 20 ms."""
+MAX_SCANNED: Final = 5_000
+"""Objects of a bucket that are read to find the first stamp of each account: some 20 ms."""
 _SESSIONS: Final = """
 SELECT session, robot, started_ns, received = skipped + stored
     + ifnull((SELECT sum(value) FROM json_each(rejected)), 0) + ifnull((SELECT sum(value) FROM json_each(dropped)), 0)
     AND ifnull(json_extract(dropped, '$.restart'), 0) = 0,
-  topic, accounting, received, skipped, first_ns, heard_ns, heard_received_ns, complete_ns,
+  topic, accounting, received, skipped, first_ns, newest_ns, newest_received_ns, complete_ns,
   ended_ns IS NOT NULL
 FROM accounts JOIN sessions ON id = session
 WHERE session > (SELECT max(id) FROM sessions) - 20 AND first_ns >= ? AND accounting IN ('exact', 'estimated')
@@ -30,25 +30,25 @@ MERGE: Final = """
       ELSE excluded.received_from_ns END,
     received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END"""
 """What an INSERT does if the row exists; the triggers of schema.sql do the same."""
-MOST_ROWS: Final = 500_000
-"""Of the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
-_TOLD: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_reported) ELSE ifnull((
-    SELECT told.version FROM gaps_reported AS told JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
-"""Whether the store is told of a row; those of objects have no session."""
+MAX_ROWS: Final = 500_000
+"""Rows in the journal, some 100 MB: three days of a topic that loses messages in every second are 259,200."""
+_REPORTED: Final = """version <= CASE session WHEN 0 THEN (SELECT ifnull(max(version), 0) FROM gaps_reported) ELSE ifnull((
+    SELECT known.version FROM gaps_reported AS known JOIN sessions USING (robot) WHERE sessions.id = gaps.session), 0) END"""
+"""Whether a row has been reported to the store; rows of objects have no session."""
 _WHOLE_ROW: Final = f"""
-SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns, {_TOLD} FROM gaps"""  # noqa: S608
+SELECT session, topic, kind, cause, grade, publisher, mission, begin_ns, count, merged, to_ns, {_REPORTED} FROM gaps"""  # noqa: S608
 _FORGETTABLE: Final = f"""{_WHOLE_ROW} WHERE begin_ns BETWEEN ? AND ? AND ifnull(to_ns, begin_ns) <= ?
-  AND kind <> 'quarantined' AND {_TOLD}"""
+  AND kind <> 'quarantined' AND {_REPORTED}"""
 _OF_OLD_SESSIONS: Final = f"""{_WHOLE_ROW} WHERE (begin_ns BETWEEN {UNTIMED} AND ? - 1 OR begin_ns > ?)
-  AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_TOLD}"""  # noqa: S608 - own constants only
+  AND session BETWEEN 1 AND (SELECT ifnull(max(id), 0) FROM sessions WHERE ended_ns BETWEEN ? AND ?) AND {_REPORTED}"""  # noqa: S608 - own constants only
 _LONGEST_UNCHANGED: Final = f"{_WHOLE_ROW} WHERE begin_ns <> {FORGOTTEN} AND kind <> 'quarantined' ORDER BY version"
-_SUM_OF_TOLD, _SUM_OF_UNTOLD = 1, 0
-"""In ``from_ns`` of a sum: whether all rows in it have been reported to the store."""
+_SUM_OF_REPORTED, _SUM_OF_UNREPORTED = 1, 0
+"""In ``from_ns`` of a sum: whether all of its rows had been reported to the store."""
 _FORGOTTEN_UNTIL: Final = f"""
 SELECT session, topic, max(ifnull(to_ns, (SELECT max(started_ns) FROM sessions)))
-FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNTOLD}) = {_SUM_OF_UNTOLD}
+FROM gaps WHERE begin_ns = {FORGOTTEN} AND (ifnull(from_ns, {_SUM_OF_UNREPORTED}) = {_SUM_OF_UNREPORTED}
   OR EXISTS (SELECT 1 FROM gaps_reported WHERE again)) GROUP BY session, topic"""  # noqa: S608
-"""When the last forgotten gap ended that may be missing in the store; if that is unknown, when the newest session began."""
+"""The end of the last forgotten gap that the store may not have; if unknown, the start of the newest session."""
 _NAMED: Final = 'session = ? AND topic = ? AND kind = ? AND cause = ? AND grade = ?'
 
 
@@ -56,7 +56,7 @@ class GapTable(Table):
     """The table of the gap journal."""
 
     def write(self, session: int, rows: Iterable[GapRow], taken_back: Iterable[TakenBack]) -> None:
-        """Change the journal, in the transaction that writes the accounts."""
+        """Apply the changes of one commit, in the transaction that writes the accounts."""
         less: list[TakenBack] = []
         for row in rows:
             key = row.key
@@ -95,35 +95,36 @@ class GapTable(Table):
             rest -= part
 
     def forget(self, before_ns: int, limit: int) -> bool:
-        """Drop rows of what was over before then; False when there may be more of them. In a transaction.
+        """Delete rows of gaps that ended before then; False if there may be more of them. Call it in a transaction.
 
-        Their sums stay, with the end of the last of them, for what is told again (``watermarks``).
+        Their sums are kept, with the end of the last of them, for the watermarks.
 
-        A row stays until a part of the spool tells it. Rows without a time, of before the clock was set or of a time to come go
-        when their session has ended so long ago. Beyond ``MOST_ROWS`` those go that did not change for the longest. Rows of
-        quarantined objects stay.
+        A row is kept until an object of the spool reports it. Rows without a time, from before the clock was set or in the future
+        are deleted once their session ended before then. Beyond ``MAX_ROWS``, the rows that have been unchanged for longest are
+        deleted. Rows of quarantined objects are kept.
         """
         old = self._db.execute(f'{_FORGETTABLE} LIMIT ?', (EARLIEST_SANE_NS, before_ns, before_ns, limit)).fetchall()
         if len(old) < limit:
             times = EARLIEST_SANE_NS, before_ns, EARLIEST_SANE_NS, before_ns
             old += self._db.execute(f'{_OF_OLD_SESSIONS} LIMIT ?', (*times, limit)).fetchall()
-        over = self._db.execute('SELECT count(*) FROM gaps').fetchone()[0] - MOST_ROWS - len(old)
+        over = self._db.execute('SELECT count(*) FROM gaps').fetchone()[0] - MAX_ROWS - len(old)
         if over > 0:
             old = list(dict.fromkeys(old + self._db.execute(f'{_LONGEST_UNCHANGED} LIMIT ?', (min(over, limit),)).fetchall()))
         sums = Counter[tuple[Any, ...]]()
         merged = Counter[tuple[Any, ...]]()
         ends: dict[tuple[Any, ...], int | None] = {}
-        told: dict[tuple[Any, ...], int] = {}
+        reported: dict[tuple[Any, ...], int] = {}
         for row in old:
             sums[row[:5]] += row[8]
             merged[row[:5]] += row[9]
             end_ns, last_ns = row[10], ends.get(row[:5], 0)
             is_known = end_ns is not None and end_ns >= EARLIEST_SANE_NS and last_ns is not None
             ends[row[:5]] = max(end_ns, last_ns) if is_known else None
-            told[row[:5]] = min(told.get(row[:5], _SUM_OF_TOLD), _SUM_OF_TOLD if row[11] else _SUM_OF_UNTOLD)
+            is_reported = _SUM_OF_REPORTED if row[11] else _SUM_OF_UNREPORTED
+            reported[row[:5]] = min(reported.get(row[:5], _SUM_OF_REPORTED), is_reported)
         self._db.executemany(
             f"INSERT INTO gaps VALUES (?,?,?,?,?,'','',{FORGOTTEN},?,?,NULL,NULL,?,?,{NEXT_VERSION}) {MERGE}",  # noqa: S608
-            ((*what, told[what], ends[what], count, merged[what]) for what, count in sums.items()),
+            ((*what, reported[what], ends[what], count, merged[what]) for what, count in sums.items()),
         )
         self._db.executemany(
             f'DELETE FROM gaps WHERE {_NAMED} AND publisher = ? AND mission = ? AND begin_ns = ?',  # noqa: S608
@@ -131,29 +132,29 @@ class GapTable(Table):
         )
         return len(old) < limit
 
-    def told(self, robot: str) -> tuple[int, int]:
-        """Up to which version the parts of a robot tell all, and how often it was asked to tell all of it again."""
+    def reported(self, robot: str) -> tuple[int, int]:
+        """The version up to which a robot has reported all rows, and how often an operator requested that it resend them."""
         found = self._db.execute('SELECT version, again FROM gaps_reported WHERE robot = ?', (robot,)).fetchone()
         return (found[0], found[1]) if found else (0, 0)
 
     def set_reported(self, robot: str, version: int) -> None:
-        """In the transaction that spools the last part of those that tell it."""
+        """Record this, in the transaction that spools the last object that reports the version."""
         query = 'INSERT INTO gaps_reported VALUES (?, ?, 0) ON CONFLICT DO UPDATE SET version = excluded.version'
         self._db.execute(query, (robot, version))
 
     def set_all_reported(self) -> None:
-        """Nobody will tell what is there by now."""
+        """Record all current rows as reported, because the catalog is off."""
         self._db.execute('UPDATE gaps_reported SET version = (SELECT ifnull(max(version), 0) FROM gaps)')
 
     def resend(self) -> int:
-        """Have all robots of this spool tell the store all that is remembered; returns how many rows that is."""
+        """Make all robots of this spool report every remembered row again; returns how many rows that is."""
         self._db.execute('UPDATE gaps_reported SET version = 0, again = again + 1')
         return int(self._db.execute('SELECT count(*) FROM gaps WHERE begin_ns <> ?', (FORGOTTEN,)).fetchone()[0])
 
     def changed(self, after: int, limit: int, offsets: Mapping[str, int]) -> list[Gap]:
-        """The rows whose versions are greater, by version: about ``limit``, and all of the last version.
+        """Rows with versions after this, by version: about ``limit``, with all rows of the last version.
 
-        ``offsets`` are UTC less boot clock by boot (``ClockRecord.offsets``). Sums of what was forgotten are left out.
+        ``offsets`` are UTC minus the boot clock by boot id (``ClockRecord.offsets``). Sums of forgotten rows are omitted.
         """
         query = 'SELECT version FROM gaps WHERE version > ? ORDER BY version LIMIT 1 OFFSET ?'
         last = self._db.execute(query, (after, limit - 1)).fetchone()
@@ -163,7 +164,7 @@ class GapTable(Table):
         )
 
     def extent(self, robot: str) -> tuple[int, int, set[str]]:
-        """The newest version; when the journal began; and topics that other robots of this spool have, and this one has not."""
+        """The newest version; when the journal began; and the topics of this spool's other robots that this one does not have."""
         newest = self._db.execute('SELECT ifnull(max(version), 0) FROM gaps').fetchone()[0]
         began_ns = self._db.execute('SELECT ifnull(min(started_ns), 0) FROM sessions').fetchone()[0]
         topics: dict[bool, set[str]] = {True: set(), False: set()}
@@ -174,86 +175,86 @@ class GapTable(Table):
         return newest, began_ns, topics[False] - topics[True]
 
     def has_undated(self) -> bool:
-        """Whether there are rows of a time before the clock was set."""
+        """Whether there are rows from before the clock was set."""
         return (
             self._db.execute('SELECT 1 FROM gaps WHERE begin_ns BETWEEN 0 AND ? LIMIT 1', (EARLIEST_SANE_NS,)).fetchone()
             is not None
         )
 
     def known(self, offsets: Mapping[str, int]) -> list[Gap]:
-        """All that is lost, in the order of time; what has no time comes first."""
+        """All losses by time; those without a time come first."""
         return list(self._gaps('count > 0 ORDER BY begin_ns, topic', (), offsets))
 
     def watermarks(self) -> list[Watermark]:
-        """Of each sink and topic of the newest sessions that has one.
+        """The watermarks of the sinks and topics of the newest sessions that have one.
 
-        Before the first message that still waits for delivery, since that may yet be evicted; and before the last message of each
-        publisher that was heard lately, since what it sent after that may be found to be missed. None begins before the end of
-        what was forgotten and the store was never told; nor, once a robot of the spool was asked to tell all again, before
-        the end of anything that was forgotten: the store may have lost that.
+        A watermark ends before the first message that still waits for delivery, because it may yet be evicted, and at the last
+        message of each recent publisher, because later messages may turn out to be missed. It starts after the last forgotten
+        gap that was never reported to the store; once an operator has requested that the journal be resent, after the last
+        forgotten gap of any kind, because the store may have lost it.
         """
-        waiting = self._waiting()
+        unsent = self._first_unsent()
         forgotten = {(session, account): stamp for session, account, stamp in self._db.execute(_FORGOTTEN_UNTIL)}
         silent = {
             (session, account): stamp
             for session, account, stamp in self._db.execute(
-                'SELECT session, topic, min(publishers.heard_ns) FROM publishers JOIN accounts USING (session, topic)'
-                ' JOIN sessions ON id = session WHERE ended_ns IS NULL AND publishers.heard_ns > accounts.heard_ns - ?'
+                'SELECT session, topic, min(publishers.last_ns) FROM publishers JOIN accounts USING (session, topic)'
+                ' JOIN sessions ON id = session WHERE ended_ns IS NULL AND publishers.last_ns > accounts.newest_ns - ?'
                 ' GROUP BY session, topic', (LATELY_NS,),
             )
         }  # fmt: skip
         found = []
-        for (session, robot, started_ns, is_over, account, grade, received, skipped, first_ns, heard_ns, heard_received_ns,
+        for (session, robot, started_ns, is_settled, account, grade, received, skipped, first_ns, newest_ns, newest_received_ns,
              complete_ns, has_ended) in self._db.execute(_SESSIONS, (EARLIEST_SANE_NS,)):  # fmt: skip
             sink, topic = split(account)
-            if has_ended and sink == OBJECTS and is_over:
-                complete_ns = heard_ns  # noqa: PLW2901 - nothing was lost on its way after all
-            late_ns = heard_received_ns - heard_ns if heard_received_ns else 0
-            end_ns = min(complete_ns, silent.get((session, account), complete_ns), waiting.get(account, complete_ns))
+            if has_ended and sink == OBJECTS and is_settled:
+                complete_ns = newest_ns  # noqa: PLW2901 - no message was lost on its way into the spool
+            late_ns = newest_received_ns - newest_ns if newest_received_ns else 0
+            end_ns = min(complete_ns, silent.get((session, account), complete_ns), unsent.get(account, complete_ns))
             since_ns = max(first_ns, started_ns - late_ns, forgotten.get((session, account), 0), forgotten.get((0, account), 0))
             if since_ns <= end_ns:
-                arrived_ns = min(end_ns + late_ns, heard_received_ns) or None
+                arrived_ns = min(end_ns + late_ns, newest_received_ns) or None
                 found.append(Watermark(
                     robot, sink, topic, session, since_ns, end_ns, arrived_ns and since_ns + late_ns, arrived_ns, grade, received,
                     skipped,
                 ))  # fmt: skip
         return found
 
-    def _waiting(self) -> dict[str, int]:
-        """Account -> the first stamp of what waits for delivery or a name; 0 where so much waits that nobody looks for it."""
-        waiting: dict[str, int] = {}
+    def _first_unsent(self) -> dict[str, int]:
+        """Account -> the first stamp of its objects that are pending, held or kept; 0 if there are too many to look."""
+        unsent: dict[str, int] = {}
         is_all = True
         for state, column, order in (('pending', 'bucket', 'waiting'), ('held', 'reason', 'held')):
             for value in self._values(state, column):
                 rows = self._db.execute(
                     'SELECT ifnull(contents.topic, one.topic), min(t_start_ns), count(*) FROM (SELECT id, topic, t_start_ns'  # noqa: S608
-                    f" FROM objects INDEXED BY {order} WHERE state = '{state}' AND {column} = ? ORDER BY id LIMIT {MOST_WAITING})"
+                    f" FROM objects INDEXED BY {order} WHERE state = '{state}' AND {column} = ? ORDER BY id LIMIT {MAX_SCANNED})"
                     ' AS one LEFT JOIN contents USING (id) GROUP BY 1', (value,),
                 ).fetchall()  # fmt: skip
-                is_all &= sum(count for _, _, count in rows) < MOST_WAITING
+                is_all &= sum(count for _, _, count in rows) < MAX_SCANNED
                 for account, stamp, _ in rows:
-                    waiting[account] = min(stamp, waiting.get(account, stamp))
+                    unsent[account] = min(stamp, unsent.get(account, stamp))
         if not is_all:
             query = "SELECT topic FROM tally WHERE state IN ('pending', 'held') AND samples > 0"
             for (account,) in self._db.execute(query):
-                waiting.setdefault(account, 0)
-        for account, stamp in self._kept():
-            waiting[account] = min(stamp, waiting.get(account, stamp))
-        return waiting
+                unsent.setdefault(account, 0)
+        for account, stamp in self._first_kept():
+            unsent[account] = min(stamp, unsent.get(account, stamp))
+        return unsent
 
-    def _kept(self) -> Iterator[tuple[str, int]]:
-        """Account -> about the first stamp of what is kept here: of that, nothing is in the store."""
-        there = [account for (account,) in self._db.execute("SELECT topic FROM tally WHERE state = 'kept' AND samples > 0")]
-        if not there:
+    def _first_kept(self) -> Iterator[tuple[str, int]]:
+        """Account -> about the first stamp of its kept objects; 0 if there are too many to look."""
+        accounts = [account for (account,) in self._db.execute("SELECT topic FROM tally WHERE state = 'kept' AND samples > 0")]
+        if not accounts:
             return
         oldest = dict(self._db.execute(
             'SELECT ifnull(contents.topic, one.topic), min(t_start_ns) FROM (SELECT id, topic, t_start_ns FROM objects'  # noqa: S608
-            f" INDEXED BY kept WHERE state = 'kept' ORDER BY id LIMIT {MOST_WAITING})"
+            f" INDEXED BY kept WHERE state = 'kept' ORDER BY id LIMIT {MAX_SCANNED})"
             ' AS one LEFT JOIN contents USING (id) GROUP BY 1').fetchall())  # fmt: skip
-        yield from ((account, oldest.get(account, 0)) for account in there)
+        yield from ((account, oldest.get(account, 0)) for account in accounts)
 
     def _values(self, state: str, column: str) -> Iterator[str]:
-        """Those that a column of objects in a state has, by one step in the index for each."""
+        """The distinct values of a column of objects in a state, by one index lookup each."""
         query = f"SELECT {column} FROM objects WHERE state = '{state}' AND {column} > ? ORDER BY {column} LIMIT 1"  # noqa: S608
         value = ''
         while row := self._db.execute(query, (value,)).fetchone():

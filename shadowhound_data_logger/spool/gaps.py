@@ -1,13 +1,13 @@
-"""The gap journal: when messages were lost, how many and why, a row of the index for each second, topic and cause.
+"""The gap journal: when messages were lost, how many and why, in one row of the index per second, topic and cause.
 
-The accounts say how many; a row says when. Whoever counts a loss adds its times (``TopicGaps.add``). At each commit
-``TopicGaps.settle`` compares what was added with the accounts: losses without times get those of the newest messages at this
-commit and at the one before, and counts that the accounts took back leave the newest rows. So for each topic, kind and cause
-the rows add up to the account at every commit, in the same transaction. Objects that are evicted or quarantined have theirs
-by triggers (schema.sql).
+The accounts contain how many were lost, the journal when. Code that counts a loss adds its times (``TopicGaps.add``). At each
+commit, ``TopicGaps.settle`` compares the journal with the accounts: losses without times get those of the newest messages at
+this commit and the previous one, and counts that the accounts took back are subtracted from the newest rows. So for each topic,
+kind and cause, the rows add up to the account at every commit, in the same transaction. Triggers write the rows of evicted and
+quarantined objects (schema.sql).
 
-Changed rows get a new version, and a row that says nothing any more stays with the count 0 until it is forgotten: whoever
-copies the journal asks for what is newer than the last version that it saw.
+A changed row gets a new version, and a row that is no longer true is kept with the count 0 until it is forgotten, so a copy of
+the journal is updated by reading the rows that are newer than its last version.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped
 EXACT, ESTIMATED = 'exact', 'estimated'
 """Grades."""
 UNTIMED: Final = -1
-"""The beginning of a row without a known time."""
+"""``begin_ns`` of a row whose time is unknown."""
 FORGOTTEN: Final = -2
-"""The beginning of a row that holds the sum of those that were forgotten: when they were, the store knows."""
+"""``begin_ns`` of a row that is the sum of forgotten rows, whose times are in the store."""
 HOUR_NS: Final = 3600 * SECOND
 MAX_NEW_ROWS: Final = 7200
-"""Of a sink and topic in an hour: two a second. Further gaps of a kind and cause are one row, without publisher and mission."""
+"""Per sink, topic and hour: two per second. Further gaps of a kind and cause share one row, without publisher and mission."""
 MAX_RECENT: Final = 256
 OBJECTS, BAGS, EVENTS = 'objects', 'bags', 'events'
 """Sinks."""
@@ -39,43 +39,43 @@ _SINKS: Final = {'bag:': BAGS, 'event:': EVENTS}
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Losses of one sink, topic, kind and cause, of one publisher where that is known, that began within one second."""
+    """Losses of one sink, topic, kind, cause and publisher (if known) that began within one second."""
 
     sink: str
     topic: str
     publisher: str | None
     session: int | None
-    """Of the index; None for objects that were evicted or are quarantined."""
+    """A session of the index; None for evicted and quarantined objects."""
     kind: str
     cause: str
     from_ns: int | None
-    """UTC stamp of the last message before; of an object, of its first. None where no clock knows it."""
+    """UTC stamp of the last message before the gap; for an object, of its first message. None if unknown."""
     to_ns: int | None
-    """UTC stamp of the first message after; of an object, of its last."""
+    """UTC stamp of the first message after the gap; for an object, of its last message."""
     received_from_ns: int | None
-    """When the message of ``from_ns`` arrived. None if that is unknown."""
+    """When the message of ``from_ns`` arrived; None if unknown."""
     received_to_ns: int | None
     """When the message of ``to_ns`` arrived."""
     count: int | None
-    """Messages; 0 for a row that was true once, and is not any more. None where it is not known."""
+    """Messages; 0 for a row that is no longer true, None if unknown."""
     merged: int
-    """How many gaps are in it."""
+    """How many gaps the row contains."""
     grade: str
     mission_id: str | None
     robot: str | None = None
     boot_id: str | None = None
-    """Where the wall clock was not set: of which boot the next two are."""
+    """If the wall clock was not set: the boot to which the next two times belong."""
     from_boot_ns: int | None = None
     to_boot_ns: int | None = None
     began_ns: int | None = None
-    """When its session began: numbers of sessions start again with a new index."""
+    """When its session began: a new index numbers its sessions from 1 again."""
     begin_ns: int = UNTIMED
-    """With sink, topic, publisher, session, kind, cause, grade and mission this names the row."""
+    """Identifies the row, together with sink, topic, publisher, session, kind, cause, grade and mission."""
     version: int = 0
-    """Rises with each change of any row."""
+    """Increases with each change of any row."""
 
     def as_dict(self) -> dict[str, Any]:
-        """As ``shadowhound-data ledger --gaps --json`` prints it."""
+        """The row as ``shadowhound-data ledger --gaps --json`` prints it."""
         return {name: getattr(self, name) for name in _PRINTED}
 
 
@@ -83,20 +83,20 @@ _PRINTED: Final = tuple(each.name for each in fields(Gap))[:14]
 
 
 class Watermark(NamedTuple):
-    """From when until when the journal of a topic is complete: what was lost between is in it, the rest is in the store."""
+    """The interval in which the journal of a topic is complete: every message in it is either lost as listed or in the store."""
 
     robot: str
     sink: str
     topic: str
     session: int
     since_ns: int
-    """UTC stamp of a message, and so is the next one."""
+    """UTC stamp of a message, as ``complete_ns``."""
     complete_ns: int
     received_since_ns: int | None
-    """The same two by the arrival of messages; None if that is unknown."""
+    """The same two by the arrival of the messages; None if unknown."""
     received_complete_ns: int | None
     grade: str
-    """Whether losses are known by numbers or estimated; there is no watermark where only the received is known."""
+    """``exact`` or ``estimated``: there is no watermark if losses are unknown."""
     received: int
     """Messages of the session so far."""
     skipped: int
@@ -114,10 +114,10 @@ class GapKey(NamedTuple):
 
 
 class GapRow(NamedTuple):
-    """A change of a row: the times that it covers, and how many messages and gaps are added to it."""
+    """A change of a row: the times it covers, and how many messages and gaps are added to it."""
 
     topic: str
-    """The account: with the prefix of its sink."""
+    """The account, with the prefix of its sink."""
     key: GapKey
     from_ns: int | None
     to_ns: int | None
@@ -128,7 +128,7 @@ class GapRow(NamedTuple):
 
 
 class TakenBack(NamedTuple):
-    """Losses to take back, because they were none; taken from the newest rows."""
+    """Losses to subtract from the newest rows, because the messages were not lost after all."""
 
     topic: str
     kind: str
@@ -137,50 +137,51 @@ class TakenBack(NamedTuple):
     messages: int
 
 
-Figures = Mapping[tuple[str, str, str], int]
-"""(kind, cause, grade) -> messages, as an account has them."""
+LossTotals = Mapping[tuple[str, str, str], int]
+"""(kind, cause, grade) -> messages of an account."""
 
 
 @dataclass(slots=True)
 class TopicGaps:
-    """What the next commit changes in the journal of one account. Guarded as that is."""
+    """The changes of one account's journal since the last commit. Guarded as the account."""
 
     mission: str = ''
-    """The one that is active now."""
+    """The active mission."""
     clock: Clock | None = None
-    """Of this machine: of stamps from before it was set."""
-    heard: Times = NO_TIMES
-    """Those of the newest message, first of an earlier session; zeros before the first."""
+    """Converts stamps from before the clock of this machine was set."""
+    newest: Times = NO_TIMES
+    """Times of the newest message, initially of an earlier session; zeros before the first message."""
     before: Times = field(init=False)
-    """The same of the earlier session; zeros if there is none."""
+    """Times of the newest message of earlier sessions; zeros if there is none."""
     count: int = 0
-    """Gaps so far, of whatever kind."""
+    """Gaps so far, of any kind."""
     _changes: dict[GapKey, GapRow] = field(default_factory=dict)
     _journaled: dict[tuple[str, str, str], int] = field(default_factory=dict)
     _since: Times = NO_TIMES
-    """``heard`` at the last commit."""
+    """``newest`` at the last commit."""
     _recent: dict[GapKey, None] = field(default_factory=dict)
-    """Rows that are not new: the last ones that something was added to."""
+    """The last changed rows, which do not count as new."""
     _hour: int = 0
+    """Since boot."""
     _new_rows: int = 0
-    """In this hour since boot."""
+    """In this hour."""
     _before_commit: tuple[dict[GapKey, GapRow], dict[tuple[str, str, str], int], Times] | None = None
 
     def __post_init__(self) -> None:
-        self.before = self.heard
+        self.before = self.newest
 
     @property
     def has_received(self) -> bool:
-        """Whether a message came in this session."""
-        return self.heard != self.before
+        """Whether a message was received in this session."""
+        return self.newest != self.before
 
     def add(self, kind: str, cause: str, messages: int, before: Times, after: Times, publisher: str = '',
             grade: str = EXACT) -> GapKey:  # fmt: skip
-        """Messages were lost between these two, or are these two and all between them. Returns the row's key.
+        """Add lost messages, which are between these two times or include them. Returns the row's key.
 
-        Stamps of a wall clock that was never set become those of the boot clock, as in ``stamps.StampRule``. What is not a time,
-        or more than a day ahead of our clock, is not known; of a UTC stamp and one since boot the first counts. Without a
-        publisher, the two messages may be of publishers with different clocks: then both times are by the clock of ``after``.
+        Stamps of a wall clock that was never set are converted to the boot clock, as in ``stamps.StampRule``. Invalid stamps and
+        stamps more than a day ahead of our clock count as unknown; if only one of the two is UTC, it is used for both. Without a
+        publisher, the times may be by different publishers' clocks: then both are converted to the clock of ``after``.
         """
         if not publisher and is_of_two_clocks(before, after):
             before = before._replace(stamp_ns=after.stamp_ns - (after.received_ns - before.received_ns))
@@ -200,30 +201,30 @@ class TopicGaps:
         return key
 
     def fill(self, key: GapKey, messages: int, merged: int) -> None:
-        """Messages of a gap came after all; ``merged`` is the change of how many gaps there are."""
+        """Subtract messages of a gap that arrived late; ``merged`` is the change of the number of gaps."""
         self.count += merged
         self._change(GapRow('', key, None, None, None, None, -messages, merged))
 
-    def settle(self, topic: str, figures: Figures) -> tuple[list[GapRow], list[TakenBack]]:
-        """What a commit with these figures has to change in the journal; ``undo`` if it fails."""
+    def settle(self, topic: str, totals: LossTotals) -> tuple[list[GapRow], list[TakenBack]]:
+        """The changes that make the journal add up to these totals; call ``undo`` if their commit fails."""
         added = Counter[tuple[str, str, str]]()
         for key, row in self._changes.items():
             added[key[:3]] += row.messages
         taken_back: list[TakenBack] = []
-        for what in figures.keys() | self._journaled.keys() | added.keys():
-            rest = figures.get(what, 0) - self._journaled.get(what, 0) - added[what]
+        for what in totals.keys() | self._journaled.keys() | added.keys():
+            rest = totals.get(what, 0) - self._journaled.get(what, 0) - added[what]
             kind, cause, grade = what
             if rest > 0:
-                self.add(kind, cause, rest, self._since if any(self._since) else self.heard, self.heard, grade=grade)
+                self.add(kind, cause, rest, self._since if any(self._since) else self.newest, self.newest, grade=grade)
             elif rest < 0:
                 taken_back.append(TakenBack(topic, kind, cause, grade, -rest))
         self._before_commit = self._changes, self._journaled, self._since
         changes, self._changes = self._changes, {}
-        self._journaled, self._since = {what: count for what, count in figures.items() if count}, self.heard
+        self._journaled, self._since = {what: count for what, count in totals.items() if count}, self.newest
         return [row._replace(topic=topic) for row in changes.values() if row.messages or row.merged], taken_back
 
     def undo(self) -> None:
-        """The commit did not become durable."""
+        """Restore the changes of the last ``settle``, because its commit did not become durable."""
         if self._before_commit is None:
             return
         newer = self._changes
@@ -233,7 +234,7 @@ class TopicGaps:
             self._change(row)
 
     def _bounded(self, key: GapKey) -> GapKey:
-        """The row; the one of the hour, where too many are new in it: publishers choose their stamps, and come and go."""
+        """The key, or that of a row for the whole hour if too many rows are new: publishers may send any stamps, and restart."""
         if self.clock is None or key in self._recent:
             return key
         boot_ns = self.clock.boot_ns()
@@ -280,13 +281,13 @@ def _last(*times_ns: int | None) -> int | None:
 
 
 def latest(clock: Clock | None) -> int:
-    """The time until which anything can have happened: now, where the clock is set. A publisher may stamp as it likes."""
+    """The latest time of a real event: now, if the clock is set. A publisher may send any stamp."""
     now_ns = 0 if clock is None else clock.wall_ns()
     return now_ns if now_ns >= EARLIEST_SANE_NS else _LAST_NS
 
 
 def latest_stamp(newest: Times, now_ns: int) -> int:
-    """The latest stamp that counts by then: now, or as much later as the stamps of a topic are ahead of their arrival."""
+    """The latest stamp that counts now: now, plus how far the stamps of the topic are ahead of their arrival."""
     ahead_ns = newest.stamp_ns - newest.received_ns if newest.received_ns else 0
     return now_ns + ahead_ns if 0 < ahead_ns <= FUTURE_SLACK_NS else now_ns
 
@@ -296,7 +297,7 @@ LATELY_NS: Final = 60 * SECOND
 
 
 def split(account: str) -> tuple[str, str]:
-    """Sink and topic of an account."""
+    """The sink and the topic of an account."""
     for prefix, sink in _SINKS.items():
         if account.startswith(prefix):
             return sink, account.removeprefix(prefix)

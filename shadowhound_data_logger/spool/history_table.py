@@ -1,4 +1,4 @@
-"""Objects that left the spool: a short row for each that left an hour ago, until its key is forgotten."""
+"""Objects that left the spool more than an hour ago: one short row each, until their keys are forgotten."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table, after, split
 
 FORGET_STEP: Final = 5_000
-"""Rows that one commit looks at to forget them, at most: some 20 ms."""
+"""Rows that one commit examines at most to forget them: some 20 ms."""
 COMPACT_STEP: Final = 500
-"""Rows that one commit makes short, at most: some 10 ms."""
+"""Rows that one commit shortens at most: some 10 ms."""
 COMPACT_STATES: Final = (State.DELIVERED, State.DEDUPLICATED, State.EVICTED)
 """The states of short rows, by number."""
 CATALOG: Final = '_catalog'
-"""The sensor of the catalog's own objects: other parts replace them in time, and they can be written again."""
+"""The sensor of the catalog's own objects, which are merged into other parts later and can be written again."""
 _DELIVERED: Final = f"FROM objects WHERE state = 'delivered' AND sensor <> '{CATALOG}'"
 _COMPACT_DELIVERED: Final = f"FROM compact_objects JOIN folders ON folders.id = folder WHERE state = 0 AND sensor <> '{CATALOG}'"
 _COMPACT: Final = """
@@ -28,18 +28,18 @@ SELECT compact_objects.id, bucket, path || name AS key, bytes, lower(hex(sha256)
   CASE state WHEN 0 THEN 'delivered' WHEN 1 THEN 'deduplicated' ELSE 'evicted' END AS state,
   CASE state WHEN 2 THEN 'no_room' END AS reason, sensor, '' AS waits_for
 FROM folders JOIN compact_objects ON folder = folders.id"""
-"""The columns of an object as far as they are remembered; ``created_ns`` is when it left the spool, to the second."""
+"""The remembered columns of an object; ``created_ns`` is when it left the spool, to the second."""
 _NOTHING_SWEPT: Final = (0, '')
 
 
 class HistoryTable(Table):
-    """The short rows, and what the store confirmed."""
+    """The short rows, and the deliveries that the store confirmed."""
 
     def __init__(self, connection: Callable[[], sqlite3.Connection], gaps: GapTable) -> None:
         super().__init__(connection)
         self._gaps = gaps
         self._swept: tuple[int, str] = _NOTHING_SWEPT
-        """The last short row that ``forget`` looked at."""
+        """The last short row that ``forget`` examined."""
 
     def select(self, where: str, values: Sequence[object] = ()) -> list[sqlite3.Row]:
         """Short rows, with the columns of ``ObjectTable.select``."""
@@ -48,7 +48,7 @@ class HistoryTable(Table):
         return cursor.fetchall()
 
     def with_prefix(self, bucket: str, prefix: str, sha256: str | None = None) -> list[sqlite3.Row]:
-        """Short rows whose keys start with ``prefix``, of this content or any: in the folder of the prefix, and below it."""
+        """Short rows whose keys start with ``prefix``, with this content or any."""
         path, name = split(prefix)
         more, values = ('', ()) if sha256 is None else ('AND sha256 = ?', (_digest(sha256),))
         found = self.select(
@@ -59,10 +59,10 @@ class HistoryTable(Table):
         return found + below
 
     def compact(self, before_ns: int) -> bool:
-        """Replace some rows of what left the spool before then by short ones; False if there may be more of them.
+        """Replace some rows of objects that left the spool before then by short ones; False if there may be more of them.
 
-        What remains is the key, size, SHA-256, state, and when it left: not its metadata. What the catalog does not describe yet
-        is unchanged. Totals do not change.
+        A short row has the key, size, SHA-256, state and time of leaving, but no metadata. Objects that the catalog does not
+        describe yet are skipped. Totals do not change.
         """
         rows = self._db.execute(
             'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns, ifnull(CASE WHEN json_valid(metadata) THEN'  # noqa: S608
@@ -90,9 +90,10 @@ class HistoryTable(Table):
         return len(rows) < COMPACT_STEP
 
     def forget(self, before_ns: int) -> bool:
-        """Drop some of the short rows of what left the spool before then; totals stay. False if there may be more of them.
+        """Delete some short rows of objects that left the spool before then; False if there may be more of them.
 
-        Rows of a time before the clock was set stay: the next boot may start at that time again, and their keys are taken.
+        Rows from before the clock was set are kept: the next boot may start at the same time, and must not reuse their keys.
+        Totals do not change.
         """
         first = self._swept
         end = 'SELECT folder, name FROM compact_objects WHERE (folder, name) > (?, ?) ORDER BY folder, name LIMIT 1 OFFSET ?'
@@ -110,15 +111,12 @@ class HistoryTable(Table):
     # -- what the store confirmed ----------------------------------------------------------------------------------
 
     def delivered(self, last: int, limit: int) -> list[tuple[int, ObjectInfo]]:
-        """Delivered objects with full rows and numbers after ``last``, by number and as the store must describe them.
-
-        Without the parts of the catalog.
-        """
+        """Delivered objects with full rows and ids after ``last``, by id, as the store must describe them; no catalog parts."""
         query = f'SELECT id, bucket, key, bytes, sha256 {_DELIVERED} AND id > ? ORDER BY id LIMIT ?'
         return [(number, ObjectInfo(*of_store)) for number, *of_store in self._db.execute(query, (last, limit))]
 
     def delivered_compact(self, last: tuple[int, str], limit: int) -> tuple[list[tuple[int, ObjectInfo]], tuple[int, str]]:
-        """The same of those with short rows, in their order; and the place of the last one, for the next call."""
+        """The same for short rows, in their order, and the position of the last one for the next call."""
         rows = self._db.execute(
             f'SELECT folder, name, compact_objects.id, bucket, path, bytes, lower(hex(sha256)) {_COMPACT_DELIVERED}'
             ' AND (folder, name) > (?, ?) ORDER BY folder, name LIMIT ?', (*last, limit),
@@ -132,20 +130,20 @@ class HistoryTable(Table):
         return sum(self._db.execute(query).fetchone()[0] for query in queries)
 
     def delivered_since_ns(self) -> int | None:
-        """When the first of them was delivered; None without any."""
+        """When the first remembered object was delivered; None if there is none."""
         compact = self._db.execute(f'SELECT min(settled_s) {_COMPACT_DELIVERED}').fetchone()[0]
         full = self._db.execute(f'SELECT min(settled_ns) {_DELIVERED}').fetchone()[0]
         return min((found for found in (compact and compact * SECOND, full) if found is not None), default=None)
 
     def forgotten_count(self) -> int:
-        """Delivered objects that are counted and not remembered, including parts of the catalog."""
+        """Delivered objects that are counted but no longer remembered, including parts of the catalog."""
         ever = self._db.execute("SELECT ifnull(sum(objects), 0) FROM tally WHERE state = 'delivered'").fetchone()[0]
         full = self._db.execute("SELECT count(*) FROM objects WHERE state = 'delivered'").fetchone()[0]
         return int(ever) - int(full) - int(self._db.execute('SELECT count(*) FROM compact_objects WHERE state = 0').fetchone()[0])
 
 
 def _digest(sha256: str) -> bytes:
-    """Of hex; empty for what a flipped bit made of it."""
+    """Bytes of a hex string; empty if it is damaged."""
     try:
         return bytes.fromhex(sha256)
     except ValueError:

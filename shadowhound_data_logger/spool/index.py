@@ -1,8 +1,8 @@
 """The spool's index: one SQLite file with the state of every object and the accounts of all messages.
 
-Written by one connection under one lock, in transactions that are durable when they return (WAL, synchronous=FULL);
-read by any number of others. Its transaction is the one commit point of the spool: an object exists once its row does.
-Each concept has its tables and statements in one class, an attribute of the index. What to do is decided elsewhere.
+One connection writes, under one lock, in transactions that are durable when they return (WAL, synchronous=FULL); any number of
+others read. The transaction is the only commit point of the spool: an object exists once its row does. Each concept has its
+tables and statements in one class, which is an attribute of the index; the callers decide what to do.
 """
 
 from __future__ import annotations
@@ -14,17 +14,20 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
+from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.errors import SpoolError
+from shadowhound_data_logger.core.model import State
+from shadowhound_data_logger.core.status import SpoolStatus
 from shadowhound_data_logger.spool.account_table import AccountTable
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.history_table import HistoryTable
 from shadowhound_data_logger.spool.kept_table import KeptTable
-from shadowhound_data_logger.spool.object_table import IN_SPOOL, ObjectTable
+from shadowhound_data_logger.spool.object_table import IN_SPOOL, ObjectStates, ObjectTable
 from shadowhound_data_logger.spool.overview_table import OverviewTable
 from shadowhound_data_logger.spool.recording_table import RecordingTable
-from shadowhound_data_logger.spool.request_table import RequestTable
+from shadowhound_data_logger.spool.request_table import RequestedTable, RequestTable
 from shadowhound_data_logger.spool.schema import definitions, expected, implausible, prepare, version_of
 
 BUSY_TIMEOUT_S: Final = 10.0
@@ -40,7 +43,7 @@ WHERE {IN_SPOOL} AND (objects OR bytes OR samples)"""  # noqa: S608 - own consta
 class Index:
     """The spool's SQLite database.
 
-    Lifecycle: new; open once; close once. Methods that write belong to the owner of the spool's lock.
+    Lifecycle: new; open once; close once. Only the owner of the spool's lock may call methods that write.
     """
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
@@ -54,25 +57,27 @@ class Index:
 
         self.gaps = GapTable(db)
         self.requests = RequestTable(db)
+        self.requested = RequestedTable(db)
         self.catalog = CatalogTable(db, self.gaps)
         self.history = HistoryTable(db, self.gaps)
-        self.objects = ObjectTable(db, self.history, self.catalog, self.requests)
-        self.kept = KeptTable(db, self.objects, self.catalog)
+        self.objects = ObjectTable(db, self.history)
+        self.states = ObjectStates(db, self.catalog, self.requested)
+        self.kept = KeptTable(db, self.objects, self.states, self.catalog)
         self.overview = OverviewTable(db)
         self.recordings = RecordingTable(db)
         self.accounts = AccountTable(db, self.gaps)
 
     def open(self) -> None:
-        """Raises sqlite3.DatabaseError for a damaged file, SpoolError for one of a newer version or no access."""
+        """Raises sqlite3.DatabaseError for a damaged file, SpoolError if it has a newer version or cannot be opened."""
         if not self._read_only:
-            # Closing a connection that may write changes the file, because it takes in the log of a killed node: check first.
+            # Check the version first: closing a connection that may write changes the file, by merging the log of a killed node.
             with suppress(sqlite3.OperationalError), closing(self._connect('ro')) as view:
                 version_of(view, self._path)
         try:
             connection = self._connect('ro' if self._read_only else 'rwc')
         except sqlite3.OperationalError as error:
             raise SpoolError(f'cannot open the spool index {self._path}: {error}',
-                             remedy='is the path right, and may you read it?') from error  # fmt: skip
+                             remedy='check the path and its permissions') from error  # fmt: skip
         try:
             prepare(connection, self._path, read_only=self._read_only)
         except BaseException:
@@ -99,19 +104,19 @@ class Index:
         return self._connection
 
     def check(self) -> None:
-        """Raises sqlite3.DatabaseError if the file is damaged: 3 us a row, 6 us after a process was killed.
+        """Raises sqlite3.DatabaseError if the file is damaged. Takes 3 us per row, 6 us after a process was killed.
 
-        The longer check compares tables with their indexes as well, whose damage otherwise only shows in a commit.
+        The longer check also compares tables with their indexes, whose damage would otherwise only show in a commit.
         """
         if not definitions(self._db) >= expected():
-            raise sqlite3.DatabaseError('its tables are not those of this version')
+            raise sqlite3.DatabaseError('its tables do not match this version')
         pragma = 'integrity_check' if self.accounts.sessions(ended=False) else 'quick_check'
         answer = self._db.execute(f'PRAGMA {pragma}(1)').fetchone()[0]
         if answer != 'ok':
             raise sqlite3.DatabaseError(str(answer))
 
     def check_values(self) -> None:
-        """Raises sqlite3.DatabaseError for a value that this program cannot have written: checked at startup, before use."""
+        """Raises sqlite3.DatabaseError for a value that this program cannot have written; checked at startup."""
         for table, query in implausible().items():
             found = self._db.execute(query).fetchone()
             if found is not None:
@@ -119,24 +124,42 @@ class Index:
 
     def miscounted(self) -> Iterator[str]:
         """A sentence for each total that differs from the objects in the spool."""
-        with self.snapshot():  # other processes commit during that time
+        with self.snapshot():  # because other processes may commit in between
             counted = {row[:2]: row[2:] for row in self._db.execute(_IN_SPOOL_COUNTED)}
             totals = {row[:2]: row[2:] for row in self._db.execute(_IN_SPOOL_TALLY)}
         for what in sorted(counted.keys() | totals.keys()):
             if counted.get(what) != totals.get(what):
                 yield f'{what[0] or "bookkeeping"}: {what[1]} {totals.get(what)}, but in the spool {counted.get(what)}'
 
+    def usage(self, now_ns: int) -> SpoolStatus:
+        """How much the spool contains, and how long its oldest object has waited. Raises OSError or sqlite3.Error."""
+        tally, oldest_ns = self.overview.tally(), self.objects.oldest_pending_ns()
+        count = {state: sum(row[2] for row in tally if row[1] == state.value) for state in State}
+        is_unknown = oldest_ns is not None and oldest_ns < EARLIEST_SANE_NS <= now_ns  # spooled before the clock was set
+        disk = os.statvfs(self._path.parent)
+        return SpoolStatus(
+            path=str(self._path.parent),
+            pending=count[State.PENDING],
+            held=count[State.HELD],
+            quarantined=count[State.QUARANTINED],
+            bytes=self.objects.payload_bytes(),
+            free_bytes=disk.f_bavail * disk.f_frsize,
+            oldest_age_s=None if oldest_ns is None or is_unknown else max(0.0, round((now_ns - oldest_ns) / SECOND, 1)),
+            kept=count[State.KEPT],
+            kept_bytes=self.kept.bytes(),
+        )
+
     def is_in_place(self) -> bool:
-        """Whether the file that was opened is still in its place."""
+        """Whether the opened file is still at its path."""
         now = self._stat()
         return now is not None and self._file is not None and os.path.samestat(now, self._file)
 
     def put_back(self) -> None:
-        """Write the open index as a new file after the old one was deleted. All who had it open must open it again.
+        """Write the open index to a new file, because the old one was deleted. All processes must then open it again.
 
         The caller holds the recovery lock. Raises OSError, sqlite3.Error.
         """
-        self._db.execute('BEGIN IMMEDIATE')  # a process that is about to commit to the deleted file has done so then
+        self._db.execute('BEGIN IMMEDIATE')  # waits for a process that is committing to the deleted file
         self._db.execute('COMMIT')
         copy = self._path.with_name(f'{self._path.name}.copy')
         copy.unlink(missing_ok=True)
@@ -156,7 +179,7 @@ class Index:
 
     @contextmanager
     def snapshot(self) -> Iterator[None]:
-        """Everything read inside is of one instant."""
+        """All reads inside see the same instant."""
         self._db.execute('BEGIN')
         try:
             yield
@@ -164,26 +187,26 @@ class Index:
             self._db.execute('COMMIT')
 
     @contextmanager
-    def transaction(self, undo: Callable[[], None] = lambda: None) -> Iterator[None]:
-        """All or nothing, durable on leaving; ``undo`` runs before a rollback, while other writers are still locked out.
+    def transaction(self, undo: Callable[[], object] = lambda: None) -> Iterator[None]:
+        """A transaction, durable on exit; ``undo`` runs before a rollback, while other writers are still locked out.
 
-        Raises sqlite3.DatabaseError if the file that was opened is no longer in its place: nobody would see what is written.
+        Raises sqlite3.DatabaseError if the opened file is no longer at its path, because nothing could read what is written.
         """
         db = self._db
         db.execute('BEGIN IMMEDIATE')
-        if not self.is_in_place():  # checked now: a process that replaces the file waited for the transactions before
+        if not self.is_in_place():  # checked inside: a process that replaces the file waits for earlier transactions
             db.execute('ROLLBACK')
             raise lost(self._path)
         try:
             yield
             db.execute('COMMIT')
         except BaseException:
-            if db.in_transaction:  # SQLite itself ends it on some errors: a full disk, a failing one
+            if db.in_transaction:  # SQLite has ended it after some errors, such as a full disk
                 undo()
                 db.execute('ROLLBACK')
             raise
 
 
 def lost(path: Path) -> sqlite3.DatabaseError:
-    """The file that was opened is no longer in its place."""
-    return sqlite3.DatabaseError(f'{path} was lost: it was deleted or replaced')
+    """The error if the opened file is no longer at its path."""
+    return sqlite3.DatabaseError(f'{path} was deleted or replaced')

@@ -1,4 +1,4 @@
-"""Kept objects: those that stay on the robot until they are requested, may be thinned, and are evicted last."""
+"""Kept objects, which stay on the robot until they are requested, and may be thinned."""
 
 from __future__ import annotations
 
@@ -10,34 +10,36 @@ from typing import Any, Final
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
-from shadowhound_data_logger.spool.object_table import ObjectTable
+from shadowhound_data_logger.spool.object_table import ObjectStates, ObjectTable
 from shadowhound_data_logger.spool.table import Table
 
 _FREE: Final = """state = 'kept' AND NOT protected
   AND NOT EXISTS (SELECT 1 FROM requested WHERE requested.id = objects.id AND outcome IN ('kept', 'pending'))"""
-"""Kept, and not part of an open request."""
+"""Kept, not protected, and in no open request."""
 
 
 class KeptTable(Table):
     """The kept objects among the objects."""
 
-    def __init__(self, connection: Callable[[], sqlite3.Connection], objects: ObjectTable, catalog: CatalogTable) -> None:
+    def __init__(self, connection: Callable[[], sqlite3.Connection], objects: ObjectTable, states: ObjectStates,
+                 catalog: CatalogTable) -> None:  # fmt: skip
         super().__init__(connection)
         self._objects = objects
+        self._states = states
         self._catalog = catalog
 
     def bytes(self) -> int:
-        """Of everything that is kept."""
+        """Bytes of all kept objects."""
         return int(self._db.execute("SELECT ifnull(sum(bytes), 0) FROM tally WHERE state = 'kept'").fetchone()[0])
 
     def evictable(self, limit: int, before_ns: int | None = None) -> list[sqlite3.Row]:
-        """What is in no open request, the oldest first; only what was spooled before ``before_ns``, if given."""
+        """Objects in no open request, oldest first; if given, only those spooled before ``before_ns``."""
         before = '' if before_ns is None else 'AND created_ns < ?'
         values = (*(() if before_ns is None else (before_ns,)), limit)
         return self._objects.select(f'{_FREE} {before} ORDER BY id LIMIT ?', values)
 
     def thinnable(self, last: int, limit: int) -> list[Mapping[str, Any]]:
-        """What is in no open request and has a number after ``last``, in that order; ``step`` as in ``thin``."""
+        """Objects in no open request with an id after ``last``, by id; ``step``: one of so many messages is left."""
         columns = ('id', 'sensor', 'type', 'samples', 'bytes', 'sha256', 'content_type', 't_start_ns', 't_end_ns', 'bucket',
                    'key', 'metadata')  # fmt: skip
         query = f'SELECT {", ".join(columns)} FROM objects WHERE {_FREE} AND id > ? ORDER BY id LIMIT ?'  # noqa: S608
@@ -51,16 +53,16 @@ class KeptTable(Table):
 
     def thin(self, row: Mapping[str, Any], body: FileBody, samples: int, lost: Mapping[str, int], key: str, reason: str,
              now_ns: int) -> None:  # fmt: skip
-        """Give a kept object less content; what is gone becomes an evicted object of its own, under ``key``.
+        """Give a kept object less content; the removed messages become a separate evicted object under ``key``.
 
-        ``row`` is that of ``ObjectTable.full_row``, ``lost`` the messages by topic if it has several. Together the two objects
-        have the totals of the first.
+        ``row`` is that of ``ObjectTable.full_row``; ``lost`` are the removed messages by topic, if it has several. Together the
+        two objects have the totals of the original.
         """
-        gone = row['samples'] - samples
+        removed = row['samples'] - samples
         accounts = {account: lost[topic] for account in row['counts'] if (topic := account.partition(':')[2]) in lost}
         was = " AND topic = ? AND state IN ('spooled', 'kept')"
         self._db.execute(f'UPDATE tally SET bytes = bytes - ?, samples = samples - ? WHERE 1{was}',  # noqa: S608 - own constants only
-                         (row['bytes'] - len(body), gone, row['topic'] or ''))  # fmt: skip
+                         (row['bytes'] - len(body), removed, row['topic'] or ''))  # fmt: skip
         for account, count in accounts.items():
             self._db.execute(f'UPDATE tally SET samples = samples - ? WHERE 1{was}', (count, account))  # noqa: S608
             self._db.execute('UPDATE contents SET samples = samples - ? WHERE id = ? AND topic = ?', (count, row['id'], account))
@@ -69,18 +71,18 @@ class KeptTable(Table):
         step = 2 * _step(metadata)
         left = {**metadata, words.SHA256: body.sha256, word: str(samples), words.THINNED: str(step)}
         values = {'bytes': len(body), 'sha256': body.sha256, 'samples': samples, 'metadata': json.dumps(left)}
-        self._objects.set_thinned(row['id'], values)
-        # A state of its own: a part that is being written describes the object as it was, and takes the row of that state.
+        self._states.set_thinned(row['id'], values)
+        # A separate state: a catalog part that is being written describes the object as it was, and removes the earlier state.
         self._catalog.report(row['id'], f'{reason} {step}')
-        gone_body = FileBody(body.path, row['bytes'] - len(body), row['sha256'])
+        removed_body = FileBody(body.path, row['bytes'] - len(body), row['sha256'])
         item = DataObject(
-            bucket=row['bucket'], key=key, body=gone_body, sensor=row['sensor'],
-            content_type=row['content_type'], topic=row['topic'], type=row['type'], samples=gone, t_start_ns=row['t_start_ns'],
+            bucket=row['bucket'], key=key, body=removed_body, sensor=row['sensor'],
+            content_type=row['content_type'], topic=row['topic'], type=row['type'], samples=removed, t_start_ns=row['t_start_ns'],
             t_end_ns=row['t_end_ns'], priority=row['priority'], protected=False, counts=accounts,
         )  # fmt: skip
-        self._objects.insert(item, key, row['sha256'], State.EVICTED, reason, {**metadata, word: str(gone)}, now_ns)
+        self._states.insert(item, key, row['sha256'], State.EVICTED, reason, {**metadata, word: str(removed)}, now_ns)
 
 
 def _step(metadata: Mapping[str, str]) -> int:
-    """One of how many pictures or clouds is left."""
+    """One of how many images or clouds is left."""
     return int(metadata.get(words.THINNED, 1))

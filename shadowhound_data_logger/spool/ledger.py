@@ -1,4 +1,4 @@
-"""The ledger: what became of every message and every object, read from the spool's index, and whether it closes."""
+"""The ledger: what became of every message and every object, read from the spool's index, and whether it balances."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool import act_record, clock_record
 from shadowhound_data_logger.spool.account_rows import OtherTypeRow
-from shadowhound_data_logger.spool.accounts import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 from shadowhound_data_logger.spool.act_record import Act
 from shadowhound_data_logger.spool.gaps import DROPPED, ESTIMATED, EVICTED, EXACT, MISSED, QUARANTINED, REJECTED, Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.topic_account import GRADES, MAX_NODES, RECEIVED_ONLY, SINKS
 
 STATES: Final = tuple(state.value for state in State)
 
@@ -42,7 +42,7 @@ class OtherTypeFigures(TypedDict):
 
 
 class TopicFigures(GradeFigures):
-    """A topic over all sessions, or what became of it in bags or events. No better than the worst of its grades."""
+    """A topic over all sessions, or its messages in bags or events. Its figures are those of the worst of its grades."""
 
     type: str
     accounting: str | None
@@ -108,16 +108,13 @@ def read(spool: Path, robot: str) -> SpoolLedger:
 
 
 def journal(spool: Path, robot: str) -> list[Gap]:
-    """What the gap journal of a spool folder has, in the order of time; works while a node runs.
-
-    Raises SpoolError as ``read``.
-    """
+    """The gap journal of a spool folder, by time; works while a node runs. Raises SpoolError as ``read``."""
     with _reading(spool) as index:
         return index.gaps.known(clock_record.read(spool, robot).offsets)
 
 
 def watermarks(spool: Path) -> list[Watermark]:
-    """From when until when the journal of a spool folder is complete, by sink and topic. Raises SpoolError as ``journal``."""
+    """The watermarks of a spool folder's gap journal. Raises SpoolError as ``read``."""
     with _reading(spool) as index:
         return index.gaps.watermarks()
 
@@ -126,20 +123,20 @@ def watermarks(spool: Path) -> list[Watermark]:
 def _reading(spool: Path) -> Iterator[Index]:
     path = spool / 'index.db'
     if not path.is_file():
-        raise SpoolError(f'there is no spool in {spool}', remedy='has the node run here? SHADOWHOUND_HOME names its folder')
+        raise SpoolError(f'there is no spool in {spool}', remedy='has the node run here? set SHADOWHOUND_HOME to its folder')
     index = Index(path, read_only=True)
     try:
         index.open()
         yield index
     except (sqlite3.Error, ValueError) as error:
         raise SpoolError(f'the spool index {path} cannot be read: {error}',
-                         remedy='a start of the node rebuilds a damaged one') from error  # fmt: skip
+                         remedy='start the node: it rebuilds a damaged index') from error  # fmt: skip
     finally:
         index.close()
 
 
 def of_index(index: Index, robot: str) -> Ledger:
-    """The ledger of an open index, all of one instant."""
+    """The ledger of an open index, at one instant."""
     with index.snapshot():
         topics, publishers, others = index.accounts.topics(), index.accounts.publishers(), index.accounts.other_types()
         tally, journal = index.overview.tally(), index.gaps.sums()
@@ -158,7 +155,7 @@ def of_index(index: Index, robot: str) -> Ledger:
 
 
 def rows_of(ledger: Ledger) -> dict[str, TopicFigures]:
-    """All rows: topics, topics in bags, topics in events."""
+    """All rows by name: topics, topics in bags, topics in events."""
     bags = {f'{topic} in bags': row for topic, row in ledger['bags'].items()}
     return ledger['topics'] | bags | {f'{topic} in events': row for topic, row in ledger['events'].items()}
 
@@ -181,7 +178,7 @@ def imbalances(ledger: Ledger) -> list[str]:
 
 
 def _undated(row: TopicFigures) -> Iterator[str]:
-    """One sentence for each account of losses that the rows of the gap journal do not add up to."""
+    """One sentence for each count of losses that differs from the sum of the gap journal's rows."""
     lost = {
         MISSED: _sum(part['missed_by'] for part in row['by_grade'].values()), REJECTED: row['rejected'], DROPPED: row['dropped'],
     }  # fmt: skip
@@ -191,13 +188,13 @@ def _undated(row: TopicFigures) -> Iterator[str]:
             if causes.get(cause, 0) != gaps.get(cause, 0):
                 yield f'{kind} by {cause} {causes.get(cause, 0)}, but in the gap journal {gaps.get(cause, 0)}'
     for kind in (EVICTED, QUARANTINED):
-        there = sum(row['gaps'].get(kind, {}).values())
-        if row['stored_in'][kind] != there:
-            yield f'{kind} {row["stored_in"][kind]}, but in the gap journal {there}'
+        journaled = sum(row['gaps'].get(kind, {}).values())
+        if row['stored_in'][kind] != journaled:
+            yield f'{kind} {row["stored_in"][kind]}, but in the gap journal {journaled}'
 
 
 def _journaled(topic: str, journal: Mapping[tuple[str, str, str, str], int]) -> dict[str, dict[str, int]]:
-    """What the gap journal has of a topic: kind -> cause -> messages."""
+    """A topic's losses in the gap journal: kind -> cause -> messages."""
     found: dict[str, Counter[str]] = {}
     for (account, kind, cause, _), count in journal.items():
         if account == topic:
@@ -206,7 +203,7 @@ def _journaled(topic: str, journal: Mapping[tuple[str, str, str, str], int]) -> 
 
 
 def _ungraded(row: TopicFigures) -> Iterator[str]:
-    """One sentence for each identity of published and missed that does not hold, of the whole and by grade."""
+    """One sentence for each identity of published and missed that does not hold, in total and by grade."""
     for part in (*row['by_grade'].values(), row):
         published, missed, causes = part['published'], part['missed'], sum(part['missed_by'].values())
         if missed is None:
@@ -227,11 +224,11 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
     spans = [row for row in publishers if row.topic == topic]
     received = sum(row.received for row in rows)
     grades = _by_grade(rows, spans)
-    heard = [row.accounting for row in rows if row.received and row.accounting]
+    graded = [row.accounting for row in rows if row.received and row.accounting]
     return {
         'type': rows[-1].type if rows else '',
-        'accounting': heard[-1] if heard else None,
-        **(_whole(received, grades) if heard and heard[-1] != RECEIVED_ONLY else _unknown(received)),
+        'accounting': graded[-1] if graded else None,
+        **(_whole(received, grades) if graded and graded[-1] != RECEIVED_ONLY else _unknown(received)),
         'by_grade': grades,
         'skipped': sum(row.skipped for row in rows),
         'by_arrival': _sum(row.by_arrival for row in rows),
@@ -248,7 +245,7 @@ def _topic(topic: str, topics: list[Any], publishers: list[Any], tally: list[tup
 
 
 def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, OtherTypeFigures]:
-    """Over all sessions; a count that is unknown in one of them is unknown."""
+    """The other types of a topic over all sessions; a count that is unknown in one session is unknown."""
     found: dict[str, OtherTypeFigures] = {}
     for row in rows:
         known = found.setdefault(row.type, {'publishers': [], 'messages': 0})
@@ -260,7 +257,7 @@ def _other_types(rows: Iterable[OtherTypeRow]) -> dict[str, OtherTypeFigures]:
 
 
 def _by_grade(rows: list[Any], spans: list[Any]) -> dict[str, GradeFigures]:
-    """What is known of the messages of each grade that there is."""
+    """The figures of each grade that a topic has."""
     unknown, estimated = sum(row.unknown for row in rows), sum(row.estimated for row in rows)
     numbered = sum(row.received for row in rows) - estimated - unknown
     exact = _counted(numbered, _sum(span.missed for span in spans), sum(span.published for span in spans))
@@ -289,7 +286,7 @@ def _counted(received: int, missed_by: dict[str, int], published: int, *, is_est
 
 
 def _whole(received: int, grades: Mapping[str, GradeFigures]) -> GradeFigures:
-    """All grades as one: no better than the worst of them."""
+    """The sum of all grades, with the worst of them."""
     if not grades or RECEIVED_ONLY in grades:
         return _unknown(received)
     published = sum(part['published'] or part['published_estimated'] or 0 for part in grades.values())

@@ -1,4 +1,4 @@
-"""What is in a spool, object by object or summed up, as its index says; and how to retry what was quarantined."""
+"""Lists what is in a spool, and lets an operator retry quarantined objects or resend the gap journal."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
-HERE: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
-"""States of objects whose bytes lie in the spool."""
+STATES_IN_SPOOL: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
+"""States of objects whose files are in the spool."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +29,12 @@ class SensorUsage:
     objects: int
     bytes: int
     oldest_ns: int
-    """When the one that has been here for the longest was spooled, by the wall clock of then."""
+    """When the oldest of them was spooled, by the wall clock at that time."""
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
-    """One object."""
+class ListedObject:
+    """One object in the spool."""
 
     bucket: str
     key: str
@@ -44,7 +44,7 @@ class Listed:
     bytes: int
     created_ns: int
     path: str
-    """Of its file, within the spool's folder; it may be ``incoming/<id>.part`` for a moment yet. One that is missing has none."""
+    """Of its file, relative to the spool's folder; for a moment the file may still be ``incoming/<id>.part``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,32 +54,35 @@ class Retried:
     objects: int
     bytes: int
     gone: int
-    """Asked for, but their files are not there."""
+    """Requested objects whose files are missing."""
 
 
 def usage_by_sensor(index: Index) -> list[SensorUsage]:
-    """Of an open index, the most important first. Raises sqlite3.Error."""
+    """The usage in an open index, by sensor, the most important first. Raises sqlite3.Error."""
     return [SensorUsage(*row) for row in index.overview.by_sensor()]
 
 
 def objects(index: Index, root: Path, *, state: State | None = None, sensor: str | None = None,
-            prefix: str = '') -> Iterator[Listed]:  # fmt: skip
-    """Of an open index, as they were spooled; ``prefix`` is how ``bucket/key`` begins. Raises sqlite3.Error."""
+            prefix: str = '') -> Iterator[ListedObject]:  # fmt: skip
+    """The objects in an open index, in the order in which they were spooled; ``bucket/key`` starts with ``prefix``.
+
+    Raises sqlite3.Error.
+    """
     tree = Tree(root)
-    for bucket, key, of, now, reason, size, created_ns in index.overview.objects(state, sensor, prefix):
-        path = tree.path(State(now), reason, bucket, key).relative_to(root)
-        yield Listed(bucket, key, of, now, reason, size, created_ns, str(path))
+    for bucket, key, of_sensor, in_state, reason, size, created_ns in index.overview.objects(state, sensor, prefix):
+        path = tree.path(State(in_state), reason, bucket, key).relative_to(root)
+        yield ListedObject(bucket, key, of_sensor, in_state, reason, size, created_ns, str(path))
 
 
 def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ()) -> Retried:
-    """Let quarantined objects wait for delivery again: all, those of a reason, or those of these names (``bucket/key``).
+    """Make quarantined objects pending again: all, those with a reason, or those with these names (``bucket/key``).
 
-    A node that runs finds them within a second. A file is moved before its row, so that a death in between is what somebody's
-    moving it by hand would be: the next start finishes it. Raises SpoolError, sqlite3.Error or OSError.
+    A running node finds them within a second. Files are moved before their rows change: after a crash in between, the next
+    startup completes the change, as if an operator had moved the file. Raises SpoolError, sqlite3.Error or OSError.
     """
     tree, index = Tree(root), Index(root / 'index.db')
     if not (root / 'index.db').is_file():
-        raise SpoolError(f'there is no spool in {root}', remedy='SHADOWHOUND_HOME names its folder')
+        raise SpoolError(f'there is no spool in {root}', remedy='set SHADOWHOUND_HOME to its folder')
     with flock(root / 'recovery.lock'):
         index.open()
         try:
@@ -87,19 +90,19 @@ def retry(root: Path, *, reason: str | None = None, names: Collection[str] = ())
             moved = [row for row in wanted if _moved(tree, row['reason'], row['bucket'], row['key'])]
             with index.transaction():
                 for row in moved:
-                    index.objects.set_found(row['id'])
+                    index.states.set_found(row['id'])
         finally:
             index.close()
     return Retried(len(moved), sum(row['bytes'] for row in moved), len(wanted) - len(moved))
 
 
 def resend_gaps(root: Path) -> int:
-    """Have the next part with gaps start again, with all that the journal remembers: the store lost parts. Returns how many rows.
+    """Upload the whole remembered gap journal again, because the store lost parts of it. Returns the number of rows.
 
-    A node that runs does so within a period of the catalog. Raises SpoolError or sqlite3.Error.
+    A running node does so within a period of the catalog. Raises SpoolError or sqlite3.Error.
     """
     if not (root / 'index.db').is_file():
-        raise SpoolError(f'there is no spool in {root}', remedy='SHADOWHOUND_HOME names its folder')
+        raise SpoolError(f'there is no spool in {root}', remedy='set SHADOWHOUND_HOME to its folder')
     with closing(Index(root / 'index.db')) as index:
         index.open()
         with index.transaction():

@@ -1,8 +1,4 @@
-"""Objects: their rows and states.
-
-A change of state and everything that follows from it are one step here: totals and lost messages follow by the triggers of
-schema.sql, the lists of what the catalog and requests must still be told by ``CatalogTable`` and ``RequestTable``.
-"""
+"""Objects: ``ObjectTable`` reads their rows, ``ObjectStates`` writes them and changes their states."""
 
 from __future__ import annotations
 
@@ -28,27 +24,24 @@ from shadowhound_data_logger.core.model import (
 )
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.history_table import HistoryTable
-from shadowhound_data_logger.spool.request_table import RequestTable
+from shadowhound_data_logger.spool.request_table import RequestedTable
 from shadowhound_data_logger.spool.table import Table, after, marks, split
 
 MISSING: Final = 'missing'
-"""Reason of a quarantined object whose file is gone."""
+"""Reason of a quarantined object whose file is missing."""
 STATES_IN_SPOOL: Final = (State.PENDING, State.HELD, State.QUARANTINED, State.KEPT)
 IN_SPOOL: Final = "state IN ('pending', 'held', 'quarantined', 'kept')"
 _COLUMNS: Final = 'id, bucket, key, bytes, sha256, content_type, metadata, priority, created_ns, state, reason, sensor, waits_for'
 _PROTECTED: Final = "protected = 1, waits_for = CASE WHEN waits_for <> '' AND event THEN 'events.when' ELSE '' END"
-"""Of an object that must not be evicted from now on (``model.waits_for``)."""
+"""SET clause for an object that must not be evicted from now on (``model.waits_for``)."""
 
 
 class ObjectTable(Table):
-    """The rows of objects."""
+    """Reads the rows of objects, those that have left the spool among them."""
 
-    def __init__(self, connection: Callable[[], sqlite3.Connection], history: HistoryTable, catalog: CatalogTable,
-                 requests: RequestTable) -> None:  # fmt: skip
+    def __init__(self, connection: Callable[[], sqlite3.Connection], history: HistoryTable) -> None:
         super().__init__(connection)
         self._history = history
-        self._catalog = catalog
-        self._requests = requests
 
     # -- by key or number ------------------------------------------------------------------------------------------
 
@@ -56,13 +49,13 @@ class ObjectTable(Table):
         return self.row(bucket, key) is not None
 
     def row(self, bucket: str, key: str) -> sqlite3.Row | None:
-        """The row of a key: of what left the spool an hour ago without ``content_type``, ``metadata`` and ``priority``."""
+        """The row of a key; without ``content_type``, ``metadata`` and ``priority`` if the object left the spool an hour ago."""
         path, name = split(key)
         found = self.select('bucket = ? AND key = ?', (bucket, key))
         return next(iter(found or self._history.select('bucket = ? AND path = ? AND name = ?', (bucket, path, name))), None)
 
     def full_row(self, number: int) -> Mapping[str, Any] | None:
-        """All columns of an object, with ``counts``: messages by account if it holds those of several."""
+        """All columns of an object, and ``counts``: messages by account if it has several."""
         cursor = self._db.execute('SELECT * FROM objects WHERE id = ?', (number,))
         cursor.row_factory = sqlite3.Row
         row: sqlite3.Row | None = cursor.fetchone()
@@ -72,12 +65,12 @@ class ObjectTable(Table):
         return {**dict(row), 'counts': counts}
 
     def state(self, number: int) -> State | None:
-        """None for an object without a full row: it left the spool an hour ago, or never existed."""
+        """The state of an object; None if it left the spool an hour ago or never existed."""
         found = self._db.execute('SELECT state FROM objects WHERE id = ?', (number,)).fetchone()
         return State(found[0]) if found else None
 
     def rows(self) -> list[sqlite3.Row]:
-        """Of all objects, in the order in which they were spooled."""
+        """The rows of all objects, in the order in which they were spooled."""
         return sorted(self.select('1') + self._history.select('1'), key=itemgetter('id'))
 
     def with_prefix(self, bucket: str, prefix: str, states: Collection[State] = tuple(State)) -> list[sqlite3.Row]:
@@ -88,16 +81,16 @@ class ObjectTable(Table):
         return sorted(found, key=itemgetter('id'))
 
     def with_content(self, bucket: str, prefix: str, sha256: str) -> list[sqlite3.Row]:
-        """Rows of this content whose keys start with ``prefix``."""
+        """Rows with this content whose keys start with ``prefix``."""
         found = self.select('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, after(prefix), sha256))
         return found + self._history.with_prefix(bucket, prefix, sha256)
 
     def in_spool(self) -> list[sqlite3.Row]:
-        """Rows of what is pending, held, kept or quarantined, in the order in which it was spooled."""
+        """Rows of pending, held, kept and quarantined objects, in the order in which they were spooled."""
         return self.select(f'{IN_SPOOL} ORDER BY id')
 
     def keys_in_spool(self, bucket: str, prefix: str) -> frozenset[str]:
-        """Keys with this prefix of what is pending, held, kept or quarantined and whose file is not known to be gone."""
+        """Keys with this prefix of pending, held, kept and quarantined objects, except those recorded as missing."""
         rows = self._db.execute(
             f'SELECT key FROM objects WHERE bucket = ? AND key >= ? AND key < ? AND {IN_SPOOL} AND reason IS NOT ?',  # noqa: S608
             (bucket, prefix, after(prefix), MISSING),
@@ -105,11 +98,11 @@ class ObjectTable(Table):
         return frozenset(key for (key,) in rows)
 
     def quarantined(self, reason: str | None = None) -> list[sqlite3.Row]:
-        """Rows of quarantined objects whose files are there, for this reason or any."""
+        """Rows of quarantined objects with files, for this reason or any."""
         return self.select("state = 'quarantined' AND reason = ifnull(?, reason) AND reason <> ? ORDER BY id", (reason, MISSING))
 
     def held(self, reason: str, limit: int) -> list[HeldObject]:
-        """What has no final name yet for this reason, the oldest first."""
+        """Objects without a final name for this reason, oldest first."""
         rows = self._db.execute(
             "SELECT id, bucket, key, metadata, t_start_ns, t_end_ns, created_ns FROM objects WHERE state = 'held' AND reason = ?"
             ' ORDER BY id LIMIT ?', (reason, limit),
@@ -118,7 +111,7 @@ class ObjectTable(Table):
                 for number, bucket, key, metadata, start_ns, end_ns, created_ns in rows]  # fmt: skip
 
     def held_count(self, reason: str) -> int:
-        """How many objects have no final name yet for this reason."""
+        """How many objects have no final name for this reason."""
         query = "SELECT count(*) FROM objects WHERE state = 'held' AND reason = ?"
         return int(self._db.execute(query, (reason,)).fetchone()[0])
 
@@ -126,9 +119,9 @@ class ObjectTable(Table):
 
     def pending(self, limit: int, *, oldest: bool, without: Sequence[str] = (),
                 waiting_for: Collection[str] = ()) -> list[sqlite3.Row]:  # fmt: skip
-        """Objects to upload: most important first or oldest first, not of buckets ``without``, none that ``waiting_for`` delays.
+        """Objects to upload, by priority or oldest first; skips the buckets ``without`` and objects delayed by ``waiting_for``.
 
-        Each bucket has its own query, so that the backlog of those that are left out costs nothing.
+        Each bucket has its own query, so that the backlog of skipped buckets takes no time.
         """
         order = ('id',) if oldest else ('priority', 'id')
         rules = ''.join(f" AND waits_for <> '{setting}'" for setting in (UPLOAD_WHEN, EVENTS_WHEN) if setting in waiting_for)
@@ -138,7 +131,7 @@ class ObjectTable(Table):
         return list(islice(merge(*found, key=itemgetter(*order)), limit))
 
     def _pending_buckets(self) -> Iterator[str]:
-        """The buckets of all pending objects: one step in the index for each."""
+        """The buckets of all pending objects, by one index lookup each."""
         query = "SELECT bucket FROM objects WHERE state = 'pending' AND bucket > ? ORDER BY bucket LIMIT 1"
         bucket = ''
         while row := self._db.execute(query, (bucket,)).fetchone():
@@ -146,29 +139,45 @@ class ObjectTable(Table):
             yield bucket
 
     def oldest_pending_ns(self) -> int | None:
-        """When the object that has waited longest for delivery was spooled; None if none waits."""
+        """When the oldest pending object was spooled; None if there is none."""
         return next((row['created_ns'] for row in self.pending(1, oldest=True)), None)
 
     def evictable(self, limit: int) -> list[sqlite3.Row]:
-        """What a full disk evicts first: lowest priority, then oldest; never a protected object."""
+        """The objects to evict first on a full disk: lowest priority, then oldest; never protected ones."""
         return self.select("state IN ('pending', 'held') AND NOT protected ORDER BY priority DESC, id LIMIT ?", (limit,))
 
     def evictable_bytes(self) -> dict[int, int]:
-        """What evicting everything that may be evicted would free, by priority."""
+        """Bytes of all evictable objects, by priority."""
         where = "state IN ('pending', 'held') AND NOT protected"
         return dict(self._db.execute(f'SELECT priority, sum(bytes) FROM objects WHERE {where} GROUP BY priority'))  # noqa: S608
 
     def payload_bytes(self) -> int:
-        """Bytes of all payload in the spool except what is kept; files that are gone take no room."""
+        """Bytes of all files in the spool, except those of kept objects."""
         present = "SELECT ifnull(sum(bytes), 0) FROM tally WHERE state IN ('pending', 'held', 'quarantined')"
         missing = "SELECT ifnull(sum(bytes), 0) FROM objects WHERE state = 'quarantined' AND reason = 'missing'"
         return int(self._db.execute(f'SELECT ({present}) - ({missing})').fetchone()[0])
 
-    # -- changes ---------------------------------------------------------------------------------------------------
+    def select(self, where: str, values: Sequence[object] = (), table: str = 'objects') -> list[sqlite3.Row]:
+        """Rows that meet an SQL condition."""
+        cursor = self._db.execute(f'SELECT {_COLUMNS} FROM {table} WHERE {where}', tuple(values))  # noqa: S608
+        cursor.row_factory = sqlite3.Row
+        return cursor.fetchall()
+
+
+class ObjectStates(Table):
+    """Writes the rows of objects. A new state, and everything that follows from it, is one step here.
+
+    Triggers (schema.sql) update the totals and the rows of lost messages; ``CatalogTable`` and ``RequestedTable`` are called.
+    """
+
+    def __init__(self, connection: Callable[[], sqlite3.Connection], catalog: CatalogTable, requested: RequestedTable) -> None:
+        super().__init__(connection)
+        self._catalog = catalog
+        self._requested = requested
 
     def insert(self, item: DataObject, key: str, sha256: str, state: State, reason: str | None,
                metadata: Mapping[str, str], now_ns: int) -> int:  # fmt: skip
-        """Add a row under the final key; returns its id. What decides the object's fate later are columns, written here."""
+        """Insert a row under the final key, with the columns that decide what happens to the object later. Returns its id."""
         row = {
             'bucket': item.bucket, 'key': key, 'state': state.value, 'reason': reason, 'priority': item.priority,
             'protected': item.protected, **_fate(item.sensor, metadata, protected=item.protected), 'sensor': item.sensor,
@@ -188,17 +197,16 @@ class ObjectTable(Table):
         return number
 
     def move(self, ids: Iterable[int], state: State, reason: str | None, now_ns: int) -> None:
-        """Give objects another state; the totals follow.
+        """Change the state of objects that are still in the spool.
 
-        Only what is still in the spool moves, with one exception: an object that was evicted while it was being uploaded, and
-        that the store confirmed anyway, is delivered.
+        An exception: an object that was evicted while it was being uploaded becomes delivered if the store confirmed it.
         """
         movable = (State.PENDING, State.HELD, State.KEPT, *((State.EVICTED,) if state is State.DELIVERED else ()))
         self._change(ids, movable, 'state = ?, reason = ?, settled_ns = ?', (state.value, reason, now_ns))
 
     def set_bound(self, row: Mapping[str, Any], key: str, binding: Binding, metadata: Mapping[str, str], created_ns: int,
                   state: State) -> None:  # fmt: skip
-        """A held object, of which this is the full row, has its final key: it waits for delivery, or is kept."""
+        """Give a held object, with this full row, its final key: it becomes pending or kept."""
         values = {
             'state': state.value, 'reason': None, 'key': key, 'metadata': json.dumps(dict(metadata)),
             **_fate(row['sensor'], metadata, protected=bool(row['protected'])), 't_start_ns': binding.t_start_ns,
@@ -211,46 +219,40 @@ class ObjectTable(Table):
         self._db.execute(f'UPDATE objects SET {_PROTECTED} WHERE bucket = ? AND key = ?', (bucket, key))  # noqa: S608
 
     def release(self, number: int, priority: int) -> bool:
-        """A kept object waits for delivery, with this priority, and is not evicted any more; whether it was kept."""
+        """Make a kept object pending with this priority, never to be evicted; False if it was not kept."""
         return self._change([number], (State.KEPT,), f"state = 'pending', priority = ?, {_PROTECTED}", (priority,)) > 0
 
     def set_missing(self, ids: Iterable[int], now_ns: int) -> int:
-        """The files of these objects are gone; returns how many of them were in the spool."""
-        there = list(ids)
+        """Quarantine objects whose files are missing; returns how many of them were in the spool."""
+        ids = list(ids)
         change = "state = 'quarantined', reason = 'missing', settled_ns = ?"
-        again = self._change(there, (State.QUARANTINED,), change, (now_ns,), follow=False)
-        return again + self._change(there, (State.PENDING, State.HELD, State.KEPT), change, (now_ns,))
+        again = self._change(ids, (State.QUARANTINED,), change, (now_ns,), follow=False)
+        return again + self._change(ids, (State.PENDING, State.HELD, State.KEPT), change, (now_ns,))
 
     def set_found(self, number: int) -> None:
-        """The file of a quarantined object is back where it waits for delivery."""
+        """Make a quarantined object pending again, whose file has been moved to where pending objects are."""
         self._change([number], (State.QUARANTINED,), "state = 'pending', reason = NULL, settled_ns = NULL", ())
 
     def set_thinned(self, number: int, values: Mapping[str, object]) -> None:
-        """A kept object has less content (``KeptTable.thin``)."""
+        """Write the row of a kept object with less content (``KeptTable.thin``)."""
         columns = ', '.join(f'{column} = ?' for column in values)
         self._db.execute(f'UPDATE objects SET {columns} WHERE id = ?', (*values.values(), number))  # noqa: S608
 
     def _change(
         self, ids: Iterable[int], of: Sequence[State], change: str, values: Sequence[object], *, follow: bool = True
     ) -> int:
-        """Update the rows that are in one of the states ``of``, and the lists that depend on the state; returns how many."""
+        """Update the rows that are in one of the states ``of``, and what follows from their state; returns how many."""
         query = f'UPDATE objects SET {change} WHERE id = ? AND state IN ({marks(len(of))})'  # noqa: S608 - own constants only
         states = [state.value for state in of]
         changed = [number for number in ids if self._db.execute(query, (*values, number, *states)).rowcount]
         if changed and follow:
             self._catalog.follow(changed)
-            self._requests.follow(changed)
+            self._requested.follow(changed)
         return len(changed)
-
-    def select(self, where: str, values: Sequence[object] = (), table: str = 'objects') -> list[sqlite3.Row]:
-        """Rows by a condition of the spool's own."""
-        cursor = self._db.execute(f'SELECT {_COLUMNS} FROM {table} WHERE {where}', tuple(values))  # noqa: S608
-        cursor.row_factory = sqlite3.Row
-        return cursor.fetchall()
 
 
 def _fate(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> dict[str, object]:
-    """What decides when an object is uploaded, and what its loss means."""
+    """The columns that decide when an object is uploaded, and to what its loss is attributed."""
     return {
         'waits_for': waits_for(sensor, metadata, protected=protected),
         'on_request': metadata.get(words.SHIP) == words.ON_REQUEST,

@@ -1,4 +1,4 @@
-"""Listings and totals of the spool for people: the command line, the live page and the doctor."""
+"""Listings and totals of the spool for the command line, the live page and the doctor."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ SELECT name FROM found WHERE name IS NOT NULL AND name <> '{CATALOG}'"""  # noqa
 
 
 class OverviewTable(Table):
-    """Only reads."""
+    """Read-only queries over all objects."""
 
     def tally(self) -> list[tuple[str, str, int, int, int]]:
         """(topic or '', state or 'spooled', objects, bytes, samples)."""
         return self._db.execute('SELECT topic, state, objects, bytes, samples FROM tally').fetchall()
 
     def by_sensor(self) -> list[tuple[Any, ...]]:
-        """(sensor, state, reason, objects, bytes, oldest created_ns) of what is in the spool, the most important first."""
+        """(sensor, state, reason, objects, bytes, oldest created_ns) of the objects in the spool, by priority."""
         return self._db.execute(
             f'SELECT sensor, state, reason, count(*), sum(bytes), min(created_ns) FROM objects WHERE {IN_SPOOL}'  # noqa: S608
             ' GROUP BY sensor, state, reason ORDER BY min(priority), sensor, state, reason'
@@ -50,9 +50,9 @@ class OverviewTable(Table):
         return {str(reason): count for reason, count in self._db.execute(query)}
 
     def objects(self, state: State | None, sensor: str | None, prefix: str) -> Iterator[tuple[Any, ...]]:
-        """(bucket, key, sensor, state, reason, bytes, created_ns) of what is in the spool, in the order in which it was spooled.
+        """(bucket, key, sensor, state, reason, bytes, created_ns) of the objects in the spool, in the order of spooling.
 
-        ``prefix`` is how ``bucket/key`` starts.
+        ``bucket/key`` starts with ``prefix``.
         """
         return self._db.execute(
             f'SELECT bucket, key, sensor, state, reason, bytes, created_ns FROM objects WHERE {IN_SPOOL}'  # noqa: S608
@@ -145,7 +145,7 @@ class OverviewTable(Table):
         return sorted(found)
 
     def folders(self, robot: str) -> list[str]:
-        """Folders of keys with short rows."""
+        """The folders of objects with short rows."""
         rows = self._db.execute(
             f"SELECT DISTINCT path FROM folders WHERE path >= ? AND path < ? AND sensor <> '{CATALOG}'",  # noqa: S608
             (f'{robot}/', after(f'{robot}/')),

@@ -7,7 +7,7 @@ from shadowhound_data_logger.spool.table import Table
 
 
 class RecordingTable(Table):
-    """Each recording with its closed slices and what is missing in it, by owner: the robot, or the name of ``bag record``."""
+    """Each recording with its closed slices and its missing messages, by owner: the robot, or the name of ``bag record``."""
 
     def write(self, owner: str, rows: RecordingRows) -> None:
         """Add to a recording, or forget it once it is complete."""

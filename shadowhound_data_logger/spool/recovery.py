@@ -1,16 +1,16 @@
 """Recovery before a spool is used again: makes index and tree agree, in both directions (docs/decisions/0001).
 
-After it every pending, held or quarantined row has its file, every file has its row, and sessions whose process died
-are settled: what they had received without an outcome is dropped with the reason ``restart``.
+Afterwards every pending, held and quarantined row has its file, every file has its row, and sessions of dead processes are
+settled: messages that they received without an outcome are dropped with the reason ``restart``.
 
-A part without a row, or a file that was about to become one, was never committed, promised to nobody, and is removed; but a
-power cut may have given the part of a durable row its first name back. That cannot be said of an index that went back in time:
-it is new, or it does not know a session whose file is there, or a session died and left no write-ahead log (SQLite removes
-that at a clean stop only). Then a part that is whole by its own description is adopted, as are files that have their
-names. Where it had not been committed after all its samples are stored as well as lost at the restart: rather that than the
-other way round. A log that is there but damaged does not show; with it, what was being renamed in that instant is lost.
+A part or staged file without a row was never committed and is removed; but a power cut may have undone the rename of a staged
+file to the part of a durable row. This is different if the index lost commits: if it is new, lacks a session whose file exists,
+or a session died and left no write-ahead log (SQLite removes the log only at a clean shutdown). Then a part that matches its
+description is adopted, as are files under their final names. If such a part had not been committed after all, its samples count
+as stored and as lost at the restart, which is better than the opposite. A damaged log cannot be detected; with it, files that
+were being renamed at that moment are lost.
 
-This mends a spool; ``bags/recovery.py`` decides about a bag, ``formats/mcap/recovery.py`` repairs the bytes of a slice.
+This module repairs the spool; ``bags/recovery.py`` decides about bags, ``formats/mcap/recovery.py`` repairs the bytes of a slice.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.core.durable_files import fingerprint, lock
+from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.spool.account_rows import AccountSnapshot, TopicRow
-from shadowhound_data_logger.spool.accounts import SINKS
 from shadowhound_data_logger.spool.adoption import Adoption, Recovery, recorded_place
 from shadowhound_data_logger.spool.ballast import is_disk_full
 from shadowhound_data_logger.spool.binding import renew
@@ -35,20 +34,22 @@ from shadowhound_data_logger.spool.gaps import DROPPED, EXACT, GapRow, TopicGaps
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.ledger import imbalances, of_index
 from shadowhound_data_logger.spool.object_table import MISSING, STATES_IN_SPOOL
+from shadowhound_data_logger.spool.session import SessionFiles
+from shadowhound_data_logger.spool.topic_account import SINKS
 
 log = logging.getLogger(__name__)
 
 DAMAGED: Final = 'damaged'
 REBUILT: Final = 'damaged index rebuilt'
 MICROSECOND: Final = 1000
-_DAMAGED: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
+_DAMAGE_MESSAGES: Final = ('malformed', 'disk I/O', 'already exists', 'no such', 'decode', 'unsupported file format')
 
 
 def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
-    """The index, whole and in agreement with the tree: a damaged one is set aside as ``index.db.damaged-N`` and begun anew.
+    """The index, intact and in agreement with the tree; a damaged one is renamed to ``index.db.damaged-N`` and rebuilt.
 
-    The caller holds the recovery lock. Raises OSError or sqlite3.OperationalError when the folder cannot be used, SpoolError
-    for an index of a newer version.
+    The caller holds the recovery lock. Raises OSError or sqlite3.OperationalError if the folder cannot be used, SpoolError
+    for an index with a newer version.
     """
     path = tree.root / 'index.db'
     while True:
@@ -64,7 +65,7 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
             index.close()
             if report.counts[REBUILT] or not _is_damage(path, error):
                 raise
-            log.exception('the spool index %s is damaged: it is rebuilt from the files', path)
+            log.exception('the spool index %s is damaged and will be rebuilt from the files', path)
             report.counts[REBUILT] += 1
             _set_aside(path)
         except BaseException:
@@ -75,17 +76,17 @@ def open_recovered(tree: Tree, now_ns: int, report: Recovery) -> Index:
 
 
 def _is_damage(path: Path, error: Exception) -> bool:
-    """Whether an error says that the index's bytes are wrong, rather than that it cannot be used now.
+    """Whether an error means that the index is damaged, rather than temporarily unusable.
 
-    A flipped bit can give a record a value of any type: errors that are not SQLite's are such.
+    A flipped bit can give a record a value of any type, so errors that are not SQLite's mean damage, too.
     """
     if not isinstance(error, sqlite3.OperationalError):
         return True
     if is_disk_full(error, path.parent):
         return False
-    if 'readonly' in str(error):  # a flipped bit of the header says so as well
+    if 'readonly' in str(error):  # a flipped bit of the header has the same effect
         return os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)
-    return any(word in str(error) for word in _DAMAGED)
+    return any(text in str(error) for text in _DAMAGE_MESSAGES)
 
 
 def _set_aside(path: Path) -> None:
@@ -98,57 +99,58 @@ def _set_aside(path: Path) -> None:
 
 
 def _recover(tree: Tree, index: Index, now_ns: int, report: Recovery, *, has_log: bool) -> None:
-    """Make index and tree agree and settle dead sessions."""
-    _stay_apart(tree, index, now_ns)
-    _follow_rows(tree, index, now_ns, report)
-    _settle_parts(tree, index, report, adopt=_went_back(tree, index, has_log=has_log))
+    """Make index and tree agree, and settle dead sessions."""
+    sessions = SessionFiles(tree.root)
+    _skip_used_numbers(sessions, index, now_ns)
+    _follow_rows(tree, sessions, index, now_ns, report)
+    _settle_parts(tree, index, report, adopt=_lost_commits(sessions, index, has_log=has_log))
     Adoption(tree, index, now_ns, report).run()
     for session in index.accounts.sessions(ended=False):
-        if _is_dead(tree, session):
+        if sessions.is_dead(session):
             _settle_session(index, session, now_ns, report)
-    for session in set(tree.sessions()).difference(index.accounts.sessions(ended=False)):
-        if _is_dead(tree, session):
-            tree.remove(tree.session(session))
+    for session in sessions.numbers().difference(index.accounts.sessions(ended=False)):
+        if sessions.is_dead(session):
+            tree.remove(sessions.path(session))
     for session, body in tree.staged():
-        if _is_dead(tree, session):
+        if sessions.is_dead(session):
             tree.remove(body)
             report.counts['files not committed'] += 1
     for sentence in imbalances(of_index(index, '')) or index.miscounted():
-        log.error('the ledger of %s does not close, its index was damaged: %s', tree.root, sentence)
-        report.counts['sums of the ledger that do not close'] += 1
+        log.error('the ledger of %s does not balance because its index was damaged: %s', tree.root, sentence)
+        report.counts['sums of the ledger that do not balance'] += 1
     tree.prune()
 
 
-def _stay_apart(tree: Tree, index: Index, now_ns: int) -> None:
-    """Give out no number that a process has given out which lives with the index before, until it finds that this was lost.
+def _skip_used_numbers(sessions: SessionFiles, index: Index, now_ns: int) -> None:
+    """Make the numbers of a rebuilt index differ from those that a running process used with the lost one.
 
-    Numbers begin with the time in microseconds: a recovery adopts more than one file a millisecond, so with milliseconds two
-    indexes that were rebuilt shortly after each other could give out the same number.
+    Numbers start with the time in microseconds: recovery adopts more than one file per millisecond, so with milliseconds two
+    indexes that are rebuilt shortly after each other could use the same number.
     """
     known = {*index.accounts.sessions(ended=False), *index.accounts.sessions(ended=True)}
-    strangers = set(tree.sessions()).difference(known)
-    if strangers:
+    unknown = sessions.numbers().difference(known)
+    if unknown:
         with index.transaction():
-            index.accounts.begin_after(max(strangers), now_ns // MICROSECOND)
+            index.accounts.begin_after(max(unknown), now_ns // MICROSECOND)
 
 
-def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> None:
-    """Every row's file to where the row says it is. Other processes may deliver meanwhile."""
+def _follow_rows(tree: Tree, sessions: SessionFiles, index: Index, now_ns: int, report: Recovery) -> None:
+    """Move every row's file to where the row's state requires it. Other processes may deliver at the same time."""
     missing: list[int] = []
     damaged: list[tuple[sqlite3.Row, Path]] = []
-    staged = _Staged(tree)
+    staged = _StagedFiles(tree, sessions)
     for row in index.objects.in_spool():
         state = State(row['state'])
         if state is State.QUARANTINED and row['reason'] == MISSING:
             continue
-        json.loads(row['metadata'])  # damage that SQLite does not see; later it would stop all delivery
+        json.loads(row['metadata'])  # raises for damage that SQLite does not detect and that would stop all delivery later
         if state in {State.PENDING, State.KEPT} and tree.is_in_place(state, row['bucket'], row['key'], row['bytes']):
             continue
         path = where = tree.path(state, row['reason'], row['bucket'], row['key'])
-        if state is State.KEPT and tree.size(tree.part(row['id'])) == row['bytes']:  # thinned, and not in its place yet
+        if state is State.KEPT and tree.size(tree.part(row['id'])) == row['bytes']:  # thinned, but not renamed yet
             report.counts['renames completed'] += tree.place(tree.part(row['id']), path)
         if tree.size(path) is None:
-            # Last its own place again: another process may just have moved it there.
+            # Check its own place again last: another process may have just moved it there.
             ready, kept = (tree.path(of, None, row['bucket'], row['key']) for of in (State.PENDING, State.KEPT))
             places = (tree.part(row['id']), ready, kept, path)
             found = next((place for place in places if tree.size(place) is not None), None) or staged.pop_content(row)
@@ -157,50 +159,50 @@ def _follow_rows(tree: Tree, index: Index, now_ns: int, report: Recovery) -> Non
                 continue
             where = found
             if state is State.QUARANTINED and found == ready and tree.size(found) == row['bytes']:
-                # Moved there by hand, to be tried again; or quarantined when the power went, and then a try costs nothing.
+                # An operator moved it there to retry it, or the power failed while it was quarantined: then a retry is harmless.
                 with index.transaction():
-                    index.objects.set_found(row['id'])
+                    index.states.set_found(row['id'])
                 report.counts['quarantined files to be tried again'] += 1
             elif found != path and tree.place(found, path):
                 where = path
-                renew(index, row['id'], path)  # a part may say what it was, or what it was about to become
+                renew(index, row['id'], path)  # a part may have the description of its former or its new state
                 report.counts['renames completed'] += 1
         if state is not State.QUARANTINED and tree.size(where) not in {row['bytes'], None}:
             damaged.append((row, where))
     if missing or damaged:
         with index.transaction():
-            report.counts['files missing'] += index.objects.set_missing(missing, now_ns)
-            index.objects.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
+            report.counts['files missing'] += index.states.set_missing(missing, now_ns)
+            index.states.move([row['id'] for row, _ in damaged], State.QUARANTINED, DAMAGED, now_ns)
     for row, where in damaged:
         tree.place(where, tree.path(State.QUARANTINED, DAMAGED, row['bucket'], row['key']))
         report.counts['files damaged'] += 1
 
 
-class _Staged:
-    """Files of dead processes that were about to become parts: of a committed one a power cut may have undone the rename."""
+class _StagedFiles:
+    """Staged files of dead processes: a power cut may have undone the rename of a committed one to its part."""
 
-    def __init__(self, tree: Tree) -> None:
-        self._left = [body for session, body in tree.staged() if _is_dead(tree, session)]
+    def __init__(self, tree: Tree, sessions: SessionFiles) -> None:
+        self._files = [body for session, body in tree.staged() if sessions.is_dead(session)]
 
     def pop_content(self, row: sqlite3.Row) -> Path | None:
-        """One that is, byte for byte, what the row is of; once each."""
-        for body in self._left:
+        """A file with the content of the row's object; each file only once."""
+        for body in self._files:
             if Tree.size(body) == row['bytes'] and fingerprint(body)[1] == row['sha256']:
-                self._left.remove(body)
+                self._files.remove(body)
                 return body
         return None
 
 
-def _went_back(tree: Tree, index: Index, *, has_log: bool) -> bool:
-    """Whether commits may have been lost with the index, or with the log beside it."""
-    dead = [session for session in index.accounts.sessions(ended=False) if _is_dead(tree, session)]
+def _lost_commits(sessions: SessionFiles, index: Index, *, has_log: bool) -> bool:
+    """Whether commits may have been lost with an earlier index or with the write-ahead log."""
+    dead = [session for session in index.accounts.sessions(ended=False) if sessions.is_dead(session)]
     known = {*index.accounts.sessions(ended=False), *index.accounts.sessions(ended=True)}
-    return not known or not known.issuperset(tree.sessions()) or (bool(dead) and not has_log)
+    return not known or not known.issuperset(sessions.numbers()) or (bool(dead) and not has_log)
 
 
 def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) -> None:
-    """Parts without a row are removed, or go where they say that they belong."""
-    # Inside a transaction: another process that is about to commit a part of its own holds the write lock.
+    """Remove parts without a row, or move them where their descriptions say that they belong."""
+    # In a transaction, because another process that is about to commit a part holds the write lock.
     with index.transaction():
         for number, part in tree.parts():
             if index.objects.state(number) in STATES_IN_SPOOL:
@@ -213,7 +215,7 @@ def _settle_parts(tree: Tree, index: Index, report: Recovery, *, adopt: bool) ->
 
 
 def _remove_unthinned(tree: Tree, index: Index, number: int, part: Path, report: Recovery) -> None:
-    """Remove a part beside the whole file of a kept object: the smaller content that it did not get."""
+    """Remove the part of a kept object whose file is complete: the part is the result of a thinning that was not committed."""
     row = index.objects.full_row(number)
     if (
         row is not None
@@ -224,36 +226,19 @@ def _remove_unthinned(tree: Tree, index: Index, number: int, part: Path, report:
         report.counts['uncommitted parts removed'] += 1
 
 
-def any_alive(tree: Tree) -> bool:
-    """Whether a process has the spool open."""
-    return any(not _is_dead(tree, session) for session in tree.sessions())
-
-
-def _is_dead(tree: Tree, session: int) -> bool:
-    """Whether the process of a session is gone: its lock file can be locked."""
-    try:
-        descriptor = os.open(tree.session(session), os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return True
-    try:
-        return lock(descriptor, wait=False)
-    finally:
-        os.close(descriptor)
-
-
 def _settle_session(index: Index, session: int, now_ns: int, report: Recovery) -> None:
-    """Close the accounts of a process that died: what was open is lost, and the ledger says so."""
+    """End the session of a dead process: its open messages are dropped."""
     rows: list[TopicRow] = []
     lost: list[GapRow] = []
     for row in index.accounts.topics(session):
-        if row.topic.startswith(SINKS):  # what is open there is in files, which the node looks for (Spool.carry)
+        if row.topic.startswith(SINKS):  # its open messages are in files, which the node reads (Spool.carry)
             continue
         dropped = {**row.dropped, 'restart': row.dropped.get('restart', 0) + row.open}
         rows.append(replace(row, dropped=dropped) if row.open else row)
         report.counts['messages lost with an open batch'] += row.open
         if row.open > 0:
             gaps = TopicGaps()
-            gaps.add(DROPPED, 'restart', row.open, row.last_kept if any(row.last_kept) else row.heard, row.heard)
+            gaps.add(DROPPED, 'restart', row.open, row.last_kept if any(row.last_kept) else row.newest, row.newest)
             lost += gaps.settle(row.topic, {(DROPPED, 'restart', EXACT): row.open})[0]
     with index.transaction():
         index.accounts.write(session, AccountSnapshot(tuple(rows), (), gaps=tuple(lost)))

@@ -1,14 +1,14 @@
-"""Dates objects whose time was taken while the clock of this machine was not set.
+"""Dates objects that were recorded while the clock of this machine was not set.
 
-A time before 2024 is that of the boot clock (``stamps.StampRule`` sees to that). An object that begins at such a time is held
-under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``, with all that its final name is made of in its metadata,
-where it survives a restart and a lost index. Once the clock is set the offset between the clocks is known, and key, times and
-metadata are those of UTC; content stays as it is. Which offset that is, and how long an object waits for it, is decided in
-``dating.py``; those that go without a date ship under the names that they have.
+A time before 2024 is a time of the boot clock (``stamps.StampRule`` ensures that). An object that begins at such a time is held
+under ``<robot>/_unsynced/<boot_id>/<sensor>/<seconds since boot>``. Its metadata contain everything needed for its final name,
+so it survives a restart and a lost index. Once the clock is set, the offset between the clocks is known, and key, times and
+metadata are converted to UTC; the content is unchanged. ``dating.py`` decides on the offset and on how long an object waits for
+it; objects without a date are shipped under their current names.
 
-Every object says when it was by both clocks: ``boot_id``, ``boot_start_ns``, ``boot_end_ns``, and as ``clock`` how its date is
-known: ``set`` (this machine's clock was right), ``publisher`` (it was not, but that of the publisher's machine),
-``set_later`` (re-dated; ``clock_offset_ns`` is to be added to times in the content), ``unset`` (it has none).
+The metadata of every object contain its times by the boot clock (``boot_id``, ``boot_start_ns``, ``boot_end_ns``), and in
+``clock`` how its date is known: ``set`` (this machine's clock was set), ``publisher`` (only the clock of the publisher's machine
+was), ``set_later`` (dated afterwards; add ``clock_offset_ns`` to times in the content), ``unset`` (it has no date).
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ log = logging.getLogger(__name__)
 CLOCK: Final = 'clock'
 """Why an object is held."""
 STEP: Final = 256
-"""Objects named in one go: some 30 ms."""
+"""Objects dated at a time: some 30 ms."""
 _TIMES: Final = (words.T_START_NS, words.T_END_NS)
 
 
 class Redating:
-    """Holds objects while the clock is not set, and gives them their dates once it is.
+    """Holds objects while the clock is not set, and dates them once it is.
 
-    New; ``date`` every object on its way to the spool, on any thread; ``step`` once a second, on one.
+    Lifecycle: new; ``mark`` every object before it is spooled, on any thread; ``step`` once per second, on one thread.
     """
 
     def __init__(self, spool: Spool, watch: ClockWatch, record: ClockRecord, robot: str) -> None:
@@ -51,7 +51,7 @@ class Redating:
         self._robot = robot
 
     def mark(self, item: DataObject) -> DataObject:
-        """The object with what is known of its time; held, or under another key, where that is not UTC."""
+        """The object with the metadata about its time; held, or under another key, if its time is not UTC."""
         boot_id = self._watch.boot_id
         offset_ns = self._offset_of(boot_id)
         start_ns, end_ns = item.t_start_ns, item.t_end_ns
@@ -71,7 +71,10 @@ class Redating:
         return replace(item, key=key, metadata=metadata, held=CLOCK if offset_ns is None else None)
 
     def step(self) -> list[SpooledObject]:
-        """Look at the clock and name what can be named now; returns what may be shipped. Raises OSError or sqlite3.Error."""
+        """Check the clock and date the objects that can be dated. Returns those that may be shipped now.
+
+        Raises OSError or sqlite3.Error.
+        """
         if self._watch.look() or not self._record.knows(self._watch.boot_id, self._watch.offset_ns()):
             self._record.note(self._watch)
         bindings = [binding for item in self._spool.held(CLOCK, STEP) if (binding := self._binding(item)) is not None]
@@ -79,11 +82,11 @@ class Redating:
             return []
         bound = self._spool.bind(bindings)
         dates = sum(binding.t_start_ns >= EARLIEST_SANE_NS for binding in bindings)
-        log.info('%d objects of before the clock was set are dated, %d go without a date', dates, len(bindings) - dates)
+        log.info('dated %d objects from before the clock was set; %d are shipped without a date', dates, len(bindings) - dates)
         return bound
 
     def _binding(self, item: HeldObject) -> Binding | None:
-        """What becomes of a held object now; None where it has to wait."""
+        """The final key and times of a held object; None if it must wait."""
         offset_ns = self._offset_of(item.metadata.get(words.BOOT_ID, ''))
         if offset_ns is None:
             return None
@@ -92,11 +95,11 @@ class Redating:
                 key, metadata = _final(item.metadata, item.t_start_ns, item.t_end_ns, offset_ns)
                 return Binding(item.id, key, metadata, item.t_start_ns + offset_ns, item.t_end_ns + offset_ns)
             except (NameRefused, LookupError, ValueError) as error:
-                log.warning('%s cannot be dated: %s', item.key, error)
+                log.warning('cannot date %s, which is shipped without a date: %s', item.key, error)
         return Binding(item.id, item.key, item.metadata, item.t_start_ns, item.t_end_ns)
 
     def _offset_of(self, boot_id: str) -> int | None:
-        """As of ``Dating``. Objects wait since the clock is known not to be set: once that is too long, none waits any more."""
+        """As ``Dating.offset_ns``. All objects stop waiting once the clock has been unset for too long."""
         return self._dating.offset_ns(boot_id, self._watch.unset_since_ns)
 
 
@@ -105,7 +108,7 @@ def _boot(boot_id: str, start_ns: int, end_ns: int) -> dict[str, str]:
 
 
 def _final(metadata: Mapping[str, str], start_ns: int, end_ns: int, offset_ns: int) -> tuple[str, dict[str, str]]:
-    """Key and metadata of an object that is re-dated. Raises NameRefused, LookupError or ValueError where they make no sense."""
+    """Key and metadata of an object that is dated now. Raises NameRefused, LookupError or ValueError for invalid metadata."""
     times = {words.T_START_NS: str(start_ns + offset_ns), words.T_END_NS: str(end_ns + offset_ns)}
     rest = {name: value for name, value in metadata.items() if name != words.KEY_PATTERN}
     key = dated(metadata[words.KEY_PATTERN], start_ns + offset_ns)

@@ -1,9 +1,9 @@
-"""Content equal to what was stored just before is kept once: a camera that shows the same picture for minutes.
+"""Stores content once if a sensor repeats it, such as a camera that sends the same image for minutes.
 
-Equal are the same bytes. A repeat is a row of the index in state
-deduplicated, with its own time, and ``content_key`` in its metadata names the object that holds the content; so does its
-row in the catalog. No file of it is written and nothing of it is sent. What was sent cannot be changed, so the first
-object with another content tells, as metadata, how many repeats there were before it. What has repeats is never evicted.
+Content is equal if its bytes are. A repeat is a row of the index in state deduplicated, with its own times; ``content_key`` in
+its metadata and in its catalog row names the object that holds the content. No file of it is written and nothing is uploaded.
+Uploaded objects cannot be changed, so the metadata of the next object with other content contain the number of repeats before it.
+An object that has repeats is never evicted.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
 
-_HOLDS: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
+_HAS_CONTENT: Final = frozenset({State.PENDING.value, State.DELIVERED.value})
 
 
 @dataclass(frozen=True, slots=True)
 class _Last:
-    """What a sensor stored last."""
+    """The last object that a sensor stored."""
 
     key: str
     sha256: str
@@ -36,15 +36,15 @@ class Holder:
     """The object that holds the content of a repeat."""
 
     body: FileBody
-    """Size and checksum of the object that holds the content; its path is of no use."""
-    said: Mapping[str, str]
-    """Metadata of the repeat."""
+    """With its size and checksum; the path is not used."""
+    metadata: Mapping[str, str]
+    """Additional metadata of the repeat."""
 
 
 class Repeats:
-    """Finds content that a sensor has just stored, so that it is kept once.
+    """Recognizes content that a sensor has just stored.
 
-    Guarded by the spool's lock. It knows only what this process stored: the first object after a start is always stored.
+    Guarded by the spool's lock. It remembers only what this process stored: the first object after startup is always stored.
     """
 
     def __init__(self) -> None:
@@ -52,15 +52,15 @@ class Repeats:
         self._next: dict[tuple[str, str, str | None], _Last] = {}
 
     def begin(self) -> None:
-        """A commit begins: what is told from here on counts once it is durable."""
+        """Begin a commit: later calls take effect with ``keep``."""
         self._next = dict(self._last)
 
     def keep(self) -> None:
-        """It is durable."""
+        """The commit is durable."""
         self._last = self._next
 
     def expected(self, items: Sequence[DataObject]) -> frozenset[int]:
-        """Places of those that look like repeats: their content need not be written."""
+        """Indexes of objects that look like repeats, whose content need not be written."""
         last = {source: each.sha256 for source, each in self._next.items()}
         found = set[int]()
         for place, item in enumerate(items):
@@ -72,19 +72,19 @@ class Repeats:
         return frozenset(found)
 
     def holder(self, index: Index, item: DataObject, sha256: str) -> Holder | None:
-        """The object that holds this content already, if it is what the sensor stored last and is still on its way or there."""
+        """The object with this content, if it is the last one that the sensor stored and is pending or delivered."""
         last = self._next.get(_source(item))
         if not item.dedup or item.held or last is None or last.sha256 != sha256:
             return None
         row = index.objects.row(item.bucket, last.key)
-        if row is None or row['state'] not in _HOLDS or row['sha256'] != last.sha256:
-            return None  # evicted, say
-        index.objects.protect(item.bucket, last.key)  # else an outage that fills the disk would cost all its repeats as well
+        if row is None or row['state'] not in _HAS_CONTENT or row['sha256'] != last.sha256:
+            return None
+        index.states.protect(item.bucket, last.key)  # its eviction would lose all its repeats, too
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
         return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), {words.CONTENT_KEY: last.key})
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
-        """The sensor stored this; returns what is to be said of the repeats before it."""
+        """Remember an object that the sensor stored; returns the metadata that describe the repeats before it."""
         if not item.dedup or item.held:
             return {}
         last = self._next.get(_source(item))

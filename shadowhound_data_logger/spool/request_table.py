@@ -1,8 +1,8 @@
-"""The rows of what was asked for: each request with what it found among the kept objects, and what became of that.
+"""Requests for kept objects: one table has the requests, the other the objects that each of them selected and their outcomes.
 
-An object that an open request waits for is not evicted (``KeptTable.evictable``). What became of each is written in the
-transaction that changes the object (``follow``). Of a slice that is cut a request counts fewer bytes than it has: an estimate,
-until the cut takes its place. Requests may be of very many objects, so nothing here changes more than ``PIECE`` rows at a time.
+An object that an open request waits for is not evicted (``KeptTable.evictable``). Outcomes are written in the transaction that
+changes the object (``RequestedTable.follow``). A slice that will be cut counts with the estimated bytes of the cut until the cut
+replaces it. A request may be for very many objects, so one transaction changes at most ``PIECE`` rows.
 """
 
 from __future__ import annotations
@@ -18,17 +18,16 @@ from shadowhound_data_logger.spool.table import Table
 ACTIVE, DONE, EXPIRED, CANCELLED, REFUSED = 'active', 'done', 'expired', 'cancelled', 'refused'
 """States of a request; all but the first are final."""
 _COLUMNS: Final = (
-    'id, requester, priority, made_ns, expires_ns, received_ns, wanted, state, why, objects, bytes, gone, answers, told, told_ns'
+    'id, requester, priority, made_ns, expires_ns, received_ns, selection, state, why, objects, bytes, unavailable, answers,'
+    ' answered_state, answered_ns'
 )
-_HERE: Final = "('kept', 'pending')"
 PIECE: Final = 512
-"""Rows that are changed in one transaction: some 10 ms."""
-_OPEN: Final = "SELECT id FROM requests WHERE state = 'active'"
+"""Rows changed in one transaction: some 10 ms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RequestRow:
-    """A request as the index knows it; times in Unix nanoseconds."""
+    """A request in the index; times in Unix nanoseconds."""
 
     id: str
     requester: str
@@ -36,22 +35,22 @@ class RequestRow:
     made_ns: int
     expires_ns: int
     received_ns: int
-    wanted: str
-    """JSON: what is asked for (``mailbox.py``)."""
+    selection: str
+    """JSON: what is requested (``mailbox.py``)."""
     state: str = ACTIVE
     why: str = ''
-    """Of a request that was refused."""
+    """Why it was refused."""
     objects: int = 0
-    """That it found."""
+    """Selected objects."""
     bytes: int = 0
-    gone: str = '{}'
-    """JSON: what it would have found, had that not left before (``shipping/requests.py``)."""
+    unavailable: str = '{}'
+    """JSON: matching objects that were lost before the request (``shipping/requests.py``)."""
     answers: int = 0
-    """The number of the newest answer that is durable."""
-    told: str = ''
-    """The state that it told; empty before the first one."""
-    told_ns: int = 0
-    """When that was."""
+    """The number of the newest durable answer."""
+    answered_state: str = ''
+    """The state that the newest answer reports; empty before the first one."""
+    answered_ns: int = 0
+    """When the newest answer was written."""
 
     @property
     def is_open(self) -> bool:
@@ -59,7 +58,7 @@ class RequestRow:
 
 
 class KeptObject(NamedTuple):
-    """What a request may choose from."""
+    """An object that a request may select."""
 
     id: int
     bucket: str
@@ -73,24 +72,24 @@ class KeptObject(NamedTuple):
     state: str
     reason: str
     settled_ns: int
-    """When it was evicted, say; 0 of what is here."""
+    """When it was evicted or quarantined; 0 if it was not."""
 
     @property
     def is_here(self) -> bool:
         return self.state in {'kept', 'pending'}
 
 
-class WaitingObject(NamedTuple):
-    """What a request waits for and nobody has released."""
+class UnreleasedObject(NamedTuple):
+    """A kept object that a request waits for and that no request has released."""
 
     id: int
     bytes: int
     is_cut: bool
-    """Only a part of it is wanted."""
+    """Whether only a part of it is requested."""
 
 
 class KeptSlice(NamedTuple):
-    """A slice of which a request wants a part; times in Unix nanoseconds."""
+    """A slice of which a request wants a part."""
 
     id: int
     key: str
@@ -100,61 +99,74 @@ class KeptSlice(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What became of what a request found."""
+    """What became of the objects that a request selected."""
 
     outcomes: Mapping[str, tuple[int, int]]
     """``kept``, ``pending``, ``delivered``, ... -> objects, bytes."""
     lost: tuple[tuple[str, str, str, int], ...]
-    """(key, state, reason, when in Unix nanoseconds) of the first of those that are lost."""
+    """(key, state, reason, time in Unix nanoseconds) of the first lost objects."""
     manifests: tuple[str, ...]
-    """Keys of the manifests of the first bags that were cut for it."""
+    """Keys of the manifests of the first bags that were cut for the request."""
 
 
 class RequestTable(Table):
-    """The requests, and the objects that each of them found."""
-
-    def follow(self, ids: Iterable[int]) -> None:
-        """These objects have a new state: what became of them is the outcome for each request that found them."""
-        self._db.executemany(
-            'UPDATE requested SET (outcome, bytes) = (SELECT state, bytes FROM objects WHERE objects.id = requested.id)'
-            ' WHERE id = ?',
-            ((number,) for number in ids),
-        )
+    """The requests."""
 
     def rows(self) -> list[RequestRow]:
-        """The oldest first."""
+        """All requests, oldest first."""
         cursor = self._db.execute(f'SELECT {_COLUMNS} FROM requests ORDER BY received_ns, id')  # noqa: S608 - own constants only
         names = [name for name, *_ in cursor.description]
         return [RequestRow(**dict(zip(names, row, strict=True))) for row in cursor]
 
-    def open_ids(self) -> list[str]:
-        """Of those that are not over."""
-        return [name for (name,) in self._db.execute('SELECT id FROM requests WHERE state = ?', (ACTIVE,))]
-
-    def add(self, request: str, chosen: Sequence[tuple[int, int]]) -> None:
-        """Some (id, bytes) of what a request chose, as far as they are here still; its row comes after all of them."""
-        self._db.executemany(
-            "INSERT OR REPLACE INTO requested SELECT ?, id, CASE state WHEN 'kept' THEN min(bytes, ?) ELSE bytes END, state"  # noqa: S608 - own constants only
-            f' FROM objects WHERE id = ? AND state IN {_HERE}',
-            ((request, size, number) for number, size in chosen),
-        )
+    def open_count(self) -> int:
+        """How many requests are open."""
+        return int(self._db.execute('SELECT count(*) FROM requests WHERE state = ?', (ACTIVE,)).fetchone()[0])
 
     def accept(self, row: RequestRow) -> RequestRow:
-        """Write the request, which has what was added to it; one of the same id is replaced."""
-        row = self._counted(row)
+        """Write a request, whose selected objects were added before; replaces one with the same id. Returns it as written."""
+        query = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?'
+        objects, size = self._db.execute(query, (row.id,)).fetchone()
+        row = replace(row, objects=objects, bytes=size)
         self._db.execute(
             f'INSERT OR REPLACE INTO requests ({_COLUMNS}) VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)',  # noqa: S608 - own constants only
             tuple(getattr(row, name) for name in _COLUMNS.split(', ')),
         )
         return row
 
-    def _counted(self, row: RequestRow) -> RequestRow:
-        count = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = ?'
-        objects, size = self._db.execute(count, (row.id,)).fetchone()
-        return replace(row, objects=objects, bytes=size)
+    def close(self, request: str, state: str, why: str) -> None:
+        """End an open request; ``RequestedTable.let_go`` must follow."""
+        self._db.execute('UPDATE requests SET state = ?, why = ? WHERE id = ? AND state = ?', (state, why, request, ACTIVE))
 
-    def known(self, robot: str) -> Iterator[KeptObject]:
-        """What is kept of a robot, what was asked for and is on its way, and what left for good within the last hour."""
+    def take_answer(self, request: str, number: int, state: str, now_ns: int) -> bool:
+        """Record an answer that reports this state; False, and nothing changes, if it is not the next one."""
+        query = 'UPDATE requests SET answers = ?, answered_state = ?, answered_ns = ? WHERE id = ? AND answers = ?'
+        return self._db.execute(query, (number, state, now_ns, request, number - 1)).rowcount > 0
+
+    def answered(self, before_ns: int, limit: int | None = None) -> list[str]:
+        """Closed requests whose last answer was written before then, oldest first."""
+        query = (
+            'SELECT id FROM requests WHERE state <> ? AND answered_state = state AND answered_ns < ? ORDER BY answered_ns LIMIT ?'
+        )
+        return [request for (request,) in self._db.execute(query, (ACTIVE, before_ns, -1 if limit is None else limit))]
+
+    def forget(self, request: str) -> None:
+        """Delete the row of a request whose objects were cleared."""
+        self._db.execute('DELETE FROM requests WHERE id = ?', (request,))
+
+
+class RequestedTable(Table):
+    """The objects that each request selected, and their outcomes."""
+
+    def follow(self, ids: Iterable[int]) -> None:
+        """Record the new states of these objects as the outcomes for all requests that selected them."""
+        self._db.executemany(
+            'UPDATE requested SET (outcome, bytes) = (SELECT state, bytes FROM objects WHERE objects.id = requested.id)'
+            ' WHERE id = ?',
+            ((number,) for number in ids),
+        )
+
+    def selectable(self, robot: str) -> Iterator[KeptObject]:
+        """A robot's objects that are kept, released but not delivered, or lost within the last hour."""
         columns = (
             'id, bucket, key, bytes, sensor, topic, t_start_ns, t_end_ns, metadata, state, ifnull(reason, state),'
             ' ifnull(settled_ns, 0)'
@@ -166,40 +178,46 @@ class RequestTable(Table):
             f" UNION SELECT {columns} FROM objects WHERE state IN ('evicted', 'quarantined') AND on_request"
             f' AND {of_robot} ORDER BY id'
         )
-        for (number, bucket, key, size, sensor, topic, start_ns, end_ns, said, state, reason,
+        for (number, bucket, key, size, sensor, topic, start_ns, end_ns, metadata, state, reason,
              settled_ns) in self._db.execute(query, {'first': f'{robot}/', 'after': f'{robot}0'}):  # fmt: skip
-            metadata = json.loads(said)
             yield KeptObject(
-                number, bucket, key, size, sensor, topic, start_ns, end_ns, metadata, state, reason, settled_ns
-            )  # fmt: skip
+                number, bucket, key, size, sensor, topic, start_ns, end_ns, json.loads(metadata), state, reason, settled_ns
+            )
 
-    def close(self, request: str, state: str, why: str) -> None:
-        """End it; ``let_go`` follows."""
-        self._db.execute('UPDATE requests SET state = ?, why = ? WHERE id = ? AND state = ?', (state, why, request, ACTIVE))
-
-    def let_go(self, request: str) -> bool:
-        """Of a request that is over: some of what it has not released is nobody's any more; whether there may be more."""
-        some = "SELECT id FROM requested WHERE request = :request AND outcome = 'kept' LIMIT :most"
-        query = f"UPDATE requested SET outcome = 'unsent' WHERE request = :request AND id IN ({some})"  # noqa: S608 - own constants only
-        return self._db.execute(query, {'request': request, 'most': PIECE}).rowcount == PIECE
+    def add(self, request: str, chosen: Sequence[tuple[int, int]]) -> None:
+        """Add objects (id, bytes) that a request selected; skips those that have left the spool. Its row is written last."""
+        self._db.executemany(
+            "INSERT OR REPLACE INTO requested SELECT ?, id, CASE state WHEN 'kept' THEN min(bytes, ?) ELSE bytes END, state"
+            " FROM objects WHERE id = ? AND state IN ('kept', 'pending')",
+            ((request, size, number) for number, size in chosen),
+        )
 
     def clear(self, request: str) -> bool:
-        """Drop some of what a request chose when it was made before; whether there may be more."""
-        some = 'SELECT id FROM requested WHERE request = :request LIMIT :most'
+        """Delete some of a request's objects; whether there may be more."""
+        some = 'SELECT id FROM requested WHERE request = :request LIMIT :limit'
         query = f'DELETE FROM requested WHERE request = :request AND id IN ({some})'  # noqa: S608 - own constants only
-        return self._db.execute(query, {'request': request, 'most': PIECE}).rowcount == PIECE
+        return self._db.execute(query, {'request': request, 'limit': PIECE}).rowcount == PIECE
 
     def clear_unfinished(self) -> bool:
-        """Drop some of what was added to a request that has no row, or was added again to one that is over; as ``clear``.
+        """Delete some of the objects of requests that were not accepted completely, or are closed; whether there may be more.
 
-        Only the death of a process leaves such.
+        They remain only if a process was killed.
         """
-        some = f"SELECT request, id FROM requested WHERE outcome = 'kept' AND request NOT IN ({_OPEN}) LIMIT ?"  # noqa: S608 - own constants only
+        some = (
+            "SELECT request, id FROM requested WHERE outcome = 'kept'"
+            " AND request NOT IN (SELECT id FROM requests WHERE state = 'active') LIMIT ?"
+        )
         query = f'DELETE FROM requested WHERE (request, id) IN ({some})'  # noqa: S608 - own constants only
         return self._db.execute(query, (PIECE,)).rowcount == PIECE
 
+    def let_go(self, request: str) -> bool:
+        """Let some of the unreleased objects of a closed request be evicted again; whether there may be more."""
+        some = "SELECT id FROM requested WHERE request = :request AND outcome = 'kept' LIMIT :limit"
+        query = f"UPDATE requested SET outcome = 'unsent' WHERE request = :request AND id IN ({some})"  # noqa: S608 - own constants only
+        return self._db.execute(query, {'request': request, 'limit': PIECE}).rowcount == PIECE
+
     def to_cut(self, request: str) -> list[tuple[int, str, str, str, Mapping[str, str]]]:
-        """(id, bucket, key, SHA-256, metadata) of the kept slices of which it wants a part, the oldest first."""
+        """(id, bucket, key, SHA-256, metadata) of the kept slices of which a request wants a part, oldest first."""
         found = self._db.execute(
             'SELECT id, bucket, key, sha256, metadata FROM requested JOIN objects USING (id) WHERE request = ?'
             " AND outcome = 'kept' AND requested.bytes < objects.bytes ORDER BY id", (request,),
@@ -207,74 +225,59 @@ class RequestTable(Table):
         return [(number, bucket, key, sha256, json.loads(metadata)) for number, bucket, key, sha256, metadata in found]
 
     def set_complete(self, request: str, ids: Iterable[int]) -> None:
-        """These are sent whole."""
+        """Send these slices complete instead of cutting them."""
         size = 'SELECT bytes FROM objects WHERE objects.id = requested.id'
         query = f'UPDATE requested SET bytes = ({size}) WHERE request = ? AND id = ?'  # noqa: S608 - own constants only
         self._db.executemany(query, ((request, number) for number in ids))
         self._recount(request)
 
-    def set_cut(self, request: str, ids: Iterable[int], made: Iterable[tuple[int, int, str]]) -> None:
-        """In place of these slices it waits for what was cut out of them: (id, bytes, state)."""
+    def set_cut(self, request: str, ids: Iterable[int], cuts: Iterable[tuple[int, int, str]]) -> None:
+        """Replace these slices by the objects cut out of them: (id, bytes, state)."""
         self._db.executemany('DELETE FROM requested WHERE request = ? AND id = ?', ((request, number) for number in ids))
-        self._db.executemany('INSERT OR REPLACE INTO requested VALUES (?, ?, ?, ?)', ((request, *each) for each in made))
+        self._db.executemany('INSERT OR REPLACE INTO requested VALUES (?, ?, ?, ?)', ((request, *each) for each in cuts))
         self._recount(request)
 
     def _recount(self, request: str) -> None:
         sums = 'SELECT count(*), ifnull(sum(bytes), 0) FROM requested WHERE request = :request'
         self._db.execute(f'UPDATE requests SET (objects, bytes) = ({sums}) WHERE id = :request', {'request': request})  # noqa: S608
 
-    def take_answer(self, request: str, number: int, told: str, now_ns: int) -> bool:
-        """Whether this answer is the next one; it is given then, and tells this state."""
-        query = 'UPDATE requests SET answers = ?, told = ?, told_ns = ? WHERE id = ? AND answers = ?'
-        return self._db.execute(query, (number, told, now_ns, request, number - 1)).rowcount > 0
-
-    def waiting(self, request: str, limit: int) -> list[WaitingObject]:
-        """What it waits for and nobody has released, the oldest first."""
+    def unreleased(self, request: str, limit: int) -> list[UnreleasedObject]:
+        """Kept objects that a request waits for and that no request has released, oldest first."""
         query = (
             'SELECT id, requested.bytes, requested.bytes < objects.bytes FROM requested JOIN objects USING (id)'
             " WHERE request = ? AND outcome = 'kept' ORDER BY id LIMIT ?"
         )
-        return [WaitingObject(number, size, bool(is_cut)) for number, size, is_cut in self._db.execute(query, (request, limit))]
+        rows = self._db.execute(query, (request, limit))
+        return [UnreleasedObject(number, size, bool(is_cut)) for number, size, is_cut in rows]
 
-    def is_over(self, request: str) -> bool:
-        """Whether nothing of it is waited for."""
+    def is_settled(self, request: str) -> bool:
+        """Whether a request waits for no object."""
         query = 'SELECT 1 FROM requested WHERE request = ? AND outcome = ? LIMIT 1'
         return not any(self._db.execute(query, (request, outcome)).fetchone() for outcome in ('kept', 'pending'))
 
     def released(self) -> tuple[int, int]:
-        """Requested objects that wait for delivery, and their bytes."""
+        """Requested objects that wait for delivery: how many, and their bytes."""
         query = "SELECT count(*), ifnull(sum(bytes), 0) FROM (SELECT DISTINCT id, bytes FROM requested WHERE outcome = 'pending')"
         count, size = self._db.execute(query).fetchone()
         return count, size
 
-    def awaited(self) -> tuple[int, int]:
-        """Open requests, and the bytes that they wait for and nobody has released."""
-        (count,) = self._db.execute("SELECT count(*) FROM requests WHERE state = 'active'").fetchone()
-        each = "SELECT max(requested.bytes) AS most FROM requested WHERE outcome = 'kept' GROUP BY id"
-        (size,) = self._db.execute(f'SELECT ifnull(sum(most), 0) FROM ({each})').fetchone()  # noqa: S608 - own constants only
-        return count, size
+    def unreleased_bytes(self) -> int:
+        """Bytes of all objects that requests wait for and that no request has released."""
+        each = "SELECT max(requested.bytes) AS size FROM requested WHERE outcome = 'kept' GROUP BY id"
+        return int(self._db.execute(f'SELECT ifnull(sum(size), 0) FROM ({each})').fetchone()[0])  # noqa: S608 - own constants only
 
-    def progress(self, request: str, most_lost: int = 100) -> Progress:
-        """What became of what it found."""
+    def progress(self, request: str, limit: int = 100) -> Progress:
+        """What became of a request's objects, with up to ``limit`` lost ones and manifests."""
         sums = self._db.execute(
             'SELECT outcome, count(*), sum(bytes) FROM requested WHERE request = ? GROUP BY outcome', (request,)
         )
         outcomes = {outcome: (count, size) for outcome, count, size in sums}
         lost = self._db.execute(
             "SELECT key, outcome, ifnull(reason, ''), ifnull(settled_ns, 0) FROM requested JOIN objects USING (id)"
-            " WHERE request = ? AND outcome IN ('evicted', 'quarantined') ORDER BY id LIMIT ?", (request, most_lost),
+            " WHERE request = ? AND outcome IN ('evicted', 'quarantined') ORDER BY id LIMIT ?", (request, limit),
         )  # fmt: skip
         cut = self._db.execute(
             "SELECT key FROM requested JOIN objects USING (id) WHERE request = ? AND key LIKE '%/manifest.json'"
-            ' ORDER BY id LIMIT ?', (request, most_lost),
+            ' ORDER BY id LIMIT ?', (request, limit),
         )  # fmt: skip
         return Progress(outcomes, tuple(lost.fetchall()), tuple(key for (key,) in cut))
-
-    def answered(self, before_ns: int, most: int | None = None) -> list[str]:
-        """Those that are over, and of which the last answer was given before then; the first ones, as many as are asked for."""
-        query = 'SELECT id FROM requests WHERE state <> ? AND told = state AND told_ns < ? ORDER BY told_ns LIMIT ?'
-        return [request for (request,) in self._db.execute(query, (ACTIVE, before_ns, -1 if most is None else most))]
-
-    def forget(self, request: str) -> None:
-        """Drop the row of a request that was cleared."""
-        self._db.execute('DELETE FROM requests WHERE id = ?', (request,))

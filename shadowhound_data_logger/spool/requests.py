@@ -1,6 +1,6 @@
-"""Requests for kept objects, as durable state: each request with what it found, what was released, and what it was answered.
+"""Requests for kept objects, as durable state: each request with the objects it selected, what was released, and its answers.
 
-A request may be for very many objects, so nothing here changes more than ``request_table.PIECE`` rows in one transaction.
+A request may be for very many objects, so one transaction changes at most ``request_table.PIECE`` rows.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from shadowhound_data_logger.spool.request_table import (
     KeptObject,
     KeptSlice,
     Progress,
+    RequestedTable,
     RequestRow,
-    RequestTable,
-    WaitingObject,
+    UnreleasedObject,
 )
 
 
@@ -38,47 +38,48 @@ class Requests:
 
     def is_any_open(self) -> bool:
         """Whether a requester waits for an answer."""
-        return bool(self._connections.reading.requests.open_ids())
+        return self._connections.reading.requests.open_count() > 0
 
     def progress(self, request: str) -> Progress:
-        """What became of the objects that a request found."""
-        return self._connections.reading.requests.progress(request)
+        """What became of the objects that a request selected."""
+        return self._connections.reading.requested.progress(request)
 
-    def is_over(self, request: str) -> bool:
-        """Whether a request waits for nothing."""
-        return self._connections.reading.requests.is_over(request)
+    def is_settled(self, request: str) -> bool:
+        """Whether a request waits for no object."""
+        return self._connections.reading.requested.is_settled(request)
 
-    def waiting(self, request: str, limit: int) -> list[WaitingObject]:
-        """Objects that a request waits for and that no request has released, oldest first."""
-        return self._connections.reading.requests.waiting(request, limit)
+    def unreleased(self, request: str, limit: int) -> list[UnreleasedObject]:
+        """Kept objects that a request waits for and that no request has released, oldest first."""
+        return self._connections.reading.requested.unreleased(request, limit)
 
     def to_cut(self, request: str) -> list[KeptSlice]:
         """Kept slices of which a request wants a part, oldest first."""
         return [KeptSlice(number, key, self._tree.path(State.KEPT, None, bucket, key), sha256, metadata)
-                for number, bucket, key, sha256, metadata in self._connections.reading.requests.to_cut(request)]  # fmt: skip
+                for number, bucket, key, sha256, metadata in self._connections.reading.requested.to_cut(request)]  # fmt: skip
 
     def released(self) -> tuple[int, int]:
         """Requested objects that wait for delivery: how many, and their bytes."""
-        return self._connections.reading.requests.released()
+        return self._connections.reading.requested.released()
 
-    def awaited(self) -> tuple[int, int]:
-        """Open requests, and the bytes that they wait for and that are not released yet."""
-        return self._connections.reading.requests.awaited()
+    def open(self) -> tuple[int, int]:
+        """How many requests are open, and the bytes that they wait for and that are not released yet."""
+        index = self._connections.reading
+        return index.requests.open_count(), index.requested.unreleased_bytes()
 
     def selectable(self) -> Iterator[KeptObject]:
         """What a request may select of this robot: objects kept, released but not delivered, or lost within the last hour."""
         with self._connections.snapshot() as index:
-            yield from index.requests.known(self._robot)
+            yield from index.requested.selectable(self._robot)
 
     def accept(self, row: RequestRow, chosen: Sequence[tuple[int, int]]) -> RequestRow:
         """Record a request with the (id, bytes) of the kept objects that it selected; returns its row as recorded.
 
-        Fewer bytes than an object has mean a slice that is to be cut. Until its row is written the request does not count.
+        Fewer bytes than an object has mean a slice that must be cut. The request counts once its row is written.
         """
         self._in_pieces(lambda table: table.clear(row.id))
         for begin in range(0, len(chosen), PIECE):
             with self._connections.transaction() as index:
-                index.requests.add(row.id, chosen[begin : begin + PIECE])
+                index.requested.add(row.id, chosen[begin : begin + PIECE])
         with self._connections.transaction() as index:
             return index.requests.accept(row)
 
@@ -93,31 +94,31 @@ class Requests:
         self._in_pieces(lambda table: table.let_go(request))
 
     def set_complete(self, request: str, ids: Collection[int]) -> None:
-        """These slices cannot be cut: the request wants all of each."""
+        """Send these slices complete, because they cannot be cut."""
         with self._connections.transaction() as index:
-            index.requests.set_complete(request, ids)
+            index.requested.set_complete(request, ids)
 
     def set_cut(self, request: str, ids: Collection[int], places: Iterable[tuple[str, str]]) -> int:
         """Replace slices that a request waits for by the objects cut out of them, at (bucket, key); returns their bytes."""
         with self._connections.transaction() as index:
             rows = [row for bucket, key in places if (row := index.objects.row(bucket, key)) is not None]
-            index.requests.set_cut(request, ids, [(row['id'], row['bytes'], row['state']) for row in rows])
+            index.requested.set_cut(request, ids, [(row['id'], row['bytes'], row['state']) for row in rows])
         return sum(row['bytes'] for row in rows)
 
-    def forget(self, before_ns: int, most: int | None = None) -> None:
-        """Delete the rows of requests answered before then (Unix nanoseconds), oldest first, ``most`` at most."""
-        for request in self._connections.reading.requests.answered(before_ns, most):
+    def forget(self, before_ns: int, limit: int | None = None) -> None:
+        """Delete the rows of requests answered before then (Unix nanoseconds), oldest first, at most ``limit``."""
+        for request in self._connections.reading.requests.answered(before_ns, limit):
             self._in_pieces(lambda table: table.clear(request))  # noqa: B023 - called before the loop continues
             with self._connections.transaction() as index:
                 index.requests.forget(request)
 
     def clear_unfinished(self) -> None:
-        """Delete what was left by a process that was killed while it accepted a request."""
-        self._in_pieces(RequestTable.clear_unfinished)
+        """Delete the remains of requests that a killed process was accepting."""
+        self._in_pieces(RequestedTable.clear_unfinished)
 
-    def _in_pieces(self, step: Callable[[RequestTable], bool]) -> None:
+    def _in_pieces(self, step: Callable[[RequestedTable], bool]) -> None:
         """Repeat a step until it reports that nothing is left; other threads get the lock between two steps."""
         more = True
         while more:
             with self._connections.transaction() as index:
-                more = step(index.requests)
+                more = step(index.requested)

@@ -1,7 +1,7 @@
-"""Makes room in the spool: what a full disk costs, decided object by object and recorded as evicted.
+"""Makes room in the spool by evicting objects, and decides which new objects are stored.
 
-This decides how much is evicted and when; the order is that of ``Index.evictable``. A disk that is full at once (ENOSPC) is
-``ballast.py``, an open slice ``bags/recording.py``.
+This module decides how much is evicted and when; ``ObjectTable.evictable`` has the order. ``ballast.py`` handles ENOSPC,
+``bags/recording.py`` an open slice.
 """
 
 from __future__ import annotations
@@ -23,97 +23,98 @@ from shadowhound_data_logger.spool.index import Index
 log = logging.getLogger(__name__)
 
 EVICTION_STEP: Final = 64
-"""Objects looked at for one round of eviction."""
+"""Objects read for one round of eviction."""
 OVERHEAD_BYTES: Final = 8192
-"""What an object costs on disk beyond its bytes: a block's rounding and its share of the index."""
+"""Disk space of an object besides its bytes: rounding to blocks, and its share of the index."""
 NO_ROOM: Final = 'no_room'
 KEEP_LIMIT: Final = 'keep_limit'
-"""Why a kept object is evicted where there is room on the disk: beyond ``keep.max_bytes`` the oldest go."""
+"""Reason of a kept object evicted although the disk has room, because kept objects exceed ``keep.max_bytes``."""
 KEEP_DAYS: Final = 'keep_days'
-"""The same of one that was kept for long enough."""
+"""Reason of a kept object evicted because it is older than ``keep.days``."""
 THINNED: Final = 'thinned'
-"""The same where others of its time stay: room ran short, and rate goes before time."""
-TELL_EVERY_NS: Final = 60 * SECOND
+"""Reason of a kept object evicted while others of the same time remain: the rate is reduced before the duration."""
+LOG_EVERY_NS: Final = 60 * SECOND
 
 
 @dataclass(frozen=True, slots=True)
-class RoomNeeded:
-    """What a group of new objects costs."""
+class RoomMade:
+    """What making room for a group of new objects took."""
 
-    given_up: frozenset[int] = frozenset()
-    """Places in the group of those that are not taken in."""
+    not_stored: frozenset[int] = frozenset()
+    """Indexes of the objects of the group that are evicted immediately."""
     evicted: int = 0
+    """Objects that were in the spool before."""
     unkept: int = 0
-    """Of those, how many could not be kept because what may not be evicted takes all of ``keep.max_bytes``."""
+    """How many of ``not_stored`` could not be kept, because objects that must not be evicted use all of ``keep.max_bytes``."""
 
 
 def make_room(index: Index, tree: Tree, settings: SpoolSettings, keep: KeepSettings, objects: Sequence[DataObject],
-              leaving: int, now_ns: int) -> RoomNeeded:  # fmt: skip
-    """Take in as many of the objects as fit, the most important first, and evict what is not more important for them.
+              leaving: int, now_ns: int) -> RoomMade:  # fmt: skip
+    """Decide which of the objects to store, by priority, and evict objects that are not more important.
 
-    Where the disk is full what is kept goes first. Then, of what is equally important, the oldest goes. Protected objects are
-    always taken in, and nothing is evicted in vain. ``leaving`` bytes are about to be freed. The caller holds the spool's lock
-    and is in no transaction: the evictions are one of their own for each round.
+    On a full disk, kept objects are evicted first; then the least important ones, and the oldest among these. Protected objects
+    are always stored, and nothing is evicted unless that makes enough room. ``leaving`` bytes are about to be freed. The caller
+    holds the spool's lock and is not in a transaction: each round of evictions is a separate one.
     """
     kept = [place for place, item in enumerate(objects) if item.is_on_request and not item.held]
     needed = sum(map(_cost, objects))
-    there = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
-    if not kept and (needed <= leaving or _over(index, tree, settings, needed - leaving, there) <= 0):
-        return RoomNeeded()
+    on_disk = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
+    if not kept and (needed <= leaving or _excess(index, tree, settings, needed - leaving, on_disk) <= 0):
+        return RoomMade()
     unkept = _make_room_to_keep(index, tree, settings, keep, objects, kept, leaving, now_ns)
-    beside = sum(_cost(objects[place]) for place in kept if place not in unkept)
+    kept_bytes = sum(_cost(objects[place]) for place in kept if place not in unkept)
     rest = [place for place in range(len(objects)) if place not in kept]
     needed = sum(_cost(objects[place]) for place in rest)
-    there -= sum(len(objects[place].body) for place in unkept if isinstance(objects[place].body, FileBody))
-    if not rest or (over := _over(index, tree, settings, needed - leaving, there - beside)) <= 0:
-        return RoomNeeded(frozenset(unkept), 0, len(unkept))
-    free, evictable = needed - over, index.objects.evictable_bytes()
-    taken, given_up = 0, set[int]()
+    on_disk -= sum(len(objects[place].body) for place in unkept if isinstance(objects[place].body, FileBody))
+    if not rest or (excess := _excess(index, tree, settings, needed - leaving, on_disk - kept_bytes)) <= 0:
+        return RoomMade(frozenset(unkept), 0, len(unkept))
+    free, evictable = needed - excess, index.objects.evictable_bytes()
+    taken, not_stored = 0, set[int]()
     for place in sorted(rest, key=lambda place: (not objects[place].protected, objects[place].priority, -place)):
         item = objects[place]
         room = free + sum(size for priority, size in evictable.items() if priority >= item.priority)
         if item.protected or taken + _cost(item) <= room:
             taken += _cost(item)
         else:
-            given_up.add(place)
+            not_stored.add(place)
     evicted = 0
     if taken and taken - free <= sum(evictable.values()):
-        evicted = _evict(index, tree, settings, taken - leaving, there - beside, now_ns)
-    return RoomNeeded(frozenset(given_up | unkept), evicted, len(unkept))
+        evicted = _evict(index, tree, settings, taken - leaving, on_disk - kept_bytes, now_ns)
+    return RoomMade(frozenset(not_stored | unkept), evicted, len(unkept))
 
 
 def _make_room_to_keep(index: Index, tree: Tree, settings: SpoolSettings, keep: KeepSettings, objects: Sequence[DataObject],  # noqa: PLR0913, PLR0917 - as of make_room
                        kept: Sequence[int], leaving: int, now_ns: int) -> set[int]:  # fmt: skip
-    """Evict what is kept, the oldest first, for ``keep.max_bytes`` and for a full disk; returns places of what is not kept."""
+    """Evict kept objects, oldest first, for ``keep.max_bytes`` and for a full disk; returns the indexes of those not kept."""
     needed = sum(map(_cost, objects))
-    there = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
-    asked = sum(len(objects[place].body) for place in kept)
+    on_disk = sum(len(item.body) for item in objects if isinstance(item.body, FileBody))
+    new_bytes = sum(len(objects[place].body) for place in kept)
 
-    def over() -> tuple[int, int]:
-        """By the disk, and by the limit."""
-        short = settings.min_free_bytes + needed - leaving - tree.free_bytes() - there
-        return short, index.kept.bytes() + asked - keep.max_bytes if kept else 0
+    def excess() -> tuple[int, int]:
+        """Bytes too many on the disk, and beyond ``keep.max_bytes``."""
+        on_full_disk = settings.min_free_bytes + needed - leaving - tree.free_bytes() - on_disk
+        return on_full_disk, index.kept.bytes() + new_bytes - keep.max_bytes if kept else 0
 
-    while max(by := over()) > 0 and (rows := index.kept.evictable(EVICTION_STEP)):
+    while max(by := excess()) > 0 and (rows := index.kept.evictable(EVICTION_STEP)):
         left, count = max(by), 0
         while count < len(rows) and left > 0:
             left -= rows[count]['bytes']
             count += 1
         _remove(index, tree, rows[:count], NO_ROOM if by[0] > 0 else KEEP_LIMIT, now_ns)
-    short, beyond = over()
-    left_out = set[int]()
+    by_disk, by_limit = excess()
+    unkept = set[int]()
     for place in kept:
-        if max(short, beyond) <= 0:
+        if max(by_disk, by_limit) <= 0:
             break
         if not objects[place].protected:
-            left_out.add(place)
-            short -= _cost(objects[place])
-            beyond -= len(objects[place].body)
-    return left_out
+            unkept.add(place)
+            by_disk -= _cost(objects[place])
+            by_limit -= len(objects[place].body)
+    return unkept
 
 
 def evict_old(index: Index, tree: Tree, keep: KeepSettings, now_ns: int) -> int:
-    """Evict what has been kept for ``keep.days``, some of it at a time; returns how many objects. As of ``make_room``."""
+    """Evict some of the objects kept for longer than ``keep.days``; returns how many. Locks as for ``make_room``."""
     rows = index.kept.evictable(EVICTION_STEP, now_ns - round(keep.days * 24 * 3600 * SECOND))
     if rows:
         _remove(index, tree, rows, KEEP_DAYS, now_ns)
@@ -121,7 +122,7 @@ def evict_old(index: Index, tree: Tree, keep: KeepSettings, now_ns: int) -> int:
 
 
 def thin_out(index: Index, tree: Tree, sha256_of: Mapping[int, str], now_ns: int) -> int:
-    """Evict these where they are kept as they were and nobody asked for them; returns how many. As of ``make_room``."""
+    """Evict those of these objects that are kept, unchanged and not requested; returns how many. Locks as for ``make_room``."""
     rows = [row for number, sha256 in sha256_of.items() if (row := index.kept.thinnable_row(number, sha256)) is not None]
     _remove(index, tree, rows, THINNED, now_ns)
     return len(rows)
@@ -129,29 +130,29 @@ def thin_out(index: Index, tree: Tree, sha256_of: Mapping[int, str], now_ns: int
 
 def _remove(index: Index, tree: Tree, rows: Sequence[Row | Mapping[str, Any]], reason: str, now_ns: int) -> None:
     with index.transaction():
-        index.objects.move([row['id'] for row in rows], State.EVICTED, reason, now_ns)
+        index.states.move([row['id'] for row in rows], State.EVICTED, reason, now_ns)
     for row in rows:
         tree.remove(tree.path(State(row['state']), row['reason'], row['bucket'], row['key']))
         tree.remove(tree.part(row['id']))
 
 
 def fits(tree: Tree, objects: Sequence[DataObject]) -> bool:
-    """Whether the disk takes these objects as it is, before anything leaves it, and the index's log beside them."""
+    """Whether the disk has room for these objects and the index's log, without evicting anything."""
     return tree.free_bytes() >= sum(map(_cost, objects)) + BALLAST_BYTES
 
 
 def is_short(tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject]) -> bool:
-    """Whether something would have to leave the disk for these objects."""
+    """Whether something must be removed to make room for these objects."""
     return tree.free_bytes() < sum(map(_cost, objects)) + max(BALLAST_BYTES, settings.min_free_bytes)
 
 
-def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int, now_ns: int) -> int:
-    """Evict the least important, of these the oldest, until ``needed`` bytes fit; returns how many objects that took."""
+def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, on_disk: int, now_ns: int) -> int:
+    """Evict the least important and oldest objects until ``needed`` bytes fit; returns how many objects."""
     evicted = 0
-    while (over := _over(index, tree, settings, needed, there)) > 0 and (rows := index.objects.evictable(EVICTION_STEP)):
+    while (excess := _excess(index, tree, settings, needed, on_disk)) > 0 and (rows := index.objects.evictable(EVICTION_STEP)):
         count = 0
-        while count < len(rows) and over > 0:
-            over -= rows[count]['bytes']
+        while count < len(rows) and excess > 0:
+            excess -= rows[count]['bytes']
             count += 1
         _remove(index, tree, rows[:count], NO_ROOM, now_ns)
         evicted += count
@@ -162,41 +163,41 @@ def _cost(item: DataObject) -> int:
     return len(item.body) + OVERHEAD_BYTES
 
 
-def _over(index: Index, tree: Tree, settings: SpoolSettings, needed: int, there: int) -> int:
-    """Bytes too many with ``needed`` more, by quota or file system, whichever is worse; ``there`` lie in it already."""
-    free = tree.free_bytes() + there
+def _excess(index: Index, tree: Tree, settings: SpoolSettings, needed: int, on_disk: int) -> int:
+    """Bytes too many with ``needed`` more, by quota or file system, whichever is worse; ``on_disk`` of them exist already."""
+    free = tree.free_bytes() + on_disk
     return max(index.objects.payload_bytes() + needed - settings.max_bytes, settings.min_free_bytes + needed - free)
 
 
 class Shortage:
-    """Logs that objects were evicted: when that begins, once a minute while it lasts, and when it is over."""
+    """Counts evictions and logs them: when they start, once per minute, and when there is room again."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._lost = 0
-        self._lost_ns = self._told_ns = self._unkept_ns = 0
+        self._lost_ns = self._logged_ns = self._unkept_ns = 0
         self.evicted = 0
-        """Objects that were evicted since the spool was opened."""
+        """Objects evicted since the spool was opened."""
         self.unkept = 0
-        """Of those, how many could not be kept because nothing that is kept may be evicted."""
+        """How many of them could not be kept, because no kept object may be evicted."""
 
-    def note(self, room: RoomNeeded, now_ns: int) -> None:
-        """What one commit cost."""
-        lost = room.evicted + len(room.given_up) - room.unkept
+    def note(self, room: RoomMade, now_ns: int) -> None:
+        """Count the evictions of one commit."""
+        lost = room.evicted + len(room.not_stored) - room.unkept
         self.evicted += room.unkept
         if room.unkept:
             self.unkept += room.unkept
-            if not 0 <= now_ns - self._unkept_ns < TELL_EVERY_NS:
+            if not 0 <= now_ns - self._unkept_ns < LOG_EVERY_NS:
                 self._unkept_ns = now_ns
-                log.error('the spool %s keeps nothing more: all in it is protected or asked for; %d objects are lost so far',
-                          self._root, self.unkept)  # fmt: skip
+                log.error('the spool %s cannot keep more objects, because all kept ones are protected or requested: %d are lost '
+                          'so far; raise keep.max_bytes or free some space', self._root, self.unkept)  # fmt: skip
         if lost:
             self.evicted += lost
             self._lost += lost
             self._lost_ns = now_ns
-            if not 0 <= now_ns - self._told_ns < TELL_EVERY_NS:
-                self._told_ns = now_ns
+            if not 0 <= now_ns - self._logged_ns < LOG_EVERY_NS:
+                self._logged_ns = now_ns
                 log.warning('the spool %s is full: evicted %d objects so far, the least important first', self._root, self._lost)
-        elif self._lost and not 0 <= now_ns - self._lost_ns < TELL_EVERY_NS:
+        elif self._lost and not 0 <= now_ns - self._lost_ns < LOG_EVERY_NS:
             log.info('the spool %s has had room for a minute; %d objects were evicted', self._root, self._lost)
-            self._lost = self._told_ns = 0
+            self._lost = self._logged_ns = 0

@@ -1,4 +1,4 @@
-"""The tables of the spool's index (schema.sql): created, checked, and which of their values are plausible."""
+"""Creates and checks the tables of the spool's index (schema.sql), and defines which of their values are plausible."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from shadowhound_data_logger.core.errors import SpoolError
 SCHEMA: Final = Path(__file__).with_name('schema.sql').read_text(encoding='utf-8')
 SCHEMA_VERSION: Final = 1
 VERSION_LIMIT: Final = 1000
-"""A version from here on is damage, not a newer program's."""
+"""A version from here on means damage, not a newer program."""
 _COUNTS: Final = frozenset({
     'again', 'answers', 'bytes', 'count', 'estimated', 'folder', 'id', 'merged', 'messages', 'number', 'objects', 'place',
     'published', 'received', 'samples', 'seq', 'session', 'skipped', 'stored', 'unknown', 'version',
 })  # fmt: skip
-"""Never negative, and no more than can be counted. Times and sequence numbers are whatever a publisher sends."""
-_MOST: Final = 1 << 53
+"""Columns that are never negative nor absurdly large. Times and sequence numbers may have any value that a publisher sends."""
+_MAX: Final = 1 << 53
 _JSON: Final = {
     'accounts': ('rejected', 'dropped', 'by_arrival', 'corrected', 'stamps'), 'publishers': ('missed',), 'estimates': ('missed',),
-    'objects': ('metadata',), 'requests': ('wanted', 'gone'),
+    'objects': ('metadata',), 'requests': ('selection', 'unavailable'),
 }  # fmt: skip
-_MORE: Final = {
+_CONDITIONS: Final = {
     'objects': (
         "length(key) > 1024 OR length(bucket) > 64 OR bucket GLOB '*[^A-Za-z0-9_.-]*' OR bucket IN ('', '.', '..')"
         " OR '/' || key || '/' GLOB '*/../*' OR '/' || key || '/' GLOB '*/./*' OR '/' || key || '/' GLOB '*//*'"
         " OR length(reason) > 200 OR reason GLOB '*/*' OR reason IN ('.', '..')"
     ),
-    'rhythms': f'period NOT BETWEEN 0 AND {_MOST}',
+    'rhythms': f'period NOT BETWEEN 0 AND {_MAX}',
     'compact_objects': 'state > 2',
 }
 
@@ -39,7 +39,7 @@ _MORE: Final = {
 def version_of(connection: sqlite3.Connection, path: Path) -> int:
     """The version of an index; 0 if it has no tables yet.
 
-    Raises sqlite3.DatabaseError for an impossible version, SpoolError for that of a newer program, which is left untouched.
+    Raises sqlite3.DatabaseError for an impossible version, SpoolError for that of a newer program, whose index is not touched.
     """
     version = int(connection.execute('PRAGMA user_version').fetchone()[0])
     if not 0 <= version < VERSION_LIMIT or (version > SCHEMA_VERSION and definitions(connection) == expected()):
@@ -62,7 +62,7 @@ def prepare(connection: sqlite3.Connection, path: Path, *, read_only: bool) -> N
 
 
 def definitions(db: sqlite3.Connection) -> set[tuple[str, str]]:
-    """Name and text of all tables, views, indexes and triggers."""
+    """The names and statements of all tables, views, indexes and triggers."""
     return set(db.execute('SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL'))
 
 
@@ -77,8 +77,8 @@ def expected() -> frozenset[tuple[str, str]]:
 def implausible() -> Mapping[str, str]:
     """Table -> the query for a row with a value that this program cannot have written.
 
-    A flipped bit gives a record any value, and SQLite sees nothing wrong with it: a text among numbers would stop every
-    startup, a key with ``..`` in it would lead out of the spool. A query takes 4 us per row.
+    A flipped bit may give a record any value, which SQLite does not detect: a text in a numeric column would fail every startup,
+    and a key with ``..`` would escape the spool's folder. A query takes 4 us per row.
     """
     with closing(_empty()) as db:
         tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
@@ -100,11 +100,11 @@ def _implausible(db: sqlite3.Connection, table: str) -> str:
 
 
 def _conditions(table: str, columns: Mapping[str, str]) -> Iterator[str]:
-    """NULL is checked by the table's own constraints."""
+    """The conditions that hold for an implausible row; the table's constraints check NULL."""
     for name, kind in columns.items():
         yield f"typeof({name}) NOT IN ('{kind}', 'null')"
         if kind == 'integer' and name in _COUNTS:
-            yield f'{name} NOT BETWEEN 0 AND {_MOST}'
+            yield f'{name} NOT BETWEEN 0 AND {_MAX}'
     yield from (f"{name} NOT GLOB '{{*}}'" for name in _JSON.get(table, ()))
-    if table in _MORE:
-        yield _MORE[table]
+    if table in _CONDITIONS:
+        yield _CONDITIONS[table]

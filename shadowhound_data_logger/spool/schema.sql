@@ -1,6 +1,6 @@
 -- The spool's index: what every object is, where it is, and the accounts of all messages (docs/decisions/0001).
 --
--- One version until 1.0. schema.py creates it, checks it and says which values are plausible.
+-- One version until 1.0. schema.py creates it, checks it and defines which values are plausible.
 -- Triggers only keep sums: tally (objects, bytes and messages by topic and state) and the messages of lost objects in gaps.
 -- Everything else that follows from a new state is written by ObjectTable, in the same transaction.
 
@@ -30,10 +30,10 @@ CREATE TABLE objects (
   created_ns INTEGER NOT NULL,
   settled_ns INTEGER,           -- when it left the spool, or was set aside
   UNIQUE (bucket, key));
--- Each bucket in both orders: while one accepts nothing, the objects of the others are found as fast.
+-- Each bucket in both orders, so that objects are found as fast while other buckets accept nothing.
 CREATE INDEX pending ON objects (bucket, priority, id) WHERE state = 'pending';
 CREATE INDEX waiting ON objects (bucket, id) WHERE state = 'pending';
--- What is uploaded while upload.when is false, however much waits for it.
+-- Objects that are uploaded while upload.when is false.
 CREATE INDEX exempt ON objects (bucket, priority, id) WHERE state = 'pending' AND waits_for <> 'upload.when';
 CREATE INDEX held ON objects (reason, id) WHERE state = 'held';
 CREATE INDEX kept ON objects (id, bytes) WHERE state = 'kept';
@@ -86,7 +86,7 @@ CREATE TRIGGER contents_moved AFTER UPDATE OF state ON objects WHEN OLD.state <>
     ON CONFLICT DO UPDATE SET samples = samples + excluded.samples;
 END;
 
--- Objects that left the spool more than an hour ago: what must be known of a key that was used, in a tenth of the bytes.
+-- Objects that left the spool more than an hour ago: what must be remembered of a used key, in a tenth of the bytes.
 CREATE TABLE folders (
   id INTEGER PRIMARY KEY,
   bucket TEXT NOT NULL,
@@ -101,19 +101,19 @@ CREATE TABLE compact_objects (
   bytes INTEGER NOT NULL,
   sha256 BLOB NOT NULL,
   settled_s INTEGER NOT NULL,
-  late_ms INTEGER NOT NULL,     -- how much later than its stamp its first message arrived; 0 if that is unknown
+  late_ms INTEGER NOT NULL,     -- how much later than its stamp its first message arrived; 0 if unknown
   PRIMARY KEY (folder, name)) WITHOUT ROWID;
 
--- Delivered objects that no part of the catalog describes yet, and the statistics of their contents for it.
+-- Delivered objects without a row in any part of the catalog, and the statistics of their contents.
 CREATE TABLE uncataloged (id INTEGER PRIMARY KEY);
 CREATE TABLE statistics (id INTEGER PRIMARY KEY, packed BLOB NOT NULL);
--- Changes of kept objects that no part of the table of kept objects has yet: 'kept', 'lost', or the step of thinning.
+-- Changes of kept objects that are in no part of the table of kept objects yet: 'kept', 'lost', or the step of thinning.
 CREATE TABLE unreported (
   id INTEGER NOT NULL,
   state TEXT NOT NULL,
   PRIMARY KEY (id, state)) WITHOUT ROWID;
 
--- Requests for kept objects, and what became of each object that a request found.
+-- Requests for kept objects, and what became of each object that a request selected.
 CREATE TABLE requests (
   id TEXT NOT NULL PRIMARY KEY,
   requester TEXT NOT NULL,
@@ -121,15 +121,15 @@ CREATE TABLE requests (
   made_ns INTEGER NOT NULL,
   expires_ns INTEGER NOT NULL,
   received_ns INTEGER NOT NULL,
-  wanted TEXT NOT NULL,         -- JSON: the selection (mailbox.py)
+  selection TEXT NOT NULL,      -- JSON (mailbox.py)
   state TEXT NOT NULL,          -- 'active', 'done', 'expired', 'cancelled' or 'refused'
   why TEXT NOT NULL,
   objects INTEGER NOT NULL,
   bytes INTEGER NOT NULL,
-  gone TEXT NOT NULL,           -- JSON: what it would have found earlier
+  unavailable TEXT NOT NULL,    -- JSON: matching objects that were lost before
   answers INTEGER NOT NULL,     -- the number of its newest durable answer ...
-  told TEXT NOT NULL,           -- ... the state that answer reports ...
-  told_ns INTEGER NOT NULL)     -- ... and when it was written
+  answered_state TEXT NOT NULL, -- ... the state that answer reports ...
+  answered_ns INTEGER NOT NULL) -- ... and when it was written
   WITHOUT ROWID;
 CREATE TABLE requested (
   request TEXT NOT NULL,
@@ -138,7 +138,7 @@ CREATE TABLE requested (
   outcome TEXT NOT NULL,        -- the object's state, or 'unsent' once the request has ended
   PRIMARY KEY (request, id)) WITHOUT ROWID;
 CREATE INDEX requested_objects ON requested (id);
-CREATE INDEX requested_waiting ON requested (request, id) WHERE outcome = 'kept';
+CREATE INDEX requested_unreleased ON requested (request, id) WHERE outcome = 'kept';
 CREATE INDEX requested_released ON requested (request, id, bytes) WHERE outcome = 'pending';
 
 -- Bags that are not complete in the spool yet, their closed slices, and what is missing in them (model.RecordingRows).
@@ -188,14 +188,14 @@ CREATE TABLE accounts (
   stored INTEGER NOT NULL,
   rejected TEXT NOT NULL,       -- JSON: messages by reason
   dropped TEXT NOT NULL,        -- JSON: messages by reason
-  by_arrival TEXT NOT NULL,     -- JSON: messages dated by their arrival, by the reason why their own time was not trusted
-  corrected TEXT NOT NULL,      -- JSON: messages stored by the only reading that their data allow, by what was wrong with them
+  by_arrival TEXT NOT NULL,     -- JSON: messages dated by arrival, by the reason why their own time was not trusted
+  corrected TEXT NOT NULL,      -- JSON: messages stored after a correction, by fault
   stamps TEXT NOT NULL,         -- JSON: what was unusual about its publishers' stamps (core/stamps.py, StampReport); '{}' if nothing
   last_kept_ns INTEGER NOT NULL,          -- of the newest durable sample: its stamp ...
   last_kept_received_ns INTEGER NOT NULL, -- ... and when it arrived
   first_ns INTEGER NOT NULL,
-  heard_ns INTEGER NOT NULL,              -- of the newest message: the same two
-  heard_received_ns INTEGER NOT NULL,
+  newest_ns INTEGER NOT NULL,             -- of the newest message: the same two
+  newest_received_ns INTEGER NOT NULL,
   complete_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic)) WITHOUT ROWID;
 CREATE TABLE publishers (
@@ -207,10 +207,10 @@ CREATE TABLE publishers (
   published INTEGER NOT NULL,
   received INTEGER NOT NULL,
   missed TEXT NOT NULL,         -- JSON: messages by cause
-  heard_ns INTEGER NOT NULL,    -- of the message with the number last
-  heard_received_ns INTEGER NOT NULL,
+  last_ns INTEGER NOT NULL,     -- of the message with the number last
+  last_received_ns INTEGER NOT NULL,
   PRIMARY KEY (session, topic, publisher)) WITHOUT ROWID;
--- Types that a topic was published under and that were not logged; messages is NULL if they were not counted.
+-- Types under which a topic was published but not logged; messages is NULL if they were not counted.
 CREATE TABLE other_types (
   session INTEGER NOT NULL,
   topic TEXT NOT NULL,
@@ -218,7 +218,7 @@ CREATE TABLE other_types (
   publishers TEXT NOT NULL,     -- JSON: node names
   messages INTEGER,
   PRIMARY KEY (session, topic, type)) WITHOUT ROWID;
--- Of accounts with messages without sequence numbers: how many of the received ones those are.
+-- Messages without sequence numbers among the received ones of an account.
 CREATE TABLE estimates (
   session INTEGER NOT NULL,
   topic TEXT NOT NULL,
@@ -229,11 +229,11 @@ CREATE TABLE estimates (
 CREATE TABLE rhythms (
   topic TEXT NOT NULL PRIMARY KEY,
   publisher TEXT NOT NULL,
-  of TEXT NOT NULL,
+  source TEXT NOT NULL,         -- 'stamps' or 'counter:FIELD'
   period REAL NOT NULL,
   last INTEGER NOT NULL) WITHOUT ROWID;
 
--- The gap journal: what was lost, and when (gaps.py). Session 0 has the messages of lost objects, which follow the objects.
+-- The gap journal: what was lost, and when (gaps.py). Session 0 has the messages of lost objects.
 CREATE TABLE gaps (
   session INTEGER NOT NULL,
   topic TEXT NOT NULL,
@@ -248,18 +248,18 @@ CREATE TABLE gaps (
   received_from_ns INTEGER,     -- ... and when these two arrived
   received_to_ns INTEGER,
   count INTEGER NOT NULL,
-  merged INTEGER NOT NULL,      -- gaps that are in this row
-  version INTEGER NOT NULL,     -- rises with each change of any row
+  merged INTEGER NOT NULL,      -- gaps in this row
+  version INTEGER NOT NULL,     -- increases with each change of any row
   PRIMARY KEY (session, topic, kind, cause, grade, begin_ns, publisher, mission)) WITHOUT ROWID;
 CREATE INDEX gaps_changed ON gaps (version);
 CREATE INDEX gaps_begun ON gaps (begin_ns);
--- Up to which version the parts in the store report the journal of a robot, and how often it was requested in full again.
+-- Up to which version a robot's journal has been reported to the store, and how often an operator requested to resend it.
 CREATE TABLE gaps_reported (
   robot TEXT NOT NULL PRIMARY KEY,
   version INTEGER NOT NULL,
   again INTEGER NOT NULL) WITHOUT ROWID;
 
--- The messages of every object, by topic: one row of an object with one topic, or one for each topic in it.
+-- The messages of every object, one row per topic.
 CREATE VIEW messages AS
   SELECT objects.id, ifnull(objects.topic, contents.topic) AS topic, ifnull(contents.samples, objects.samples) AS samples,
     state, ifnull(reason, '') AS reason, mission, t_start_ns, t_end_ns,
@@ -292,7 +292,7 @@ CREATE TRIGGER contents_lost AFTER INSERT ON contents
         ELSE excluded.received_from_ns END,
       received_to_ns = CASE WHEN count > 0 THEN max(received_to_ns, excluded.received_to_ns) ELSE excluded.received_to_ns END;
 END;
--- A lost object may still be found, or be lost for another reason: its messages leave the row that has them, or the sum that row is in.
+-- A lost object may be found, or lost for another reason: subtract its messages from their row, or from the sum that contains it.
 CREATE TRIGGER object_found BEFORE UPDATE OF state, reason ON objects
     WHEN OLD.state IN ('evicted', 'quarantined') AND (OLD.state <> NEW.state OR OLD.reason IS NOT NEW.reason) BEGIN
   UPDATE gaps SET version = (SELECT ifnull(max(version), 0) + 1 FROM gaps), merged = max(0, merged - 1), count = count - lost.samples

@@ -1,4 +1,4 @@
-"""The numbers of one publisher on one topic: which came, which are missing between, and why. Guarded by the Accounts' lock."""
+"""The sequence numbers of one publisher on one topic: which were received, which are missing, and why."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.spool.gaps import MISSED, GapKey, TopicGaps
 
 MAX_RANGES: Final = 512
-"""Ranges of numbers that are remembered per publisher (the newest, which may still come late): every second message lost of
-2,000 a second, between two drains. A publisher chooses its numbers, so they are never remembered one by one."""
+"""Ranges of numbers remembered per publisher (the newest ones, which may still arrive late): enough for a loss of every second
+message at 2,000/s between two drains. Numbers are never remembered one by one, because a publisher may send any numbers."""
 
 MAX_MISSED: Final = 1 << 40
-"""More than anybody publishes. Numbers that leap further lie, and that is believed to be no loss: sums stay within SQLite."""
+"""A jump by more cannot be real and is not counted as a loss, so that sums fit into SQLite's integers."""
 
 
 class NumberRun(NamedTuple):
-    """Messages of one publisher whose numbers follow one another, in a file that has the low 32 bits of these."""
+    """Consecutive sequence numbers of one publisher in a file, which stores their low 32 bits."""
 
     start: int
     stop: int
-    """Of the first one that is not in it."""
+    """Exclusive."""
     first: Times
-    """Those of its first message."""
+    """Of the first message."""
     last: Times
-    """Those of its last message."""
+    """Of the last message."""
 
 
 class Ranges:
-    """Numbers in sorted ranges that do not touch, each with a word; at most ``MAX_RANGES``, of which the lowest are forgotten."""
+    """Numbers in sorted, disjoint ranges with a label each; at most ``MAX_RANGES``: the lowest are forgotten."""
 
     __slots__ = ('_rows',)
 
@@ -45,33 +45,33 @@ class Ranges:
     def __contains__(self, number: int) -> bool:
         return self._find(number) is not None
 
-    def append(self, start: int, stop: int, word: GapKey | str) -> None:
-        """A range above all others, ``stop`` not in it."""
-        self._rows.append((start, stop, word))
+    def append(self, start: int, stop: int, label: GapKey | str) -> None:
+        """Add a range above all others; ``stop`` is exclusive."""
+        self._rows.append((start, stop, label))
         del self._rows[:-MAX_RANGES]
 
     def within(self, start: int, stop: int) -> list[tuple[int, int, GapKey | str]]:
-        """What of the ranges lies from ``start`` on and before ``stop``."""
+        """The parts of the ranges between ``start`` and ``stop`` (exclusive)."""
         at = max(bisect_right(self._rows, (start + 1,)) - 1, 0)
         found = []
         while at < len(self._rows) and self._rows[at][0] < stop:
-            low, high, word = self._rows[at]
+            low, high, label = self._rows[at]
             if high > start:
-                found.append((max(low, start), min(high, stop), word))
+                found.append((max(low, start), min(high, stop), label))
             at += 1
         return found
 
     def cut(self, start: int, stop: int) -> None:
-        """Take out numbers that are all in one range."""
+        """Remove numbers that are all in one range."""
         at = self._find(start)
         assert at is not None
-        low, high, word = self._rows[at]
-        rest = [(low, start, word), (stop, high, word)]
+        low, high, label = self._rows[at]
+        rest = [(low, start, label), (stop, high, label)]
         self._rows[at : at + 1] = [row for row in rest if row[0] < row[1]]
         del self._rows[:-MAX_RANGES]
 
     def add(self, number: int) -> bool:
-        """Put in one number that is not in it; False where that would be a range too many."""
+        """Add one number that is in no range; False if that would exceed ``MAX_RANGES``."""
         at = bisect_right(self._rows, (number,))
         below = at > 0 and self._rows[at - 1][1] == number
         above = at < len(self._rows) and self._rows[at][0] == number + 1
@@ -89,53 +89,55 @@ class Ranges:
 
 @dataclass(slots=True)
 class Span:
-    """The numbers of one publisher on one topic, from the first one taken.
+    """The sequence numbers of one publisher on one topic, from the first one taken. Guarded by the lock of the ``Accounts``.
 
     ``published`` = ``received`` + sum of ``missed``, always. A span inherited from an earlier session starts with zero
-    counts and that session's ``first`` and ``last``: the gap before its first message is then missed by ``restart``.
+    counts and that session's ``first`` and ``last``, so the gap before its first message has the cause ``restart``.
     """
 
     first: int | None = None
     last: int | None = None
     inherited: bool = False
-    heard: Times = NO_TIMES
-    """Those of the message with the number ``last``; zeros if they are unknown."""
+    last_times: Times = NO_TIMES
+    """Times of the message with the number ``last``; zeros if unknown."""
     name: str = ''
     gaps: TopicGaps = field(default_factory=TopicGaps)
-    """Where the times of what is missed go: those of its topic."""
+    """The gap journal of its topic."""
     published: int = 0
     received: int = 0
     missed: Counter[str] = field(default_factory=Counter)
-    older: bool = False
-    """Whether rows of earlier sessions have it."""
-    used: int = 0
-    """When it was last observed, by the count of its topic."""
+    has_older_rows: bool = False
+    """Whether earlier sessions have rows of this publisher."""
+    last_used: int = 0
+    """The topic's ``received`` when this publisher was last received."""
     _holes: Ranges = field(default_factory=Ranges)
-    """Numbers below ``last`` that were not taken, with the cause they are missed by; '' where they were not listened to."""
+    """Numbers below ``last`` that were not received, with the key of their gap; '' if they do not count as missed."""
     _early: Ranges = field(default_factory=Ranges)
+    """Numbers received from before the first one taken."""
     _base: int | None = None
+    """The first number taken."""
     _rebased: bool = False
     changed: bool = False
     """Since the last snapshot."""
-    _late: int = 0
-    """Messages after the inherited ``last`` that are counted already: they are not part of the gap before the next one."""
+    _unnumbered: int = 0
+    """Messages after the inherited ``last`` that are already counted, and so are not part of the gap before the next one."""
 
     def __post_init__(self) -> None:
         self._base = self.first
-        self.older = self.inherited
+        self.has_older_rows = self.inherited
 
     def observe(self, number: int, times: Times = NO_TIMES) -> bool:
-        """Count a message by its sequence number; False if it was counted before (a repeat)."""
+        """Count a message by its sequence number; False for a repeat."""
         if self.first is None or self._base is None or self.last is None:
             self.first = self._base = self.last = number
-            self.heard = times
+            self.last_times = times
         elif number > self.last:
             if number > self.last + 1:
-                self._skip(self.last + 1, number, times)
+                self._add_gap(self.last + 1, number, times)
             self.last = number
-            self.heard = times
+            self.last_times = times
             self.inherited = self._rebased = False
-            self._late = 0
+            self._unnumbered = 0
         elif holes := self._holes.within(number, number + 1):
             self.published -= self._fill(holes)
         elif number < self._base and number not in self._early:
@@ -149,53 +151,47 @@ class Span:
         return True
 
     def count(self) -> None:
-        """Count a message that has no number."""
+        """Count one received message."""
         self.received += 1
         self.published += 1
         self.changed = True
 
-    def lose(self, count: int) -> None:
-        """Count messages that the middleware reports to have lost."""
-        self.missed['transport'] += count
-        self.published += count
-        self.changed = True
-
-    def find(self, count: int) -> int:
-        """So many of what a restart cost were recorded after all; returns how many could be among them."""
+    def recover_count(self, count: int) -> int:
+        """Count up to ``count`` messages missed by a restart as received after all; returns how many."""
         found = min(count, self.missed['restart'])
         self.missed['restart'] -= found
         self.received += found
         self.changed = self.changed or bool(found)
         return found
 
-    def late(self, count: int) -> None:
-        """Count messages after the inherited ``last``, whose numbers are not known."""
+    def add_unnumbered(self, count: int) -> None:
+        """Count messages after the inherited ``last`` whose numbers are unknown."""
         if count:
             self.received += count
             self.published += count
             if self.inherited:
-                self._late += count
+                self._unnumbered += count
             self.changed = True
 
-    def recall(self, runs: Sequence[NumberRun], count: int) -> bool:
-        """Count messages of the session before that turned up in a file, ``count`` of them for the first time.
+    def recover(self, runs: Sequence[NumberRun], count: int) -> bool:
+        """Count messages of the previous session found in a file, ``count`` of them for the first time.
 
-        ``runs`` are all that the file has of the topic. False, and nothing is changed, where they do not show that these
-        messages are this publisher's: they begin with the number after its last, or have that one with its stamp.
+        ``runs`` are all messages of the topic in the file. False, and nothing changes, unless they are this publisher's for
+        certain: they start with the number after its last one, or contain its last one with the same stamp.
         """
         if self.last is None or not runs:
             return False
         more = (self.last - runs[0].start + (1 << 31)) >> 32 << 32
         runs = [run._replace(start=run.start + more, stop=run.stop + more) for run in runs]
-        return self._go_on(runs, count) if self.inherited else self._fill_in(runs, count)
+        return self._extend(runs, count) if self.inherited else self._fill_restart_gap(runs, count)
 
-    def _go_on(self, runs: Sequence[NumberRun], count: int) -> bool:
-        """As ``recall``, before the first message of this session."""
+    def _extend(self, runs: Sequence[NumberRun], count: int) -> bool:
+        """``recover`` before the first message of this session."""
         last = self.last
         assert last is not None
         is_own = any(
             run.start == last + 1
-            or (run.start <= last < run.stop and run.first.stamp_ns <= self.heard.stamp_ns <= run.last.stamp_ns)
+            or (run.start <= last < run.stop and run.first.stamp_ns <= self.last_times.stamp_ns <= run.last.stamp_ns)
             for run in runs
         )
         fresh = [run._replace(start=max(run.start, last + 1)) for run in runs if run.stop > last + 1]
@@ -203,16 +199,16 @@ class Span:
             return False
         for run in fresh:
             if run.start > last + 1:
-                self._skip(last + 1, run.start, run.first)
+                self._add_gap(last + 1, run.start, run.first)
             self.last = last = run.stop - 1
-            self.heard = run.last
+            self.last_times = run.last
         self.received += count
         self.published += count
         self.changed = True
         return True
 
-    def _fill_in(self, runs: Iterable[NumberRun], count: int) -> bool:
-        """As ``recall``, after the gap of the restart was counted."""
+    def _fill_restart_gap(self, runs: Iterable[NumberRun], count: int) -> bool:
+        """``recover`` after the gap of the restart was counted."""
         holes = [hole for run in runs for hole in self._holes.within(run.start, run.stop)
                  if isinstance(hole[2], GapKey) and hole[2].cause == 'restart']  # fmt: skip
         if sum(stop - start for start, stop, _ in holes) != count or self.missed['restart'] < count:
@@ -223,7 +219,7 @@ class Span:
         return True
 
     def absorb(self, other: Span) -> None:
-        """Take over the counts of a publisher that is not followed any more; their numbers are nobody's then."""
+        """Add the counts of a former publisher."""
         self.published += other.received
         self.received += other.received
         if self.missed.total() + other.missed.total() <= MAX_MISSED:
@@ -232,11 +228,11 @@ class Span:
         self.changed = True
 
     def rebase(self) -> None:
-        """What is published until the next new message was not listened to on purpose: that gap is not missed."""
+        """Do not count the gap before the next new message as missed: the topic is deliberately not subscribed."""
         self._rebased = True
 
     def _fill(self, holes: Iterable[tuple[int, int, GapKey | str]]) -> int:
-        """Numbers of holes came after all; how many of them were missed until now."""
+        """Remove numbers that arrived late from the holes; returns how many of them counted as missed."""
         filled = 0
         for start, stop, key in holes:
             before = len(self._holes)
@@ -247,17 +243,18 @@ class Span:
                 filled += count
         return filled
 
-    def _skip(self, start: int, stop: int, times: Times) -> None:
-        """Count the numbers of a gap as missed, unless nobody listened, and remember them: they may come late."""
+    def _add_gap(self, start: int, stop: int, times: Times) -> None:
+        """Count the numbers of a gap as missed, unless the topic was not subscribed, and remember them: they may arrive late."""
         cause = '' if self._rebased else 'restart' if self.inherited else 'transport'
         if self.missed.total() + stop - start > MAX_MISSED:
             cause = ''
         hole: GapKey | str = ''
         if cause:
-            known = min(self._late, stop - start)
-            self._late -= known
+            known = min(self._unnumbered, stop - start)
+            self._unnumbered -= known
             count = stop - start - known
             self.missed[cause] += count
             self.published += count
-            hole = self.gaps.add(MISSED, cause, count, self.heard if any(self.heard) else self.gaps.heard, times, self.name)
+            before = self.last_times if any(self.last_times) else self.gaps.newest
+            hole = self.gaps.add(MISSED, cause, count, before, times, self.name)
         self._holes.append(start, stop, hole)

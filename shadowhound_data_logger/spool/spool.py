@@ -28,7 +28,6 @@ from shadowhound_data_logger.core.status import SpoolStatus
 from shadowhound_data_logger.spool import binding
 from shadowhound_data_logger.spool.account_rows import PublisherRow
 from shadowhound_data_logger.spool.accounts import Accounts
-from shadowhound_data_logger.spool.adding import Adding, remove_sources, staged
 from shadowhound_data_logger.spool.adoption import Recovery
 from shadowhound_data_logger.spool.ballast import Ballast, is_disk_full
 from shadowhound_data_logger.spool.connections import Connections
@@ -36,13 +35,13 @@ from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.keeping import KEEP, KeptObjects
+from shadowhound_data_logger.spool.new_objects import NewObjects, remove_sources, staged
 from shadowhound_data_logger.spool.object_table import spooled
-from shadowhound_data_logger.spool.recovery import any_alive, open_recovered
+from shadowhound_data_logger.spool.recovery import open_recovered
 from shadowhound_data_logger.spool.repeats import Repeats
 from shadowhound_data_logger.spool.requests import Requests
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES, Shortage, fits, is_short, make_room
-from shadowhound_data_logger.spool.session import Session, carry
-from shadowhound_data_logger.spool.usage import usage_of
+from shadowhound_data_logger.spool.session import Session, SessionFiles, carry
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +52,7 @@ PUT_BACK_S: Final = 2.5
 DAY_NS: Final = 24 * 3600 * SECOND
 FULL_ROWS_NS: Final = 3600 * SECOND
 """How long the index keeps the full row of an object that left the spool; afterwards only key, size, checksum and state."""
-MOST_OBJECTS: Final = 32
+MAX_OBJECTS: Final = 32
 """Per commit: their rows take about 5 ms, during which other processes wait."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
 
@@ -116,16 +115,16 @@ class Spool:
                 self.accounts.mark_dirty()
                 raise self.unwritable(error) from error
             except sqlite3.DatabaseError as error:
-                self._leave(session)
+                self._end(session)
                 raise SpoolError(f'the index of the spool {self.root} is damaged: {error}',
                                  remedy='restart: the index is then rebuilt from the files') from error  # fmt: skip
-            self._leave(session)
+            self._end(session)
 
     def commit(self, objects: Sequence[DataObject] = (), outcomes: Sequence[Outcome] = (),
                rows: Sequence[RecordingRows] = (), *, leave_files: bool = False) -> list[SpooledObject]:  # fmt: skip
         """One group commit. Returns the objects that may be shipped now, under their final keys.
 
-        Everything is one transaction, for which other processes wait: pass at most ``MOST_OBJECTS`` objects. With ``leave_files``
+        Everything is one transaction, for which other processes wait: pass at most ``MAX_OBJECTS`` objects. With ``leave_files``
         the files of delivered and evicted objects remain until ``remove_files``, which may take longer than the commit.
         Raises OSError or sqlite3.OperationalError if none of it became durable; the caller tries again. Objects for which there
         is no room are recorded as evicted, those whose file is missing as quarantined.
@@ -147,7 +146,7 @@ class Spool:
             if outcome.state is State.QUARANTINED:
                 self._set_apart(item, outcome.reason)
             elif outcome.state in _LEFT and not self._tree.remove(item.path):
-                self._tree.remove(self._tree.waiting(item.id, item.bucket, item.key))
+                self._tree.remove(self._tree.place_pending(item.id, item.bucket, item.key))
 
     def fits(self, objects: Sequence[DataObject]) -> bool:
         """Whether there is room for all of them without deleting anything first. Raises OSError."""
@@ -187,7 +186,8 @@ class Spool:
             if row['id'] not in exclude and len(found) < limit:
                 number, bucket, key = row['id'], row['bucket'], row['key']
                 placed = self._tree.part(number) not in parts
-                path = self._tree.path(State.PENDING, None, bucket, key) if placed else self._tree.waiting(number, bucket, key)
+                path = (self._tree.path(State.PENDING, None, bucket, key) if placed
+                        else self._tree.place_pending(number, bucket, key))  # fmt: skip
                 found.append(spooled(row, path))
         return found
 
@@ -242,7 +242,7 @@ class Spool:
                 index = self._connections.writing
                 with index.transaction():
                     rows = carry(index, self._session.number, self._robot, sink)
-                self.accounts.carry(rows)
+                self.accounts.carried.take_over(rows)
 
     def held(self, reason: str, limit: int = 256) -> list[HeldObject]:
         """Objects without a final name for this reason, oldest first; waits for no commit. Raises sqlite3.Error."""
@@ -266,7 +266,7 @@ class Spool:
 
     def usage(self) -> SpoolStatus:
         """What the spool contains now; waits for no commit. Raises OSError or sqlite3.Error."""
-        return usage_of(self._connections.reading, self.root, self._clock.wall_ns())
+        return self._connections.reading.usage(self._clock.wall_ns())
 
     @contextmanager
     def drain_lock(self) -> Iterator[bool]:
@@ -280,7 +280,7 @@ class Spool:
         with flock(self.root / f'node-{self._robot}.lock', wait=False) as mine:
             yield mine
 
-    def _leave(self, session: Session) -> None:
+    def _end(self, session: Session) -> None:
         self._connections.close()
         session.leave()
         self._session = None
@@ -295,7 +295,7 @@ class Spool:
             with flock(self.root / 'recovery.lock'):
                 self._connections.writing = open_recovered(self._tree, self._clock.wall_ns(), self.recovery)
                 self._connections.reading.open()
-                self._session = Session.begin(self._connections.writing, self._tree, self._robot, self._clock)
+                self._session = Session.begin(self._connections.writing, self.root, self._robot, self._clock)
                 self._connections.session = self._session.number
                 self.accounts = _continued(self._connections.writing, self._robot, self._clock)
         except (OSError, sqlite3.Error):
@@ -304,9 +304,9 @@ class Spool:
             raise
 
     def _wait_for_index(self) -> None:
-        """Where it was deleted under a process that lives, that one puts it back with its next commit."""
-        end_s = time.monotonic() + PUT_BACK_S
-        while not (self.root / 'index.db').exists() and any_alive(self._tree) and time.monotonic() < end_s:
+        """Wait until a running process, under which the index was deleted, restores it with its next commit."""
+        end_s, sessions = time.monotonic() + PUT_BACK_S, SessionFiles(self.root)
+        while not (self.root / 'index.db').exists() and sessions.is_any_running() and time.monotonic() < end_s:
             time.sleep(PUT_BACK_S / 50)
 
     def _commit(self, objects: Sequence[DataObject], outcomes: Sequence[Outcome],
@@ -318,51 +318,51 @@ class Spool:
         stored = _count(objects)
         snapshot = self.accounts.snapshot(stored)
         session = self._connections.session
-        with closing(Adding(self._connections.writing, self._tree, self._repeats, session, now_ns)) as adding:
+        with closing(NewObjects(self._connections.writing, self._tree, self._repeats, session, now_ns)) as new:
             try:
-                staged_objects = adding.stage(objects, room.given_up)
-                with self._connections.writing.transaction(undo=adding.discard):
+                staged_objects = new.stage(objects, room.not_stored)
+                with self._connections.writing.transaction(undo=new.discard):
                     for place, item in enumerate(staged_objects):
                         if self._takes(item):
-                            adding.add(item, fits=place not in room.given_up)
+                            new.add(item, fits=place not in room.not_stored)
                     for outcome in outcomes:
-                        self._connections.writing.objects.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
+                        self._connections.writing.states.move([outcome.item.id], outcome.state, outcome.reason, now_ns)
                     for each in rows:
                         self._connections.writing.recordings.write(self._robot, each)
                     if snapshot is not None and self._session is not None:
                         self._connections.writing.accounts.write(self._session.number, snapshot)
                     self._tidy(now_ns)
-                    adding.take()
+                    new.take()
             except BaseException:
                 self.accounts.mark_dirty()
                 raise
             self.accounts.store(stored)
-            return adding.place()
+            return new.place()
 
     def _takes(self, item: DataObject) -> bool:
-        """Whether nothing else says what an object of bookkeeping says; in the transaction with its row."""
+        """Whether an object of bookkeeping is still needed: its answer is the next one, its rows are in no other part yet."""
         index = self._connections.writing
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
         return index.catalog.take_uncataloged(item.catalogs) and index.catalog.take_unreported(item.tells)
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
-        """Unless a retry, or another process's start, lets it wait again by now; where one is at it, the next start does it.
+        """Move a file to the quarantine, unless the object has become pending again; during a recovery, the next startup does it.
 
-        The writing connection is asked: the reading one tells of no later commit while another thread is half through its answer.
+        Uses the writing connection, because the reading one does not see later commits while another thread reads a result.
         """
         try:
             with flock(self.root / 'recovery.lock', wait=False) as mine, self._connections.lock:
                 if mine and self._connections.writing.objects.state(item.id) is State.QUARANTINED:
-                    source = self._tree.waiting(item.id, item.bucket, item.key)
+                    source = self._tree.place_pending(item.id, item.bucket, item.key)
                     self._tree.place(source, self._tree.path(State.QUARANTINED, reason, item.bucket, item.key))
         except (OSError, sqlite3.Error) as error:
             log.warning('cannot move %s to the quarantine: %s', item.path, error)
 
     def _tidy(self, now_ns: int) -> None:
-        """Once a minute, give what left the spool an hour ago short rows; once an hour, drop what nobody will ask for any more.
+        """Once per minute, shorten the rows of objects that left the spool an hour ago; once per hour, forget old ones.
 
-        While there is more to do, each commit does a step of it.
+        While more remains to be done, each commit does one step.
         """
         if not 0 <= now_ns - self._compacted_ns < 60 * SECOND:
             self._compacted_ns = now_ns if self._connections.writing.history.compact(now_ns - FULL_ROWS_NS) else 0
@@ -372,25 +372,25 @@ class Spool:
 
 
 def _continued(index: Index, robot: str, clock: Clock) -> Accounts:
-    """Accounts of a session that goes on where the earlier ones ended."""
+    """The accounts of a session, which continue those of earlier sessions."""
     last: dict[tuple[str, str], PublisherRow] = {}
     for row in index.accounts.publishers(robot=robot):
-        last.pop((row.topic, row.publisher), None)  # so that the newest are the last
+        last.pop((row.topic, row.publisher), None)  # keeps the newest last
         last[row.topic, row.publisher] = row
     kept: dict[str, Times] = {}
     grades: dict[str, str] = {}
-    heard: dict[str, Times] = {}
+    newest: dict[str, Times] = {}
     for account in index.accounts.topics(robot=robot):
         kept[account.topic] = max(kept.get(account.topic, NO_TIMES), account.last_kept)
-        known = (account.heard, account.last_kept, heard.get(account.topic, NO_TIMES))
-        heard[account.topic] = next((each for each in known if any(each)), NO_TIMES)
+        known = (account.newest, account.last_kept, newest.get(account.topic, NO_TIMES))
+        newest[account.topic] = next((each for each in known if any(each)), NO_TIMES)
         if account.received:
             grades[account.topic] = account.accounting
-    return Accounts(last.values(), kept, index.accounts.rhythms(), grades, clock, heard)
+    return Accounts(last.values(), kept, index.accounts.rhythms(), grades, clock, newest)
 
 
 def _count(objects: Iterable[DataObject]) -> dict[str, tuple[int, Times]]:
-    """By account: (samples, times of the newest)."""
+    """Account -> (samples, times of the newest)."""
     counts: dict[str, tuple[int, Times]] = {}
     for item in objects:
         for account, samples in {item.topic: item.samples}.items() if item.topic is not None else item.counts.items():

@@ -22,16 +22,15 @@ from shadowhound_data_logger.core.status import NodeStatus, OtherType, SpoolStat
 from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_strict_json
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.local_robot import robots
-from shadowhound_data_logger.spool.usage import usage_of
 
 FRESH_NS: Final = 5 * SECOND
 """A node writes once per second: one that is silent for longer hangs or has exited."""
 RUNNING, NOT_ANSWERING, NOT_RUNNING = 'running', 'not_answering', 'not_running'
 NOT_RUNNING_TEXT: Final = 'the node is not running'
 FINE_STORE: Final = frozenset({'idle', 'shipping', 'not_draining', 'waiting'})
-"""States of delivery that are not a finding; ``not_draining``: another process delivers; ``waiting``: a rule says not now."""
+"""States of delivery that are not a finding; ``not_draining``: another process delivers; ``waiting``: a rule delays uploads."""
 NAMED: Final = 3
-"""Topics that a finding names; the figures of the others are in the table."""
+"""Topics that a finding names; the table has the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +39,16 @@ class NodeSession:
 
     started: str
     ended: str | None
-    """None if it was cut off, or has just started."""
+    """None if it did not end cleanly, or is running."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """What is known here about the node of a robot."""
+    """The status of the node of a robot."""
 
     robot: str
     state: str
-    """``running``, ``not_answering`` (its process exists and is silent) or ``not_running``."""
+    """``running``, ``not_answering`` (its process exists but writes no status) or ``not_running``."""
     age_s: float | None
     """Since the node wrote its status; None if unknown."""
     node: NodeStatus
@@ -57,7 +56,7 @@ class NodeReport:
     spool: SpoolStatus | None
     """The current content of the spool; None if there is none."""
     session: NodeSession | None = None
-    """Known unless the node runs."""
+    """None while the node runs."""
     problem: str = ''
     """Why the status file or the index cannot be read."""
     findings: tuple[str, ...] = ()
@@ -68,7 +67,7 @@ class NodeReport:
         return self.state == RUNNING
 
     def as_dict(self) -> dict[str, Any]:
-        """As ``shadowhound-data status --json`` prints it, without what only a running node knows if none runs."""
+        """The report as ``shadowhound-data status --json`` prints it; if no node runs, without the fields that only it knows."""
         node = as_plain(self.node) if self.state != NOT_RUNNING else {}
         found = {'state': self.state, 'running': self.running, 'age_s': self.age_s, 'spool': as_plain(self.spool)}
         if not self.running:
@@ -96,7 +95,8 @@ def not_logged(spool: Path, robot: str) -> Mapping[str, str]:
 def limits(spool: Path, own: SpoolSettings) -> SpoolSettings:
     """The widest limits of the nodes of this spool, or ``own`` if none has run.
 
-    Other processes do not know the nodes' parameters: by their own defaults they would evict, or forget, what a node may keep.
+    Other processes do not have the nodes' parameters: with their own defaults they would evict or forget objects that a node
+    keeps.
     """
     written = [each.spool for each in _all_written(spool)]
     return replace(
@@ -142,11 +142,11 @@ def _state(written: NodeStatus, silent_ns: int | None) -> str:
         return NOT_RUNNING
     if silent_ns < FRESH_NS:
         return RUNNING
-    return NOT_ANSWERING if _lives(written.pid, written.boot_ns) else NOT_RUNNING
+    return NOT_ANSWERING if _is_running(written.pid, written.boot_ns) else NOT_RUNNING
 
 
-def _lives(pid: int, boot_ns: int) -> bool:
-    """Whether the process that wrote the status exists: one of its number that started before (proc(5), stat, field 22)."""
+def _is_running(pid: int, boot_ns: int) -> bool:
+    """Whether the process that wrote the status exists: one with its pid that started before (proc(5), stat, field 22)."""
     try:
         fields = Path(f'/proc/{pid}/stat').read_text(encoding='utf-8', errors='replace').rpartition(')')[2].split()
     except OSError:
@@ -155,16 +155,16 @@ def _lives(pid: int, boot_ns: int) -> bool:
 
 
 def _with_index(report: NodeReport, folder: Path, written: NodeStatus, now_ns: int) -> NodeReport:
-    """With the content of the spool and the last session, from the index."""
+    """The report with the content of the spool and the last session, from the index."""
     path = folder / 'index.db'
     if not path.is_file():
-        text = f'there is no spool in {folder}: start the node, or name its folder by SHADOWHOUND_HOME'
+        text = f'there is no spool in {folder}: start the node, or set SHADOWHOUND_HOME to its folder'
         return replace(report, spool=None, problem=report.problem or text)
     index = Index(path, read_only=True)
     last = written.spool
     try:
         index.open()
-        spool = replace(usage_of(index, folder, now_ns), evicted=last.evicted, unkept=last.unkept, max_bytes=last.max_bytes,
+        spool = replace(index.usage(now_ns), evicted=last.evicted, unkept=last.unkept, max_bytes=last.max_bytes,
                         min_free_bytes=last.min_free_bytes, remember_days=last.remember_days)  # fmt: skip
         return replace(report, spool=spool, session=_session(index, report.robot, written.pid))
     except (OSError, sqlite3.Error, SpoolError) as error:
@@ -174,7 +174,7 @@ def _with_index(report: NodeReport, folder: Path, written: NodeStatus, now_ns: i
 
 
 def _session(index: Index, robot: str, pid: int) -> NodeSession | None:
-    """The last session of the process that wrote the status, if one did: processes that send missions or bags have some too."""
+    """The last session, preferably of the process that wrote the status: agents and bag uploads have sessions, too."""
     row = index.accounts.last_session(robot, pid)
     return NodeSession(iso(row[0]), iso(row[1]) if row[1] is not None else None) if row else None
 
@@ -192,14 +192,14 @@ def _findings(report: NodeReport) -> Iterator[str]:
         yield from _losses(node.topics)
         for topics in (node.topics, node.bag.topics, node.events.topics):
             yield from _other_types(topics)
-        yield from _left_out(node)
-        yield from _given_up(report.spool or SpoolStatus())
+        yield from _too_many_topics(node)
+        yield from _evicted(report.spool or SpoolStatus())
         if node.store.quarantined:
             yield f'quarantined in this session: {node.store.quarantined:,} objects'
 
 
 def _faults(node: NodeStatus) -> Iterator[str]:
-    """What does not work now."""
+    """What is failing now."""
     store = node.store
     if node.paused:
         yield 'the node is paused: nothing is logged'
@@ -216,7 +216,7 @@ def _faults(node: NodeStatus) -> Iterator[str]:
 
 
 def _losses(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
-    """What was lost in this session, and whose stamps are not trusted."""
+    """What was lost in this session, and which stamps are not trusted."""
     missed = {topic: (row.missed, row.missed_by) for topic, row in topics.items()}
     yield from _missed(missed, 'missed in this session', '')
     for what in ('dropped', 'rejected'):
@@ -230,7 +230,7 @@ def _losses(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
 
 
 def _untrusted_stamps(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
-    """A line for all topics whose stamps have the same fault: one computer's clock shows on each of its topics."""
+    """One line for all topics whose stamps have the same fault, because a wrong clock affects all topics of a computer."""
     groups: dict[tuple[str, str, int], list[str]] = {}
     lines: dict[tuple[str, str, int], str] = {}
     for topic, row in topics.items():
@@ -244,13 +244,13 @@ def _untrusted_stamps(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
 
 
 def _by_arrival(topics: Mapping[str, TopicStatus]) -> Iterator[str]:
-    """A line for each reason: a clock that is wrong, old data that is replayed, or a stranger in the network."""
+    """One line per reason: a wrong clock, replayed data, or a stranger in the network."""
     for reason in sorted({reason for row in topics.values() for reason in row.by_arrival}):
         found = {topic: row.by_arrival[reason] for topic, row in topics.items() if row.by_arrival.get(reason)}
         yield f'dated by arrival in this session, because of {reason}: {_most(found)}'
 
 
-def _given_up(spool: SpoolStatus) -> Iterator[str]:
+def _evicted(spool: SpoolStatus) -> Iterator[str]:
     if spool.evicted:
         yield f'evicted in this session: {spool.evicted:,} objects; disk or spool is full (spool.min_free_bytes, spool.max_bytes)'
     if spool.unkept:
@@ -260,14 +260,14 @@ def _given_up(spool: SpoolStatus) -> Iterator[str]:
         )
 
 
-def _left_out(node: NodeStatus) -> Iterator[str]:
+def _too_many_topics(node: NodeStatus) -> Iterator[str]:
     for what, name, count in (('bag', 'recorded', node.bag.left_out), ('events', 'kept for events', node.events.left_out)):
         if count:
             yield f'{count:,} topics are not {name}: there are too many that no setting names ({what}.topics, {what}.exclude)'
 
 
 def _other_types(topics: Mapping[str, Totals]) -> Iterator[str]:
-    """Topics that were published under another type than the one that is logged."""
+    """Topics that were also published under a type that is not logged."""
     others = [(topic, row, name, other) for topic, row in topics.items() for name, other in row.other_types.items()]
     yield from (_other_type(*found) for found in others[:NAMED])
     if len(others) > NAMED:
@@ -277,12 +277,12 @@ def _other_types(topics: Mapping[str, Totals]) -> Iterator[str]:
 def _other_type(topic: str, row: Totals, name: str, other: OtherType) -> str:
     by = ', '.join(other.publishers) or 'a program that is not a ROS node'
     count = other.messages
-    what = 'it was not listened to: the number of messages is not known' if count is None else f'{count:,} messages were refused'
-    return f'{topic} was published as {name} too, by {by}, and is logged as {row.type or "nothing"} alone; {what}'
+    what = 'these messages were not received or counted' if count is None else f'{count:,} messages were rejected'
+    return f'{topic} was also published as {name}, by {by}, but is only logged as {row.type or "nothing"}; {what}'
 
 
 def _missed(topics: Mapping[str, tuple[int | None, Mapping[str, int]]], text: str, mark: str) -> Iterator[str]:
-    """A line for each cause: what a restart missed is separate from what the network lost."""
+    """One line per cause, so that losses by a restart are separate from losses in the network."""
     by_cause = {topic: causes or {'': missed} for topic, (missed, causes) in topics.items() if missed}
     for cause in sorted({cause for causes in by_cause.values() for cause in causes}):
         lost = {topic: causes[cause] for topic, causes in by_cause.items() if cause in causes}

@@ -1,4 +1,4 @@
-"""What the tables of the index share: the connection, and how their statements choose keys."""
+"""What the tables of the index share: the connection, and helpers for their statements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Table:
-    """Part of an index. Methods that write belong in one of its transactions, under the lock of the spool."""
+    """A part of the index. Methods that write must be called in one of its transactions, under the lock of the spool."""
 
     def __init__(self, connection: Callable[[], sqlite3.Connection]) -> None:
         """``connection`` raises SpoolError while the index is not open."""
@@ -24,11 +24,11 @@ def after(prefix: str) -> str:
 
 
 def split(key: str) -> tuple[str, str]:
-    """The folder of a key, with its slash, and the rest."""
+    """The folder of a key, with the slash, and the rest."""
     folder, slash, name = key.rpartition('/')
     return folder + slash, name
 
 
 def marks(count: int) -> str:
-    """Placeholders of a statement."""
+    """Placeholders for a statement."""
     return ', '.join('?' * count)

@@ -1,10 +1,10 @@
-"""Gives a kept object a content of fewer messages, and a row of its own to those that are gone.
+"""Replaces the content of a kept object by fewer messages; the removed messages become a separate evicted object.
 
-The object keeps its key and place. What went is told by an object beside it (``<key>.thinned``, ``evicted`` because it was
-``thinned``), so that ledger, gap journal and catalog know of it as of any other loss.
+The object keeps its key and path. The separate object (``<key>.thinned``, ``evicted`` with the reason ``thinned``) makes the
+removed messages visible in the ledger, the gap journal and the catalog like any other loss.
 
-The new content is synced beside the parts, becomes the object's part inside the transaction, and then takes the place of the
-old one: after a death at any moment the row is of the file in its place, or of the part (``recovery.py``).
+The new content is synced next to the parts, is renamed to the object's part inside the transaction, and then replaces the old
+file: after a crash at any moment, either the file in its place or the part matches the row (``recovery.py``).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import Any
 
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.model import FileBody, State
-from shadowhound_data_logger.spool.adding import link_or_copy
 from shadowhound_data_logger.spool.binding import free_key, renew
 from shadowhound_data_logger.spool.files import Tree, content_sha256
 from shadowhound_data_logger.spool.index import Index
+from shadowhound_data_logger.spool.new_objects import link_or_copy
 from shadowhound_data_logger.spool.retention import THINNED
 
 
 @dataclass(frozen=True, slots=True)
 class ThinnableObject:
-    """What stays on the robot, and nobody waits for."""
+    """A kept object that no open request waits for."""
 
     id: int
     sensor: str
@@ -36,14 +36,14 @@ class ThinnableObject:
     content_type: str
     t_start_ns: int
     t_end_ns: int
-    """Of the last message that it had at first."""
+    """Of the last message before any thinning."""
     step: int
-    """One of so many pictures or clouds is left."""
+    """One of so many images or clouds is left."""
     path: Path
 
     @classmethod
     def of(cls, row: Mapping[str, Any], tree: Tree) -> ThinnableObject:
-        """Of a row of ``Index.thinnable``."""
+        """The object of a row of ``KeptTable.thinnable``."""
         path = tree.path(State.KEPT, None, row['bucket'], row['key'])
         names = ('id', 'sensor', 'type', 'samples', 'bytes', 'sha256', 'content_type', 't_start_ns', 't_end_ns')
         return cls(**{name: row[name] for name in names}, step=row['step'] or 1, path=path)
@@ -51,24 +51,24 @@ class ThinnableObject:
 
 @dataclass(frozen=True, slots=True)
 class Thinned:
-    """A smaller content of the same time."""
+    """Smaller content for the same time."""
 
     body: bytes | FileBody
     samples: int
-    """Messages that are left, one at least."""
+    """Remaining messages, at least one."""
     lost: Mapping[str, int] = field(default_factory=dict)
-    """Of a bag's slice: messages that are gone, by topic."""
+    """Removed messages of a bag's slice, by topic."""
 
 
 def thin(index: Index, tree: Tree, session: int, item: ThinnableObject, thinned: Thinned, now_ns: int) -> ThinnableObject | None:
-    """The object with the new content; None where it went, or somebody asked for it, meanwhile: then nothing has changed.
+    """The object with the new content; None, and nothing changes, if it has been evicted or requested in the meantime.
 
-    The caller holds recovery lock and spool's lock. Raises OSError or sqlite3.Error, and then nothing has changed.
+    The caller holds the recovery lock and the spool's lock. Raises OSError or sqlite3.Error, and then nothing changes.
     """
     size, sha256 = len(thinned.body), content_sha256(thinned.body)
     if size >= item.bytes or not 0 < thinned.samples < item.samples:
         raise ValueError(
-            f'{item.path} of {item.samples} messages and {item.bytes} bytes is no larger than what is to be left of it'
+            f'{item.path} with {item.samples} messages and {item.bytes} bytes is not larger than its thinned content'
         )
     body = tree.new_body(session)
     try:
@@ -78,7 +78,7 @@ def thin(index: Index, tree: Tree, session: int, item: ThinnableObject, thinned:
         else:
             link_or_copy(thinned.body.path, body)
         tree.sync_incoming()
-        with index.transaction(undo=lambda: _undo(tree, item.id)):
+        with index.transaction(undo=lambda: tree.remove(tree.part(item.id))):
             row = index.kept.thinnable_row(item.id, item.sha256)
             if row is None:
                 return None
@@ -91,7 +91,3 @@ def thin(index: Index, tree: Tree, session: int, item: ThinnableObject, thinned:
         tree.remove(body)
     tree.place(tree.part(item.id), tree.path(State.KEPT, None, row['bucket'], row['key']))
     return replace(item, samples=thinned.samples, bytes=size, sha256=sha256, step=2 * item.step)
-
-
-def _undo(tree: Tree, number: int) -> None:
-    tree.remove(tree.part(number))

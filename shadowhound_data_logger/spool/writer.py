@@ -1,12 +1,12 @@
-"""The one thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
+"""The only thread that writes the spool: it groups finished objects and outcomes of deliveries into durable commits.
 
-At most one commit every ``commit_s``; the first after a quiet time waits for the rest of its burst, half of that at most, because
-what one poll took comes as several objects, and one commit costs less than two. Objects that stay here until somebody asks for
-them wait up to ``HEARTBEAT_S`` for others to be committed with. A commit that fails (a full or read-only disk) is tried again
-with everything that was in it; meanwhile ``put`` blocks the encoders, not the intake.
+It commits at most once every ``commit_s``. The first commit after a quiet time waits up to half of that for the rest of its
+burst, because the messages of one poll become several objects and one commit takes less time than two. Objects that are kept
+until requested wait up to ``HEARTBEAT_S`` for others to be committed with. A failed commit (full or read-only disk) is retried
+with everything that was in it; until it succeeds, ``put`` blocks the encoders but not the intake.
 
-Files of delivered objects are removed between commits, by this thread and by those that settle, or before one where the disk is
-short.
+Files of delivered objects are removed between commits, by this thread and by threads that call ``settle``; before a commit if
+the disk is nearly full.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, FileBody, Outcome, RecordingRows, SpooledObject, State
 from shadowhound_data_logger.core.worker import Worker
-from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Spool
+from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
 
 COMMIT_S: Final = 0.1
-"""Least time between two commits."""
+"""Minimum time between two commits."""
 MAX_WAITING_BYTES: Final = 32 << 20
-"""Encoded bytes in memory before encoders have to wait."""
+"""Encoded bytes in memory above which encoders wait."""
 QUIET_S: Final = 0.01
-"""A burst is over when nothing came for so long and nothing is expected."""
+"""A burst has ended when no object was added for this long and none is expected."""
 HEARTBEAT_S: Final = 1.0
-"""How often accounts and outcomes become durable when there is no object to commit them with."""
+"""How often accounts and outcomes become durable if no object is committed."""
 MANY_OUTCOMES: Final = 64
-"""So many outcomes are worth a commit of their own."""
-FILES_A_SETTLEMENT: Final = 2
-"""Files of earlier objects that ``settle`` removes for each outcome: more than one, or they would become no fewer."""
-MOST_BYTES: Final = 4 << 20
-"""In one commit: nothing else is done in the spool while its files are written and synced."""
+"""This many outcomes are committed without waiting for an object."""
+FILES_PER_OUTCOME: Final = 2
+"""Files of earlier objects that ``settle`` removes for each outcome; with one, a backlog of files would never shrink."""
+MAX_BYTES: Final = 4 << 20
+"""Per commit, because writing and syncing its files blocks the spool."""
 HANGING_S: Final = 10.0
-"""A commit that takes longer hangs in the disk: usual is a hundredth of a second, a slow card at its worst takes a few."""
+"""A commit that takes longer hangs in the disk: 10 ms is usual, a slow SD card needs a few seconds at worst."""
 
 
 class _Unit(NamedTuple):
-    """What one commit takes, all of it."""
+    """What must be committed together."""
 
     objects: tuple[DataObject, ...]
     rows: tuple[RecordingRows, ...]
 
     @property
     def may_wait(self) -> bool:
-        """Whether nobody waits for any of it."""
+        """Whether its commit may be delayed, because it only has objects that are kept on the robot."""
         return not self.rows and all(item.is_on_request for item in self.objects)
 
 
@@ -60,12 +60,12 @@ _Group = tuple[Sequence[_Unit], Sequence[Outcome]]
 class SpoolWriter:
     """Collects objects and outcomes, and commits them on one thread.
 
-    New; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the lists,
-    but for ``_leaving``, to which the thread alone adds, and from which takes who holds ``_removing``.
+    Lifecycle: new; ``on_commit``; open once; put, settle, flush from any thread; close once. The lock of ``_changed`` guards the
+    lists, except for ``_leaving``: only the writer's thread appends to it, and only the holder of ``_removing`` removes from it.
     """
 
     def __init__(self, spool: Spool, commit_s: float = COMMIT_S, expects: Callable[[], bool] = lambda: False) -> None:
-        """``expects``, called by the writer's thread, says whether more objects are being made that are worth waiting for."""
+        """``expects``, called on the writer's thread, returns whether more objects of the burst are being encoded."""
         self.spool = spool
         self._commit_s = commit_s
         self._expects = expects
@@ -73,28 +73,29 @@ class SpoolWriter:
         self._settled: Callable[[Collection[int]], None] = lambda _: None
         lock = threading.RLock()
         self._changed = threading.Condition(lock)
-        self._hurried = threading.Condition(lock)  # ends the pause before a commit; what is put meanwhile wakes nobody
+        self._hurried = threading.Condition(lock)  # ends the pause before a commit, which ``put`` must not
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._leaving: deque[Outcome] = deque()
-        """Outcomes that are durable and whose files are still here."""
+        """Durable outcomes whose files still have to be removed."""
         self._removing = threading.Lock()
         self._bytes = 0
         self._added = self._done = 0
         self._written = Counter[str]()
         self._urgent = False
         self.prompt = False
-        """Whether outcomes wait for no object to be committed with: somebody waits for them, at a stop say."""
+        """Whether to commit outcomes without waiting for an object, for example during shutdown."""
         self._last_commit = -HEARTBEAT_S
         self.damaged = False
-        """Whether the index was found damaged: only the recovery at the next start can repair it."""
+        """Whether the index is damaged; only the recovery at the next startup can repair it."""
         self.worker = Worker('spool-writer', self._step, patience_s=HEARTBEAT_S + commit_s + HANGING_S)
 
     def on_commit(self, *, spooled: Callable[[Sequence[SpooledObject]], None] | None = None,
                   settled: Callable[[Collection[int]], None] | None = None) -> None:  # fmt: skip
-        """After each commit, its thread calls ``spooled`` with the new objects, and ``settled`` with the ids of the outcomes.
+        """After each commit, call ``spooled`` with the new objects and ``settled`` with the ids of the outcomes.
 
-        In a node these are ``Uploader.wake``, which adds the objects to what is to be sent, and ``Uploader.settled``.
+        The writer's thread calls them. In a node they are ``Uploader.wake``, which queues the objects for upload, and
+        ``Uploader.settled``.
         """
         self._spooled = spooled or self._spooled
         self._settled = settled or self._settled
@@ -103,9 +104,9 @@ class SpoolWriter:
         self.worker.start()
 
     def put(self, *items: DataObject, rows: Sequence[RecordingRows] = (), wait: bool = True) -> None:
-        """Queue objects for the next commit, and what it writes of recordings; waits while too many bytes wait.
+        """Queue objects and rows of recordings for the next commit; with ``wait``, block while too many bytes are queued.
 
-        Raises NameRefused for a bad key.
+        Raises NameRefused for an invalid key.
         """
         for item in items:
             check_key(item.key)
@@ -118,25 +119,25 @@ class SpoolWriter:
             self._changed.notify_all()
 
     def settle(self, outcomes: Sequence[Outcome]) -> None:
-        """Queue outcomes of deliveries for the next commit; never waits for one.
+        """Queue outcomes of deliveries for the next commit; never waits for a commit.
 
-        It also removes files of some objects settled before: while a backlog leaves, one thread does not keep up with that.
+        It also removes files of some objects settled before, because one thread alone cannot keep up while a backlog is uploaded.
         """
         with self._changed:
             was_due = self._due()
             self._outcomes.extend(outcomes)
             self._added += len(outcomes)
-            if self._due() and not was_due:  # else it is awake, and one wake an outcome would only cost
+            if self._due() and not was_due:  # otherwise the thread is awake already
                 self._changed.notify_all()
-        self._remove_files(FILES_A_SETTLEMENT * len(outcomes), wait=False)
+        self._remove_files(FILES_PER_OUTCOME * len(outcomes), wait=False)
 
     def written(self) -> tuple[int, int]:
-        """Objects that became durable since it was opened, and the messages in them."""
+        """How many objects, and messages in them, became durable since the writer was opened."""
         with self._changed:
             return self._written['objects'], self._written['messages']
 
     def flush(self, deadline_s: float) -> bool:
-        """Whether everything put and settled before this call became durable in time; False at once where nothing can."""
+        """Whether everything put and settled before this call became durable in time; False immediately if it cannot."""
         with self._changed:
             target = self._added
             self._urgent = True
@@ -146,7 +147,7 @@ class SpoolWriter:
             return self._done >= target
 
     def close(self, deadline_s: float) -> bool:
-        """Commit what is queued and end the thread; False when that did not work in time. Idempotent."""
+        """Commit what is queued and end the thread; False if that takes longer than the deadline. Idempotent."""
         end = time.monotonic() + deadline_s
         flushed = self.flush(deadline_s)
         self.worker.stop()
@@ -181,14 +182,14 @@ class SpoolWriter:
                 self._changed.notify_all()
             raise
 
-    def _remove_files(self, most: float = math.inf, until: Callable[[], bool] = lambda: False, *, wait: bool = True) -> None:
-        """Let files of what is settled follow their rows; unless ``wait``, not while another thread does."""
+    def _remove_files(self, limit: float = math.inf, until: Callable[[], bool] = lambda: False, *, wait: bool = True) -> None:
+        """Remove files of settled objects; without ``wait``, do nothing while another thread does."""
         if self._removing.acquire(blocking=wait):
             try:
-                while most > 0 and self._leaving and not until():
+                while limit > 0 and self._leaving and not until():
                     self.spool.remove_files((self._leaving[0],))
                     self._leaving.popleft()
-                    most -= 1
+                    limit -= 1
             finally:
                 self._removing.release()
 
@@ -199,7 +200,7 @@ class SpoolWriter:
             return self._urgent or self.worker.stopping or (is_now and self._due())
 
     def _await_burst(self) -> None:
-        """Wait until its last object has come, half of ``commit_s`` at most; the caller holds the lock."""
+        """Wait for the last object of the burst, up to half of ``commit_s``; the caller holds the lock."""
         end_s = time.monotonic() + self._commit_s / 2
         while (left_s := end_s - time.monotonic()) > 0:
             added = self._added
@@ -207,18 +208,18 @@ class SpoolWriter:
                 return
 
     def _pause(self, seconds: float) -> bool:
-        """Wait. True if it ended early, because somebody waits for the commit; the caller holds the lock."""
+        """Wait; True if the commit became urgent before. The caller holds the lock."""
         return self._hurried.wait_for(lambda: self._urgent or self.worker.stopping, max(0.0, seconds))
 
     def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:
-        """One commit of all, or several of a burst; also where the disk has no room, since files leave only after a commit.
+        """The groups to commit one by one: as few as possible if the disk has room.
 
-        Then first what was delivered, then the files, which lie there already and of which some may be given up, last what is
-        written.
+        Otherwise first the outcomes, because their commit frees files; then objects whose files exist, some of which may be
+        evicted; last those that must be written.
         """
         objects = [item for unit in units for item in unit.objects]
         if not objects or self.spool.fits(objects):
-            first, *more = list(_parted(units)) or [[]]
+            first, *more = list(_split(units)) or [[]]
             return [(first, outcomes), *((part, []) for part in more)]
         files = [unit for unit in units if all(isinstance(item.body, FileBody) for item in unit.objects)]
         rest = [unit for unit in units if not all(isinstance(item.body, FileBody) for item in unit.objects)]
@@ -234,13 +235,13 @@ class SpoolWriter:
         self._committed(units, outcomes, spooled)
 
     def _due(self) -> bool:
-        """Whether there is something that waits for a commit; the caller holds the lock."""
+        """Whether something needs a commit now; the caller holds the lock."""
         if self._urgent or len(self._outcomes) >= (1 if self.prompt else MANY_OUTCOMES):
             return True
-        return self._bytes >= MOST_BYTES or not all(unit.may_wait for unit in self._units)
+        return self._bytes >= MAX_BYTES or not all(unit.may_wait for unit in self._units)
 
     def _committed(self, units: Sequence[_Unit], outcomes: Sequence[Outcome], spooled: Sequence[SpooledObject]) -> None:
-        """All of it is durable: let it go and tell who waits for that."""
+        """Remove what is durable from the queues, and call the listeners."""
         objects = [item for unit in units for item in unit.objects]
         with self._changed:
             done = {id(unit) for unit in units}
@@ -258,13 +259,13 @@ class SpoolWriter:
             self._spooled(spooled)
 
 
-def _parted(units: Sequence[_Unit]) -> Iterator[list[_Unit]]:
-    """The same in their order, as many at a time as one commit takes."""
+def _split(units: Sequence[_Unit]) -> Iterator[list[_Unit]]:
+    """The units in order, split into groups that fit into one commit."""
     part: list[_Unit] = []
     count = size = 0
     for unit in units:
         more = sum(map(_in_memory, unit.objects))
-        if part and (count + len(unit.objects) > MOST_OBJECTS or size + more > MOST_BYTES):
+        if part and (count + len(unit.objects) > MAX_OBJECTS or size + more > MAX_BYTES):
             yield part
             part, count, size = [], 0, 0
         part.append(unit)

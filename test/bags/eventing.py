@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.ring import Ring
 from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.options import BagSettings, EventSettings
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import EVENT, Losses
+from shadowhound_data_logger.spool.topic_account import EVENT, Losses
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 POLL_S = 0.2

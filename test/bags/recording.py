@@ -23,8 +23,8 @@ from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import BagSettings
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.topic_account import BAG
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 NOON_NS = 1_760_788_800 * 10**9
@@ -92,7 +92,7 @@ class Desk:
         with self.spool.accounts.entry(f'{BAG}{topic}') as account:
             for message in heard.messages:
                 assert account.receive(message.publisher, message.number)
-            account.gaps.heard = heard.messages[-1].times
+            account.gaps.newest = heard.messages[-1].times
         dropped = self.queue.put(heard)
         if dropped:
             self.spool.accounts.drop(f'{BAG}{topic}', 'queue_full', dropped)

@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.recovery import BagRecovery
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import unsynced
 from shadowhound_data_logger.core.model import Taken
-from shadowhound_data_logger.spool.accounts import BAG
+from shadowhound_data_logger.spool.topic_account import BAG
 from shadowhound_data_logger.stores.memory import MemoryStore
 
 UNSET = 'recording_unsynced_this-boot_00000060'

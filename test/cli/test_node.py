@@ -114,5 +114,5 @@ def test_the_node_of_a_robot(serving: Serving, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv('SHADOWHOUND_ROBOT', 'tachi')
     result = run('flush')
     assert isinstance(result.exception, NodeUnavailable)
-    assert 'no node of tachi runs here; those that run: thor' in str(result.exception)
+    assert 'no node of tachi is running here, only those of thor' in str(result.exception)
     assert serving.asked[-1] == {'do': 'describe'}

@@ -164,7 +164,7 @@ def test_a_death_in_the_middle_of_a_retry(home: Path, monkeypatch: pytest.Monkey
         raise KeyboardInterrupt
 
     with monkeypatch.context() as dying:
-        dying.setattr('shadowhound_data_logger.spool.object_table.ObjectTable.set_found', die)
+        dying.setattr('shadowhound_data_logger.spool.object_table.ObjectStates.set_found', die)
         with pytest.raises(KeyboardInterrupt):
             retry(home / 'spool')
     spool = new_spool(home / 'spool')

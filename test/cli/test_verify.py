@@ -162,7 +162,7 @@ def test_one_at_a_time(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A second one ends at once and says why; notes that are none are said, and --again does without them."""
     with closing(sqlite3.connect(home / 'spool/verify.db', isolation_level=None)) as other:
         other.execute('BEGIN EXCLUSIVE')
-        assert 'does another --verify run' in str(run('--verify').exception)
+        assert 'is another --verify running' in str(run('--verify').exception)
     (home / 'spool/verify.db').write_bytes(b'garbage' * 1000)
     assert '--again starts from the beginning' in str(run('--verify').exception)
     assert as_json('--verify', '--again')['asked'] == 3

@@ -47,11 +47,11 @@ from shadowhound_data_logger.node.encoding.encode_pool import ENCODER_FAILED
 from shadowhound_data_logger.node.intake.sampling import QUEUE_FULL, SAMPLER_FAILED
 from shadowhound_data_logger.ros.endpoints import POLL_S
 from shadowhound_data_logger.ros.fast_dds_profile import SHIPPED
-from shadowhound_data_logger.spool.accounts import PAUSED, WRONG_TYPE
 from shadowhound_data_logger.spool.estimator import RESTART, SILENCE, TRANSPORT
 from shadowhound_data_logger.spool.object_table import MISSING
 from shadowhound_data_logger.spool.recovery import DAMAGED
 from shadowhound_data_logger.spool.retention import KEEP_DAYS, KEEP_LIMIT, NO_ROOM, THINNED
+from shadowhound_data_logger.spool.topic_account import PAUSED, WRONG_TYPE
 from shadowhound_data_logger.stores import open_store
 
 if TYPE_CHECKING:

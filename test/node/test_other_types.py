@@ -31,7 +31,9 @@ from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscribe
 from shadowhound_data_logger.ros import endpoints
 from shadowhound_data_logger.ros.endpoints import Endpoint
 from shadowhound_data_logger.ros.reader import FAST_DDS, PolledGroup
-from shadowhound_data_logger.spool.accounts import EXACT, RECEIVED_ONLY, Accounts
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.gaps import EXACT
+from shadowhound_data_logger.spool.topic_account import RECEIVED_ONLY
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0

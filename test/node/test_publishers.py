@@ -31,7 +31,8 @@ from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.intake.sampling import Sampler
 from shadowhound_data_logger.ros.reader import FAST_DDS
 from shadowhound_data_logger.ros.shared_memory import FOLDER
-from shadowhound_data_logger.spool.accounts import EXACT, Accounts
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.gaps import EXACT
 
 pytestmark = pytest.mark.ros
 WAIT_S: Final = 60.0

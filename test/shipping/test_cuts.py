@@ -22,7 +22,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import DataObject, FileBody
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
-from shadowhound_data_logger.spool.accounts import BAG as ACCOUNT
+from shadowhound_data_logger.spool.topic_account import BAG as ACCOUNT
 
 BAG = 'patrol_20251018_120000'
 SLICE_S = 10

@@ -61,7 +61,7 @@ def hear(spool: Spool, *numbers: int, topic: str = CAMERA) -> None:
     with spool.accounts.entry(topic) as account:
         for number in numbers:
             account.receive('p', number, by_arrival(NOON_NS + number * SECOND // 10))
-            account.gaps.heard = by_arrival(NOON_NS + number * SECOND // 10)
+            account.gaps.newest = by_arrival(NOON_NS + number * SECOND // 10)
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * SECOND // 10)
@@ -244,7 +244,7 @@ def test_no_watermark_covers_what_was_forgotten_before_it_was_told(
     store(spool, 'a')
     hear(spool, 26, 27, 28)
     store(spool, 'b', samples=3)
-    monkeypatch.setattr(gap_table, 'MOST_ROWS', 0)
+    monkeypatch.setattr(gap_table, 'MAX_ROWS', 0)
     with spool._connections.writing.transaction():
         assert spool._connections.writing.gaps.forget(0, 100)
     (mark,) = told(writer(root).parts())

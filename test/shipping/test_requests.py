@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import KeepSettings
 from shadowhound_data_logger.core.mailbox import KeptFilter, PullCancel, PullRequest, encode_inbox
 from shadowhound_data_logger.shipping.requests import WINDOW
-from shadowhound_data_logger.spool.request_table import RequestRow, RequestTable
+from shadowhound_data_logger.spool.request_table import RequestedTable, RequestRow
 
 
 @pytest.fixture
@@ -232,26 +232,26 @@ def test_a_death_while_many_objects_are_accepted_leaves_no_half_request(tmp_path
     desk = Desk(tmp_path / 'spool', KeepSettings(max_bytes=1 << 20))
     desk.keeps(*(frame(number) for number in range(10)))
     with closing(desk.spool):
-        real, calls = RequestTable.add, Counter[str]()
+        real, calls = RequestedTable.add, Counter[str]()
 
-        def add(table: RequestTable, request: str, chosen: Sequence[tuple[int, int]]) -> None:
+        def add(table: RequestedTable, request: str, chosen: Sequence[tuple[int, int]]) -> None:
             calls[request] += 1
             if calls[request] == 3:
                 raise OSError('it died')
             real(table, request, chosen)
 
-        monkeypatch.setattr(RequestTable, 'add', add)
+        monkeypatch.setattr(RequestedTable, 'add', add)
         request = desk.ask(sensor='camera')
         with pytest.raises(OSError, match='it died'):
             desk.step()
         assert desk.spool.requests.rows() == []
-        assert len(desk.spool.requests.waiting(request, 100)) == 8
+        assert len(desk.spool.requests.unreleased(request, 100)) == 8
     desk.entries.clear()
     desk.write(encode_inbox([]))  # the requester took it out again
     desk.open()
     with closing(desk.spool):
         desk.step()
-        assert desk.spool.requests.waiting(request, 100) == []
+        assert desk.spool.requests.unreleased(request, 100) == []
         request = desk.ask(sensor='camera')
         desk.finish()
         assert desk.answers(request)[-1]['outcomes'] == {'delivered': {'objects': 10, 'bytes': 60}}

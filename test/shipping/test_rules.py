@@ -109,12 +109,12 @@ def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Pat
     with closing(index), index.transaction():
         for place, (sensor, said) in enumerate(itertools.product(sensors, facts)):
             item = replace(data_object(place), sensor=sensor, protected=False)
-            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, said, 0)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, said, 0)
             for protected in (False, True):
                 row = index.objects.row(item.bucket, item.key)
                 assert row is not None
                 assert row['waits_for'] == waits_for(sensor, said, protected=protected), (sensor, said, protected)
-                index.objects.protect(item.bucket, item.key)
+                index.states.protect(item.bucket, item.key)
 
 
 @pytest.mark.parametrize('oldest', [False, True])

@@ -102,7 +102,7 @@ def bind(root: Path, moment: str) -> None:
     spool = new_spool(root)
     spool.open()
     put(spool, *(make(f'thor/provisional/{name}', name.encode(), held='clock') for name in 'ab'))
-    owner, step = {'renamed': (Tree, 'sync_incoming'), 'synced': (Index, 'transaction'), 'bound': (Tree, 'waiting')}[moment]
+    owner, step = {'renamed': (Tree, 'sync_incoming'), 'synced': (Index, 'transaction'), 'bound': (Tree, 'place_pending')}[moment]
     work = getattr(owner, step)
 
     @contextmanager

@@ -17,18 +17,18 @@ from shadowhound_data_logger.core.stamps import by_arrival
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool import span as module
 from shadowhound_data_logger.spool.account_rows import PublisherRow
-from shadowhound_data_logger.spool.accounts import (
-    EXACT,
-    GONE,
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.gaps import EXACT
+from shadowhound_data_logger.spool.span import NumberRun, Ranges, Span
+from shadowhound_data_logger.spool.topic_account import (
+    FORMER,
     MAX_NODES,
     MAX_OTHER_TYPES,
     MAX_PUBLISHERS,
     MORE_TYPES,
     RECEIVED_ONLY,
-    Accounts,
     TopicAccount,
 )
-from shadowhound_data_logger.spool.span import NumberRun, Ranges, Span
 
 
 def run(start: int, stop: int, first_ns: int, last_ns: int) -> NumberRun:
@@ -134,16 +134,16 @@ def test_a_late_number_of_a_restart_fills_its_hole() -> None:
 
 def test_what_a_file_has_of_the_session_before_is_counted_by_its_numbers() -> None:
     """They come again as repeats; what is missing between them and after them is missed by the restart."""
-    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
-    assert span.recall([run(7, 13, 70, 120), run(15, 18, 150, 170)], 5)
+    span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
+    assert span.recover([run(7, 13, 70, 120), run(15, 18, 150, 170)], 5)
     assert taken(span, 12, 17, 20) == [False, False, True]
     assert figures(span) == (10, 6, {'restart': 4})
 
 
 def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> None:
     """Though the message before it is in none."""
-    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
-    assert span.recall([run(11, 13, 110, 120)], 2)
+    span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
+    assert span.recover([run(11, 13, 110, 120)], 2)
     assert taken(span, 13) == [True]
     assert figures(span) == (3, 3, {})
 
@@ -153,27 +153,27 @@ def test_a_file_that_begins_with_the_next_number_has_the_same_publisher() -> Non
 ])  # fmt: skip
 def test_numbers_that_may_be_of_another_publisher_are_not_believed(runs: list[NumberRun]) -> None:
     """Then so many messages are counted, and whatever number comes next is a message as any other."""
-    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
-    assert not span.recall(runs, 5)
-    span.late(5)
+    span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
+    assert not span.recover(runs, 5)
+    span.add_unnumbered(5)
     assert taken(span, 11, 12, 12, 18) == [True, True, False, True]
     assert figures(span) == (13, 8, {'transport': 5})
 
 
 def test_a_gap_that_was_counted_already_is_filled_by_what_a_file_has() -> None:
     """Where the next message came before the file was read; what it lacks stays missed, and may still come."""
-    span = Span(first=1, last=10, inherited=True, heard=by_arrival(100))
+    span = Span(first=1, last=10, inherited=True, last_times=by_arrival(100))
     assert taken(span, 20) == [True]
-    assert span.recall([run(5, 13, 50, 120), run(14, 16, 140, 150)], 4)
+    assert span.recover([run(5, 13, 50, 120), run(14, 16, 140, 150)], 4)
     assert taken(span, 12, 13, 14, 17) == [False, True, False, True]
     assert figures(span) == (10, 7, {'restart': 3})
 
 
 def test_numbers_in_a_file_are_the_low_32_bits() -> None:
     """As MCAP has them: those of the publisher's last number are added."""
-    span = Span(first=1, last=(1 << 32) - 2, inherited=True, heard=by_arrival(100))
-    assert span.recall([run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
-    assert span.recall([run(0, 2, 120, 130)], 2)
+    span = Span(first=1, last=(1 << 32) - 2, inherited=True, last_times=by_arrival(100))
+    assert span.recover([run((1 << 32) - 2, 1 << 32, 100, 110)], 1)
+    assert span.recover([run(0, 2, 120, 130)], 2)
     assert taken(span, (1 << 32) + 1, (1 << 32) + 2) == [False, True]
     assert figures(span) == (4, 4, {})
 
@@ -276,7 +276,7 @@ def test_publishers_that_come_and_go_are_added_up(opened: Open, root: Path) -> N
     assert (row['accounting'], row['received'], row['missed']) == ('exact', 6030, 6000 + 2900 - 29)
     with closing(sqlite3.connect(root / 'index.db')) as db:
         assert db.execute('SELECT count(*) FROM publishers').fetchone()[0] <= MAX_PUBLISHERS
-        assert db.execute('SELECT published FROM publishers WHERE publisher = ?', (GONE,)).fetchone()[0] > 10_000
+        assert db.execute('SELECT published FROM publishers WHERE publisher = ?', (FORMER,)).fetchone()[0] > 10_000
 
 
 def test_one_that_was_added_up_and_is_back(opened: Open, root: Path) -> None:
@@ -317,8 +317,8 @@ def test_what_was_added_up_and_not_committed_is_tried_again() -> None:
     second = accounts.snapshot({})
     assert first is not None
     assert second is not None
-    assert first.gone == second.gone
-    assert len(first.gone) == MAX_PUBLISHERS // 2
+    assert first.removed == second.removed
+    assert len(first.removed) == MAX_PUBLISHERS // 2
 
 
 NUMBERS = st.lists(st.integers(0, 60), max_size=80)
@@ -363,7 +363,7 @@ def test_without_a_number_a_message_is_only_received() -> None:
 
 def test_before_the_first_message_nothing_is_known() -> None:
     """A topic that was not heard has not missed 0."""
-    assert (TopicAccount().missed, TopicAccount().about_missed) == (None, None)
+    assert (TopicAccount().missed, TopicAccount().missed_estimated) == (None, None)
 
 
 def test_two_publishers_have_numbers_of_their_own() -> None:
@@ -424,9 +424,9 @@ def test_messages_of_another_type_are_received_and_rejected(opened: Open, root: 
     for counted in (True, False):
         spool = opened()
         receive(spool, 5, '/odom')
-        spool.accounts.see_other('/odom', 'b/msg/B', ['/x'], counted=True, named=True)
-        spool.accounts.see_other('/odom', 'c/msg/C', ['', '/y'], counted=counted, named=True)
-        spool.accounts.refuse('/odom', 'b/msg/B', 3)
+        spool.accounts.add_other_type('/odom', 'b/msg/B', ['/x'], counted=True, named=True)
+        spool.accounts.add_other_type('/odom', 'c/msg/C', ['', '/y'], counted=counted, named=True)
+        spool.accounts.reject_other_type('/odom', 'b/msg/B', 3)
         spool.close()
         found = ledger.read(root, 'thor')
         assert ledger.imbalances(found) == []
@@ -442,9 +442,9 @@ def test_other_types_are_few() -> None:
     """Whoever invents types fills no memory: beyond some they are one, of which nothing is counted."""
     accounts = Accounts()
     for number in range(1000):
-        accounts.see_other('/odom', f'b/msg/B{number}', [f'/{number}'], counted=True, named=True)
+        accounts.add_other_type('/odom', f'b/msg/B{number}', [f'/{number}'], counted=True, named=True)
     for number in range(1000):
-        accounts.see_other('/odom', 'b/msg/B1', [f'/{number}'], counted=True, named=True)
+        accounts.add_other_type('/odom', 'b/msg/B1', [f'/{number}'], counted=True, named=True)
     found = accounts.totals()['/odom'].other_types
     assert len(found) == MAX_OTHER_TYPES + 1
     assert found[MORE_TYPES].messages is None
@@ -456,9 +456,9 @@ def test_without_a_named_type_nobody_knows_whose_messages_are_missed() -> None:
     accounts = Accounts()
     with accounts.entry('/odom') as account:
         account.receive('p', 1)
-    accounts.see_other('/odom', 'b/msg/B', [], counted=True, named=False)
+    accounts.add_other_type('/odom', 'b/msg/B', [], counted=True, named=False)
     assert accounts.totals()['/odom'].missed == 0
-    accounts.see_other('/odom', 'b/msg/B', [], counted=False, named=False)
+    accounts.add_other_type('/odom', 'b/msg/B', [], counted=False, named=False)
     assert accounts.totals()['/odom'].missed is None
-    accounts.see_other('bag:/odom', 'b/msg/B', [], counted=False, named=False, only_known=True)
+    accounts.add_other_type('bag:/odom', 'b/msg/B', [], counted=False, named=False, only_known=True)
     assert accounts.totals('bag:') == {}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shadowhound_data_logger.spool import act_record
-from shadowhound_data_logger.spool.act_record import MAX_ACTS, MAX_SAID, MOST_BYTES, ActRecord
+from shadowhound_data_logger.spool.act_record import MAX_ACTS, MAX_BYTES, MAX_TEXT, ActRecord
 
 
 def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
     assert len(found) == MAX_ACTS
     assert found[0] == {'at_ns': 2, 'who': 'operator at 10.0.0.7', 'do': 'flush', 'ok': True, 'said': '1 objects'}
     assert found[-1] == {
-        'at_ns': MAX_ACTS + 1, 'who': 'operator at 10.0.0.8', 'do': 'pause', 'ok': False, 'said': 'x' * MAX_SAID
+        'at_ns': MAX_ACTS + 1, 'who': 'operator at 10.0.0.8', 'do': 'pause', 'ok': False, 'said': 'x' * MAX_TEXT
     }  # fmt: skip
     assert act_record.file(tmp_path, 'thor').stat().st_mode & 0o077 == 0
     assert act_record.read(tmp_path, 'loki') == []
@@ -40,7 +40,7 @@ def test_the_newest_outlive_the_process(tmp_path: Path) -> None:
         b'null',
         b'[{"at_ns": 1e999}]',
         b'[' * 100_000,
-        b' ' * (MOST_BYTES + 1),
+        b' ' * (MAX_BYTES + 1),
     ],
 )
 def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
@@ -53,4 +53,4 @@ def test_a_damaged_file_has_none(tmp_path: Path, damage: bytes) -> None:
 
 def test_a_disk_that_takes_nothing_stops_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     ActRecord(tmp_path / 'gone', 'thor', lambda: 1).add('operator', 'flush', ok=True, said='done')
-    assert 'cannot be kept' in caplog.text
+    assert 'cannot record' in caplog.text

@@ -15,9 +15,9 @@ from shadowhound_data_logger.core.config import SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, State
 from shadowhound_data_logger.core.stamps import NO_TIMES, Times
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.span import NumberRun
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.topic_account import BAG
 
 ODOM, IMU = f'{BAG}/odom', f'{BAG}/imu'
 
@@ -53,7 +53,7 @@ def started(root: Path, clock: FakeClock) -> Spool:
 
 def find(spool: Spool, item: DataObject) -> None:
     """What recovery does with a slice that was left behind."""
-    spool.accounts.find(item.counts, runs(item))
+    spool.accounts.carried.recover(item.counts, runs(item))
     spool.commit([item])
 
 
@@ -130,7 +130,7 @@ def test_what_a_dead_session_left_open_is_settled_by_what_its_files_hold(
     assert bags(left) == {'/imu': (10, 0, {}, 10)}
     if recorded:
         find(after, a_slice(0, imu=recorded))
-    assert after.accounts.drop_carried('restart') == max(0, 10 - recorded)
+    assert after.accounts.carried.drop_rest('restart') == max(0, 10 - recorded)
     after.close()
     assert bags(left) == {'/imu': expected}
 
@@ -145,7 +145,7 @@ def test_what_a_slice_lacks_was_lost_after_its_last_message(opened: Open, root: 
     with spool.accounts.entry(IMU) as account:
         for second in range(20):
             account.receive('p', second + 1, at(second))
-            account.gaps.heard = at(second)
+            account.gaps.newest = at(second)
     spool.commit([make('thor/rosbags/b/b_0.mcap', b'0', sensor='bag', topic=None, samples=5, counts={IMU: 5},
                        t_end_ns=clock.now_ns + 4 * SECOND)])  # fmt: skip
     left = die(spool, root)
@@ -153,8 +153,8 @@ def test_what_a_slice_lacks_was_lost_after_its_last_message(opened: Open, root: 
         copy = left.with_name(f'from-{begin_s}')
         shutil.copytree(left, copy)
         after = started(copy, clock)
-        after.accounts.find({IMU: 12}, {}, newest)
-        after.accounts.drop_carried('restart')
+        after.accounts.carried.recover({IMU: 12}, {}, newest)
+        after.accounts.carried.drop_rest('restart')
         after.commit()
         after.close()
         (gap,) = [each for each in ledger.journal(copy, 'thor') if each.sink == 'bags']
@@ -171,13 +171,13 @@ def test_each_settles_its_own(opened: Open, root: Path, clock: FakeClock) -> Non
     recording.commit()
     left = die(recording, root)
     node = started(left, clock)
-    assert node.accounts.drop_carried('restart') == 0
+    assert node.accounts.carried.drop_rest('restart') == 0
     node.close()
     again = Spool(left, SpoolSettings(min_free_bytes=0), clock, 'thor records')
     again.open()
     again.carry(BAG)
     find(again, a_slice(0, imu=8))
-    assert again.accounts.drop_carried('restart') == 2
+    assert again.accounts.carried.drop_rest('restart') == 2
     again.close()
     assert bags(left) == {'/imu': (10, 8, {'restart': 2}, 0)}
 
@@ -191,7 +191,7 @@ def test_a_death_in_the_middle_of_settling_costs_nothing(opened: Open, root: Pat
     after.close()
     last = started(second, clock)
     find(last, a_slice(1, imu=5))
-    assert last.accounts.drop_carried('restart') == 1
+    assert last.accounts.carried.drop_rest('restart') == 1
     last.close()
     assert bags(second) == {'/imu': (10, 9, {'restart': 1}, 0)}
 
@@ -206,7 +206,7 @@ def test_what_is_open_at_a_stop_waits_for_the_next_start(opened: Open, root: Pat
     assert ledger.read(root, 'thor')['topics']['/imu']['dropped'] == {'shutdown': 2}
     after = opened()
     after.carry(BAG)
-    assert after.accounts.drop_carried('restart') == 5
+    assert after.accounts.carried.drop_rest('restart') == 5
 
 
 def test_what_is_found_is_counted_once_whatever_dies_next(opened: Open, root: Path, clock: FakeClock) -> None:
@@ -233,11 +233,11 @@ def test_a_recorded_message_is_not_missed_as_well(
     after = started(left, clock)
     item = a_slice(0, imu=14)
     if found_first:
-        after.accounts.find(item.counts, runs(item) if is_told else {})
+        after.accounts.carried.recover(item.counts, runs(item) if is_told else {})
     with after.accounts.entry(IMU) as account:
         assert account.receive('p', 31)
     if not found_first:
-        after.accounts.find(item.counts, runs(item) if is_told else {})
+        after.accounts.carried.recover(item.counts, runs(item) if is_told else {})
     after.commit([item])
     after.close()
     found = ledger.read(left, 'thor')

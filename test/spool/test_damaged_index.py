@@ -242,7 +242,7 @@ def test_an_index_that_is_replaced_in_use(opened: Open, root: Path, logs: tuple[
         (root / f'index.db{end}').unlink()
     (root / 'index.db').touch()
     second = opened()
-    with pytest.raises(sqlite3.DatabaseError, match='lost'):
+    with pytest.raises(sqlite3.DatabaseError, match='deleted or replaced'):
         put(first, make('late'))
     (new,) = put(second, make('new'))
     assert first._session is not None

@@ -23,7 +23,7 @@ from shadowhound_data_logger.spool.estimator import (
     Expectation,
     LossEstimator,
     TopicEstimate,
-    learned,
+    learn_period,
 )
 
 POLL_S = 0.2
@@ -43,7 +43,7 @@ class Ear:
     covered: int = 0
     missed: Counter[str] = field(default_factory=Counter)
 
-    def hear(self, stamps: Iterable[int], *, asleep_s: float = 0.0, shift: int = 0, **hearing: object) -> Ear:
+    def hear(self, stamps: Iterable[int], *, asleep_s: float = 0.0, shift: int = 0, **context: object) -> Ear:
         """``asleep_s`` before the first drain; ``shift`` is what the publisher's clock is ahead of the stamps given here."""
         waiting = sorted(stamps)
         self.now_s += asleep_s
@@ -52,7 +52,7 @@ class Ear:
             batch = [stamp for stamp in waiting if stamp <= self.now_s * SECOND]
             if batch:
                 del waiting[: len(batch)]
-                heard = ArrivalContext(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**hearing)  # type: ignore[arg-type]
+                heard = ArrivalContext(self.now_s, max(0.0, self.looked_s - self.heard_s))._replace(**context)  # type: ignore[arg-type]
                 found = self.estimator.observe([stamp + shift for stamp in batch], heard)
                 self.heard_s = self.now_s
                 self.received += len(batch)
@@ -197,7 +197,7 @@ def test_two_publishers_have_no_rhythm(phase: float) -> None:
     first = even(2000)
     ear = Ear().hear(first[:500])
     assert ear.covered == 500
-    ear.hear([*first[500:], *even(1500, PERIOD, first[500] + phase * PERIOD, seed=1)], alone=False)
+    ear.hear([*first[500:], *even(1500, PERIOD, first[500] + phase * PERIOD, seed=1)], is_only=False)
     assert ear.estimator.period == 0
     assert ear.covered < 600
     assert ear.lost <= 5
@@ -205,7 +205,7 @@ def test_two_publishers_have_no_rhythm(phase: float) -> None:
 
 def test_two_that_alternate_evenly_are_not_taken_for_one() -> None:
     """They look like one of twice the rate; the graph says that they are two."""
-    ear = Ear().hear(even(2000), alone=False)
+    ear = Ear().hear(even(2000), is_only=False)
     assert (ear.covered, ear.lost) == (0, 0)
 
 
@@ -292,7 +292,7 @@ def test_a_counter_that_begins_anew_is_no_loss() -> None:
 def test_a_gap_before_another_publisher_is_no_loss() -> None:
     """Its predecessor may have left at any time; one gap later it is a publisher like any other."""
     sent = even(1000)
-    ear = Ear().hear(sent[:400]).hear(sent[500:501], new=True).hear(without(sent[501:], (100, 130)))
+    ear = Ear().hear(sent[:400]).hear(sent[500:501], has_new=True).hear(without(sent[501:], (100, 130)))
     assert ear.missed == {TRANSPORT: 30}
 
 
@@ -300,7 +300,7 @@ def test_one_of_a_crowd_is_not_counted() -> None:
     """While several publish, and nobody knows who, nothing is claimed; with the last one the rhythm goes on."""
     estimate = TopicEstimate()
     sent = even(1000, jitter=0.0)
-    alone, crowd = ArrivalContext(gid='a'), ArrivalContext(alone=False, crowded=True)
+    alone, crowd = ArrivalContext(gid='a'), ArrivalContext(is_only=False, is_shared=True)
     assert estimate.observe({'': sent[:300]}, alone).covered == 300
     found = estimate.observe({'': sent[300:400]}, crowd)
     assert (found.covered, found.lost, estimate.known) == (0, None, False)
@@ -312,9 +312,9 @@ def test_one_of_a_crowd_is_not_counted() -> None:
 def test_publishers_that_are_told_apart_have_rhythms_of_their_own() -> None:
     """Whatever their rates, and whether the graph knows several."""
     estimate = TopicEstimate()
-    hearing = ArrivalContext(alone=False, crowded=True)
+    context = ArrivalContext(is_only=False, is_shared=True)
     stamps = {'p': without(even(500), (300, 320)), 'q': even(300, 3 * PERIOD)}
-    found = estimate.observe(stamps, hearing)
+    found = estimate.observe(stamps, context)
     assert (found.covered, found.missed) == (780, {TRANSPORT: 20})
 
 
@@ -332,4 +332,4 @@ def test_the_next_session_goes_on() -> None:
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=2, max_size=300))
 def test_no_intervals_are_too_odd(intervals: list[int]) -> None:
     """Whatever they are, there is a period or none."""
-    assert learned(intervals) >= 0.0
+    assert learn_period(intervals) >= 0.0

@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.spool.account_table import AccountTable
 from shadowhound_data_logger.spool.files import Tree
-from shadowhound_data_logger.spool.object_table import ObjectTable
+from shadowhound_data_logger.spool.object_table import ObjectStates
 from shadowhound_data_logger.spool.spool import Spool
 
 MEBI = 1 << 20
@@ -207,7 +207,7 @@ def test_a_part_that_cannot_be_removed(spool: Spool, root: Path, monkeypatch: py
     assert_whole(root)
 
 
-@pytest.mark.parametrize(('table', 'step'), [(ObjectTable, 'insert'), (AccountTable, 'write'), (ObjectTable, 'move')])
+@pytest.mark.parametrize(('table', 'step'), [(ObjectStates, 'insert'), (AccountTable, 'write'), (ObjectStates, 'move')])
 def test_no_space_for_the_index(spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch, table: type, step: str) -> None:
     """A transaction that fails takes its payloads with it, keeps the deliveries pending, and can be tried again."""
     (delivered,) = put(spool, make('old'))

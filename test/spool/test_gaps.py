@@ -16,11 +16,11 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import Outcome, SpooledObject, State
 from shadowhound_data_logger.core.stamps import Times, by_arrival
 from shadowhound_data_logger.spool import gap_table, gaps, ledger
-from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.gaps import Gap, TopicGaps
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.topic_account import BAG
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 MS = SECOND // 1000
@@ -57,7 +57,7 @@ def hear(spool: Spool, *numbers: int, publisher: str = 'p', topic: str = CAMERA,
         for number in numbers:
             times = Times(NOON_NS + number * period_ns, NOON_NS + number * period_ns + LATE_NS)
             account.receive(publisher, number, times)
-            account.gaps.heard = times
+            account.gaps.newest = times
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns = max(clock.now_ns, NOON_NS + max(numbers) * period_ns)
@@ -163,7 +163,7 @@ def test_a_stamp_of_the_future_moves_no_watermark_beyond_now(spool: Spool) -> No
     hear(spool, 1, 2)
     with spool.accounts.entry(CAMERA) as account:
         account.receive('hostile', 1, by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND))
-        account.gaps.heard = by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND)
+        account.gaps.newest = by_arrival(NOON_NS + 365 * 24 * 3600 * SECOND)
     deliver(spool, *spool.commit([make('a', samples=3)]))
     assert watermark(spool) == (0.2, 0.2)
     hear(spool, 4)
@@ -198,7 +198,7 @@ def test_a_restart_with_a_publisher_ahead_is_timed_by_its_clock(root: Path) -> N
         times = Times(clock.now_ns + 3600 * SECOND, clock.now_ns)
         with spool.accounts.entry(CAMERA) as account:
             account.receive('p', second, times)
-            account.gaps.heard = times
+            account.gaps.newest = times
         if second < 2:
             deliver(spool, *put_newest(spool, times, f'n{second}'))
             assert watermark(spool) == (3600, 3600 + second)
@@ -240,7 +240,7 @@ def test_a_clock_that_is_set_back_takes_the_watermark_along(spool: Spool) -> Non
     clock.now_ns = NOON_NS
     with spool.accounts.entry(CAMERA) as account:
         account.receive('p', 101, by_arrival(NOON_NS))
-        account.gaps.heard = by_arrival(NOON_NS)
+        account.gaps.newest = by_arrival(NOON_NS)
     deliver(spool, *spool.commit([make('b')]))
     assert watermark(spool) == (0, 0)
 
@@ -356,7 +356,7 @@ def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) ->
     spool.open()
     with spool.accounts.entry(CAMERA) as account:
         account.receive(None, None)
-        account.appraise(1, {'restart': 4}, Times(NOON_NS + 5 * SECOND, NOON_NS + 5 * SECOND + LATE_NS))
+        account.add_estimate(1, {'restart': 4}, Times(NOON_NS + 5 * SECOND, NOON_NS + 5 * SECOND + LATE_NS))
     spool.commit()
     found = [gap for gap in journal(root) if gap.grade == 'estimated']
     spool.close()
@@ -367,7 +367,7 @@ def test_what_is_estimated_to_be_lost_with_a_restart_has_its_time(root: Path) ->
 
 def test_messages_of_another_type_have_their_time(spool: Spool, root: Path) -> None:
     """Though none of the topic's own came."""
-    spool.accounts.refuse(CAMERA, 'x/msg/Y', 3, by_arrival(NOON_NS), by_arrival(NOON_NS + SECOND))
+    spool.accounts.reject_other_type(CAMERA, 'x/msg/Y', 3, by_arrival(NOON_NS), by_arrival(NOON_NS + SECOND))
     spool.commit()
     assert short(root) == [('rejected', 'wrong_type', 3, 0.0, 1.0)]
 
@@ -539,7 +539,7 @@ def test_rows_of_no_known_time_go_with_their_session(root: Path) -> None:
 
 def test_there_are_never_more_rows_than_that(spool: Spool, root: Path, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """Told or not, and where no clock is ever set: those that did not change for the longest become a sum."""
-    monkeypatch.setattr(gap_table, 'MOST_ROWS', 10)
+    monkeypatch.setattr(gap_table, 'MAX_ROWS', 10)
     clock.now_ns = 500 * SECOND
     for number in range(30):
         with spool.accounts.entry(CAMERA) as account:
@@ -603,7 +603,7 @@ def test_the_journal_adds_up_at_every_commit(
     """Whatever comes late, fails, dies, is evicted, quarantined, tried again, forgotten, or too much for rows of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gaps, 'MAX_NEW_ROWS', bounds[0])
-        patch.setattr(gap_table, 'MOST_ROWS', bounds[1])
+        patch.setattr(gap_table, 'MAX_ROWS', bounds[1])
         _take_steps(tmp_path_factory.mktemp('any') / 'spool', steps)
 
 
@@ -655,10 +655,10 @@ def _count(spool: Spool, clock: FakeClock, what: str, number: int) -> None:
     with accounts.entry(CAMERA) as account:
         count = min(number, account.open)
         if what == 'find':
-            account.find(number)
+            account.recover(number)
         elif what == 'unnumbered':
             account.receive(None, None)
-            account.appraise(1, {'transport': number - 2}, by_arrival(clock.now_ns))
+            account.add_estimate(1, {'transport': number - 2}, by_arrival(clock.now_ns))
     if what == 'drop':
         accounts.drop(CAMERA, 'queue_full', count, by_arrival(clock.now_ns - SECOND), by_arrival(clock.now_ns))
     elif what == 'reject':

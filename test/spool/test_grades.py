@@ -12,16 +12,16 @@ from spool.making import abandon, new_spool
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.estimator import ArrivalContext, Expectation
 from shadowhound_data_logger.spool.spool import Spool
+from shadowhound_data_logger.spool.topic_account import BAG
 
 TOPIC = '/odom'
 PERIOD_NS = SECOND // 100
 ALONE = ArrivalContext(gid='a')
 
 
-def session(opened: Callable[..., Spool], received: int, first: int | None = None, hearing: ArrivalContext = ALONE, *,
+def session(opened: Callable[..., Spool], received: int, first: int | None = None, context: ArrivalContext = ALONE, *,
             at: int | None = None, died: bool = False) -> None:  # fmt: skip
     """So many messages come: numbered from ``first``, or sent in a rhythm from its place ``at``, or neither."""
     spool = opened()
@@ -30,7 +30,7 @@ def session(opened: Callable[..., Spool], received: int, first: int | None = Non
             account.receive('p' if first else None, first and first + offset)
         account.skipped += received
         if at is not None:
-            account.observe({'': [PERIOD_NS * (at + offset) for offset in range(received)]}, hearing)
+            account.observe({'': [PERIOD_NS * (at + offset) for offset in range(received)]}, context)
     if died:
         spool.commit()
         abandon(spool)
@@ -99,11 +99,11 @@ def test_the_rhythm_survives_a_death(opened: Open, root: Path) -> None:
     assert row(root)['missed_by'] == {'restart': 110}
 
 
-@pytest.mark.parametrize('hearing', [ALONE._replace(gid='b'), ALONE._replace(gid='', alone=False)])
-def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, hearing: ArrivalContext) -> None:
+@pytest.mark.parametrize('context', [ALONE._replace(gid='b'), ALONE._replace(gid='', is_only=False)])
+def test_a_gap_before_another_publisher_is_no_loss(opened: Open, root: Path, context: ArrivalContext) -> None:
     """Nor one before several; the rhythm is known all the same."""
     session(opened, 300, at=0)
-    session(opened, 20, hearing=hearing, at=400)
+    session(opened, 20, context=context, at=400)
     found = row(root)
     assert (found['accounting'], found['missed_estimated'], found['missed_by']) == ('estimated', 0, {})
 
@@ -122,7 +122,7 @@ def test_another_declaration_is_another_rhythm(opened: Open, root: Path) -> None
     session(opened, 300, at=0)
     spool = opened()
     with spool.accounts.entry(TOPIC) as account:
-        account.expect(Expectation('counter:tick', 1.0, 1 << 32))
+        account.estimate.expect(Expectation('counter:tick', 1.0, 1 << 32))
         account.receive(None, None)
         account.skipped += 1
         account.observe({'': [7]}, ALONE)
@@ -137,13 +137,13 @@ def test_what_is_carried_keeps_its_grade(opened: Open, root: Path) -> None:
         for lost in (None, {'transport': 2}):
             for _ in range(5):
                 account.receive(None, None)
-            account.appraise(5, lost)
+            account.add_estimate(5, lost)
         account.stored += 0
         account.skipped += 4
     spool.close()
     spool = opened()
     spool.carry(BAG)
-    spool.accounts.drop_carried('restart')
+    spool.accounts.carried.drop_rest('restart')
     spool.close()
     found = ledger.read(root, 'thor')
     assert ledger.imbalances(found) == []

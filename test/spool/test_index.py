@@ -35,7 +35,7 @@ def add(index: Index, numbers: range, bucket: str) -> None:
     with index.transaction():
         for number in numbers:
             item = make(f'{number}', bucket=bucket, priority=number % 9)
-            index.objects.insert(item, item.key, '0' * 64, State.PENDING, None, {}, NOON_NS + number)
+            index.states.insert(item, item.key, '0' * 64, State.PENDING, None, {}, NOON_NS + number)
 
 
 def work(index: Index, *, oldest: bool, without: tuple[str, ...]) -> int:

@@ -65,7 +65,7 @@ def test_totals_of_other_objects_are_told(index: Path, opened: Open, caplog: pyt
         db.commit()
     with index_of(index.parent) as wrong:
         assert len(list(wrong.miscounted())) == 2
-    assert opened().recovery.counts['sums of the ledger that do not close'] == 2
+    assert opened().recovery.counts['sums of the ledger that do not balance'] == 2
     assert '/other: pending None, but in the spool (1, 7, 1)' in caplog.text
 
 

@@ -100,7 +100,7 @@ def test_a_ledger_that_does_not_close_is_told(opened: Open, root: Path, caplog: 
         spool._connections.writing._db.execute("UPDATE tally SET samples = samples + 1 WHERE state = 'pending'")
     spool.close()
     spool = opened()
-    assert dict(spool.recovery.counts) == {'sums of the ledger that do not close': 1}
+    assert dict(spool.recovery.counts) == {'sums of the ledger that do not balance': 1}
     assert 'stored 1, but in objects there are 2' in caplog.text
     assert [item.key for item in spool.pending(9)] == ['a']
 

@@ -125,7 +125,7 @@ def test_an_audit_asks_for_both(spool: Spool, root: Path) -> None:
         assert (deliveries.known(), deliveries.forgotten(), deliveries.since_ns()) == (9, 0, NOON_NS)
         pages = deliveries.pages()
         page = next(pages)
-        deliveries.note([number for number, _ in page])
+        deliveries.set_verified([number for number, _ in page])
         age(spool)
         assert len(short_rows(root)) == 10
         asked = [*page, *(item for more in pages for item in more)]
@@ -222,8 +222,8 @@ def test_keys_that_begin_so_are_the_same_with_short_rows(
         index._db.executescript('DELETE FROM objects; DELETE FROM compact_objects')
         with index.transaction():
             for place, name in enumerate(names):
-                number = index.objects.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
-                index.objects.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
+                number = index.states.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
+                index.states.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
             index._db.execute('DELETE FROM uncataloged')
             index.history.compact(before_ns)
         assert [index.objects.has(BUCKET, name) for name in names] == [True] * len(names)

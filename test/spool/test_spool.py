@@ -30,8 +30,8 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.keys import MAX_SEGMENT_BYTES
 from shadowhound_data_logger.core.model import State
-from shadowhound_data_logger.spool.accounts import BAG
 from shadowhound_data_logger.spool.spool import Outcome, Spool
+from shadowhound_data_logger.spool.topic_account import BAG
 
 DAY_NS = 24 * 3600 * SECOND
 

@@ -224,13 +224,13 @@ TOPICS = {'/imu': {'dropped': 2}, '/odom': {'missed': 3}, '/camera': {'rejected'
         ({'stalls': {'/imu': 'silent for 7 s'}}, '/imu: silent for 7 s'),
         (
             {'topics': {'/odom': {'type': 'A', 'other_types': {'B': {'publishers': ['/x'], 'messages': 1234}}}}},
-            '/odom was published as B too, by /x, and is logged as A alone; 1,234 messages were refused',
+            '/odom was also published as B, by /x, but is only logged as A; 1,234 messages were rejected',
         ),
         (
             {'bag': {'topics': {'/map': {'type': 'A', 'other_types': {'B': {'publishers': [], 'messages': None}}}}}},
             (
-                '/map was published as B too, by a program that is not a ROS node, and is logged as A alone; '
-                'it was not listened to: the number of messages is not known'
+                '/map was also published as B, by a program that is not a ROS node, but is only logged as A; '
+                'these messages were not received or counted'
             ),
         ),
     ],

@@ -255,7 +255,7 @@ def test_what_is_asked_for_or_protected_stays_as_it_is(make_robot: Callable[...,
     robot = make_robot(1 << 20)
     robot.keep(archive(robot, 0), archive(robot, 1), archive(robot, 2))
     with robot.spool._connections.writing.transaction():
-        robot.spool._connections.writing.objects.protect('sensor-data', 'thor/camera/20251018/000000.tar')
+        robot.spool._connections.writing.states.protect('sensor-data', 'thor/camera/20251018/000000.tar')
         number = robot.kept()[1]['id']
         robot.spool._connections.writing._db.execute("INSERT INTO requested VALUES ('r', ?, 1, 'kept')", (number,))
     robot.max_bytes = 70 * KIB

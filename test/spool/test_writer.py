@@ -21,8 +21,8 @@ from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObje
 from shadowhound_data_logger.spool import writer as writer_module
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.retention import OVERHEAD_BYTES
-from shadowhound_data_logger.spool.spool import MOST_OBJECTS, Outcome, Spool
-from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, MOST_BYTES, SpoolWriter
+from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Outcome, Spool
+from shadowhound_data_logger.spool.writer import MANY_OUTCOMES, MAX_BYTES, SpoolWriter
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_what_stays_here_waits_for_others(opened: Callable[..., SpoolWriter], ro
     assert len(commits) <= 2  # the heartbeat may come between
     writing.put(make('alone', **kept))
     until(lambda: sum(commits) == 7)
-    writing.put(make('large', bytes(MOST_BYTES), **kept))
+    writing.put(make('large', bytes(MAX_BYTES), **kept))
     until(lambda: sum(commits) == 8)
     assert writing.flush(60)
     found = assert_whole(root)['objects']
@@ -136,8 +136,8 @@ def test_a_burst_does_not_hold_the_index(
         writing.put(make(f'{number:03}', bytes([number]) * size))
     assert writing.flush(60)
     assert sum(commits) == count + 1
-    assert max(commits) * size <= MOST_BYTES
-    assert max(commits) <= MOST_OBJECTS
+    assert max(commits) * size <= MAX_BYTES
+    assert max(commits) <= MAX_OBJECTS
     assert [row['key'] for row in rows(root)] == ['first', *(f'{number:03}' for number in range(count))]
     assert_whole(root)
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple, Protocol
 
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import BagSettings, EventSettings
-from shadowhound_data_logger.spool.accounts import Losses, TopicAccount
+from shadowhound_data_logger.spool.topic_account import Losses, TopicAccount
 
 log = logging.getLogger(__name__)
 

@@ -19,7 +19,8 @@ from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.ros.endpoints import POLL_S
-from shadowhound_data_logger.spool.accounts import PAUSED, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.topic_account import PAUSED, TopicAccount
 
 QUEUE_FULL: Final = 'queue_full'
 """Why samples are dropped that the encoders' queue has no room for."""
@@ -194,7 +195,7 @@ class Sampler(Consumer):
             sampled.kept_ns = kept[-1][1].stamp_ns
             sampled.open_ns = sampled.open_ns or kept[0][1].stamp_ns
         if drained.paused:
-            heard = account.gaps.heard
+            heard = account.gaps.newest
             account.drop(PAUSED, len(messages), heard if any(heard) else messages[0].times, messages[-1].times)
         else:
             account.skipped += len(messages) - len(kept)

@@ -110,12 +110,12 @@ class Arrivals:
         looked_s = now_s if self._looked_s is None else self._looked_s
         since_s = now_s if self._heard_s is None else self._heard_s
         self._heard_s = now_s
-        alone = len(senders.gids) == 1
+        is_only = len(senders.gids) == 1
         return ArrivalContext(
-            now_s=now_s, quiet_s=max(0.0, looked_s - since_s), alone=alone,
-            gid=senders.gids[0] if alone else '',
-            crowded=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
-            new=senders.changed_s > since_s - NEW_S,
+            now_s=now_s, silent_s=max(0.0, looked_s - since_s), is_only=is_only,
+            gid=senders.gids[0] if is_only else '',
+            is_shared=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
+            has_new=senders.changed_s > since_s - NEW_S,
         )  # fmt: skip
 
 
@@ -207,7 +207,7 @@ class SensorStream:
         self._is_refuted = False
         with self._entry as account:
             account.type = type_name
-            account.expect(self._expected(sensor, types))
+            account.estimate.expect(self._expected(sensor, types))
         for consumer in self._of_sensors:
             consumer.enter(topic, type_name, sensor.name)
 
@@ -251,7 +251,7 @@ class SensorStream:
                         consumer.choose(drained, account)
                     except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
                         failed[consumer] = error
-                account.gaps.heard = newest
+                account.gaps.newest = newest
                 account.stamps = self._times.report()
         if is_refuted and not self._is_refuted:
             self._is_refuted = True

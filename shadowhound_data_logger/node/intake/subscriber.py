@@ -38,7 +38,8 @@ from shadowhound_data_logger.ros.reader import (
     node_of,
     unavailable,
 )
-from shadowhound_data_logger.spool.accounts import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE, Accounts
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.topic_account import MAX_NODES, MAX_OTHER_TYPES, SINKS, WRONG_TYPE
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +128,7 @@ class OtherTypes:
     def _count(self, topic: str, reader: Reader) -> None:
         refused = reader.drain()
         if refused:
-            self._accounts.refuse(topic, reader.plan.type, len(refused), by_arrival(refused[0].received_ns),
+            self._accounts.reject_other_type(topic, reader.plan.type, len(refused), by_arrival(refused[0].received_ns),
                                   by_arrival(refused[-1].received_ns))  # fmt: skip
             by = Counter(message.publisher or '' for message in refused)
             text = f'{WRONG_TYPE}: it is a {reader.plan.type}'
@@ -319,7 +320,8 @@ class Subscriber:
         accounts = [self._chosen] if self._others is not None else [f'{sink}{self._chosen}' for sink in SINKS]
         for name, by in nodes.items():
             for account in accounts:
-                self._accounts.see_other(account, name, by, counted=name == counted, named=named, only_known=self._others is None)
+                self._accounts.add_other_type(account, name, by, counted=name == counted, named=named,
+                                              only_known=self._others is None)  # fmt: skip
             if name not in self._told and (any(by) or self._has_waited(now_s)):
                 how = 'counted as rejected (wrong_type)' if name == counted else 'not listened to'
                 whose = ', '.join(filter(None, by[:MAX_NODES])) or 'a program that is not a ROS node'

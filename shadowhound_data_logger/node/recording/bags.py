@@ -16,7 +16,8 @@ from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.core.options import BagSettings
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import offered_qos
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, TopicChoice
-from shadowhound_data_logger.spool.accounts import BAG, PAUSED, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.topic_account import BAG, PAUSED, TopicAccount
 
 MAX_OFFERS: Final = 1000
 """Publishers whose offers are remembered."""
@@ -58,10 +59,10 @@ class BagConsumer(Consumer):
                 if receive(message.publisher, message.number, message.times) or self._is_earlier(topic, message, account)
             ]  # fmt: skip
             newest = drained.messages[-1].times
-            account.appraise(account.unknown - unknown, drained.lost, newest)
+            account.add_estimate(account.unknown - unknown, drained.lost, newest)
             if paused and fresh:
                 account.drop(PAUSED, len(fresh), fresh[0].times, fresh[-1].times)
-            account.gaps.heard = newest
+            account.gaps.newest = newest
         if not fresh:
             return
         if paused:

@@ -26,7 +26,7 @@ from shadowhound_data_logger.node.intake.consumers import Consumer, Drained, Top
 from shadowhound_data_logger.node.recording.bags import Offers
 from shadowhound_data_logger.node.recording.triggers import EventWatch, Inbox
 from shadowhound_data_logger.ros.endpoints import POLL_S
-from shadowhound_data_logger.spool.accounts import PAUSED
+from shadowhound_data_logger.spool.topic_account import PAUSED
 
 
 class EventConsumer(Consumer):

@@ -48,9 +48,9 @@ from shadowhound_data_logger.node.reporting.front import Front
 from shadowhound_data_logger.node.reporting.watchdog import Watchdog
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.uploader import Uploader, UploadStatus
-from shadowhound_data_logger.spool.accounts import BAG, EVENT
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.status import file
+from shadowhound_data_logger.spool.topic_account import BAG, EVENT
 from shadowhound_data_logger.spool.writer import SpoolWriter
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,9 @@ from shadowhound_data_logger.node.intake import sampling
 from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.node.intake.sampling import Sampler
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
-from shadowhound_data_logger.spool.accounts import ESTIMATED, EXACT, RECEIVED_ONLY, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.gaps import ESTIMATED, EXACT
+from shadowhound_data_logger.spool.topic_account import RECEIVED_ONLY, TopicAccount
 
 TOPIC, TYPE = '/talk', 'std_msgs/msg/String'
 NOON_NS = 1_760_788_800 * SECOND
@@ -186,7 +188,7 @@ def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
     talk.senders.look(['a'])
     spoken(talk, 3, **UNNUMBERED)
     account = talk.account
-    assert (account.accounting, account.missed, account.about_missed, account.unknown) == (RECEIVED_ONLY, None, None, 3)
+    assert (account.accounting, account.missed, account.missed_estimated, account.unknown) == (RECEIVED_ONLY, None, None, 3)
 
 
 def test_a_rhythm_counts_what_is_lost() -> None:
@@ -198,7 +200,7 @@ def test_a_rhythm_counts_what_is_lost() -> None:
         talk.messages(7)  # which nobody takes
     spoken(talk, 1, **UNNUMBERED)
     account = talk.account
-    assert (account.accounting, account.missed, account.about_missed) == (ESTIMATED, None, 21)
+    assert (account.accounting, account.missed, account.missed_estimated) == (ESTIMATED, None, 21)
     assert (account.received, account.estimated, account.unknown) == (301, 301, 0)
 
 
@@ -209,7 +211,7 @@ def test_a_declared_rate_needs_no_learning() -> None:
     spoken(talk, 2, **UNNUMBERED)
     talk.messages(5)
     spoken(talk, 2, **UNNUMBERED)
-    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 5)
+    assert (talk.account.accounting, talk.account.missed_estimated) == (ESTIMATED, 5)
 
 
 def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -217,7 +219,7 @@ def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFix
     talk = Talk(expected_hz=4.0)
     talk.senders.look(['a'])
     spoken(talk, 500, **UNNUMBERED)
-    assert (talk.account.accounting, talk.account.about_missed) == (ESTIMATED, 0)
+    assert (talk.account.accounting, talk.account.missed_estimated) == (ESTIMATED, 0)
     assert [record.getMessage().partition(':')[0] for record in caplog.records] == [TOPIC]
 
 
@@ -242,7 +244,7 @@ def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
         talk.senders.look([successor], now_s)
         next(talk.numbers)
         spoken(talk, 10, **UNNUMBERED)
-        assert talk.account.about_missed == lost + bool(lost) * 2
+        assert talk.account.missed_estimated == lost + bool(lost) * 2
 
 
 def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:

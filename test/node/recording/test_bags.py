@@ -24,7 +24,8 @@ from shadowhound_data_logger.node.intake.sampling import Sampler
 from shadowhound_data_logger.node.intake.stream import Senders, SensorStream, TopicStream
 from shadowhound_data_logger.node.intake.subscriber import Surroundings
 from shadowhound_data_logger.node.recording.bags import BagConsumer
-from shadowhound_data_logger.spool.accounts import BAG, Accounts, TopicAccount
+from shadowhound_data_logger.spool.accounts import Accounts
+from shadowhound_data_logger.spool.topic_account import BAG, TopicAccount
 
 STAMPS = StampRule(SystemClock.of_this_machine())
 
@@ -131,7 +132,7 @@ def test_a_bag_is_told_what_the_rhythm_says(ear: Ear) -> None:
         ear.stream.look((start + 20) / 100)
     account = ear.account
     assert (account.received, account.estimated + account.unknown, account.unknown) == (360, 360, 220)
-    assert (account.missed, account.about_missed, account.missed_estimated) == (None, None, {'transport': 40})
+    assert (account.missed, account.missed_estimated, account.estimated_missed) == (None, None, {'transport': 40})
 
 
 def test_a_pause_counts_and_drops(ear: Ear) -> None:

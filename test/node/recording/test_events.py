@@ -26,7 +26,7 @@ from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.node.intake.consumers import Drained
 from shadowhound_data_logger.node.recording.events import EventConsumer
 from shadowhound_data_logger.node.recording.triggers import LARGE_BYTES, SEEN, EventWatch, Inbox
-from shadowhound_data_logger.spool.accounts import PAUSED
+from shadowhound_data_logger.spool.topic_account import PAUSED
 
 FLOAT = 'std_msgs/msg/Float64'
 

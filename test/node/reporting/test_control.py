@@ -99,7 +99,7 @@ def test_it_is_for_its_owner_alone(serve: Callable[..., Serving], umask: int) ->
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='only root can become another user')
 @pytest.mark.parametrize(
-    ('mode', 'said'), [(0o600, 'control.sock is not for this user (ask as the user of the node)'), (0o666, 'thor')]
+    ('mode', 'said'), [(0o600, 'this user may not use control.sock (run this as the user of the node)'), (0o666, 'thor')]
 )
 def test_another_user_is_refused(serve: Callable[..., Serving], mode: int, said: str) -> None:
     """By the mode of the socket, where that of its folder keeps nobody away; the error says whom to ask as."""
@@ -245,7 +245,7 @@ def test_clients_are_told_when_it_closes(serve: Callable[..., Serving]) -> None:
         closes.start()
         assert [answer['error'] for answer in (*heard(waits), *heard(idles))] == ['the node is closing'] * 2
         closes.join()
-    with pytest.raises(NodeUnavailable, match='no node runs with the spool'):
+    with pytest.raises(NodeUnavailable, match='no node is running with the spool'):
         connect(serving.spool)
 
 
@@ -311,7 +311,7 @@ def test_what_a_killed_node_left_behind_is_replaced(serve: Callable[..., Serving
     for name in ('control.sock', 'control.sock.part', 'control-thor.sock'):
         with socket.socket(socket.AF_UNIX) as left, address(spool, name) as there:
             left.bind(there)
-    with pytest.raises(NodeUnavailable, match=r'no node runs with the spool .* \(start one: .*SHADOWHOUND_HOME'):
+    with pytest.raises(NodeUnavailable, match=r'no node is running with the spool .* \(start one: .*SHADOWHOUND_HOME'):
         connect(spool)
     serving = serve(spool)
     assert works(serving)
@@ -324,9 +324,9 @@ def test_several_nodes_of_one_spool(serve: Callable[..., Serving]) -> None:
     assert sorted(path.name for path in first.spool.glob('*.sock')) == ['control-tachi.sock', 'control.sock']
     with closing(connect(first.spool, 'thor')) as thor, closing(connect(first.spool, 'tachi')) as tachi:
         assert (thor.ask('flush')['robot'], tachi.ask('flush')['robot']) == ('thor', 'tachi')
-    with pytest.raises(NodeUnavailable, match=r'several nodes run here: tachi, thor \(name one: --robot NAME\)'):
+    with pytest.raises(NodeUnavailable, match=r'several nodes are running here: tachi, thor \(name one: --robot NAME\)'):
         connect(first.spool)
-    with pytest.raises(NodeUnavailable, match='no node of odin runs here; those that run: tachi, thor'):
+    with pytest.raises(NodeUnavailable, match='no node of odin is running here, only those of tachi, thor'):
         connect(first.spool, 'odin')
     first.close()
     with closing(connect(first.spool)) as alone:
