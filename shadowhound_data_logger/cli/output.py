@@ -10,7 +10,7 @@ from typing import Any, Final
 import click
 from rich.console import Console, Group, RenderableType
 from rich.measure import Measurement
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from shadowhound_data_logger.core.clock import SECOND
@@ -43,13 +43,12 @@ def print_error(verb: str, what: str, remedy: str, code: int) -> None:
 
 
 def print_page(*parts: RenderableType, console: Console | None = None) -> None:
-    """Parts under one another, tables two columns apart where there is room; without a terminal no table is cut or broken."""
+    """Parts under one another. Tables fit the terminal; without one they are as wide as they need."""
     console = console or Console(highlight=False)
     width = console.width
-    widest = fit(parts, console)
     if not console.is_terminal:
-        console.width = max(width, widest)
-    console.print(Group(*parts))
+        console.width = max(width, *(_width(each, console) for each in _tables(parts)), 1)
+    console.print(Group(*fitted(parts, console)))
     console.width = width
 
 
@@ -84,15 +83,61 @@ def value_table(title: str, values: Mapping[str, object]) -> Table:
     return table
 
 
-def fit(parts: Sequence[RenderableType], console: Console) -> int:
-    """Set the columns of all tables with a header two apart, or one where that is too wide; the width of the widest."""
-    widest = 0
-    for table in (part for part in parts if isinstance(part, Table) and part.show_header):
+def fitted(parts: Sequence[RenderableType], console: Console) -> list[RenderableType]:
+    """The parts, with tables in which no word is broken.
+
+    Columns are two apart, or one where that is too wide. Cells of several words are folded between them; a table that is still
+    too wide becomes a list of names and values for each row, as in psql's expanded display.
+    """
+    wide = {id(each): _fitted(each, console) for each in _tables(parts)}
+    return [wide.get(id(part), part) for part in parts]
+
+
+def _tables(parts: Sequence[RenderableType]) -> list[Table]:
+    found = [part for part in parts if isinstance(part, Table) and part.show_header]
+    for table in found:
         table.padding = (0, 2, 0, 0)
-        if _width(table, console) > console.width:
-            table.padding = (0, 1, 0, 0)
-        widest = max(widest, _width(table, console))
-    return widest
+    return found
+
+
+def _fitted(table: Table, console: Console) -> Table:
+    if _width(table, console) <= console.width:
+        return table
+    table.padding = (0, 1, 0, 0)
+    if _width(table, console) <= console.width:
+        return table
+    sizes = [_size(column, console) for column in table.columns]
+    spare = console.width - sum(size.minimum for size in sizes) - len(sizes) + 1
+    if spare < 0:
+        return _expanded(table)
+    widths = [size.minimum for size in sizes]
+    for _ in range(spare):  # each column to the one that lacks most
+        lacking = [size.maximum - width for size, width in zip(sizes, widths, strict=True)]
+        widths[lacking.index(max(lacking))] += 1
+    for column, width in zip(table.columns, widths, strict=True):
+        column.width = width
+    return table
+
+
+def _size(column: Column, console: Console) -> Measurement:
+    """Of its longest word, and of its longest cell."""
+    sizes = [Measurement.get(console, console.options.update(max_width=WIDEST), cell) for cell in (column.header, *column.cells)]
+    longest = max(size.maximum for size in sizes)
+    return Measurement(longest if column.no_wrap else max(size.minimum for size in sizes), longest)
+
+
+def _expanded(table: Table) -> Table:
+    found = plain_table(str(table.title or ''), ('', 'value'), ('', 'value'))
+    found.show_header = False
+    found.padding = (0, 2, 0, 0)
+    rows = zip(*(list(column.cells) for column in table.columns), strict=True)
+    for number, cells in enumerate(rows):
+        if number:
+            found.add_row('', '')
+        for column, cell in zip(table.columns, cells, strict=True):
+            if str(cell):
+                found.add_row(Text(str(column.header), 'dim'), cell)
+    return found
 
 
 def share_bar(share: float, console: Console) -> Text:

@@ -237,6 +237,8 @@ def _print(found: Any, kind: str, where: str, *, is_objects: bool, is_limited: b
 def _table(found: Any, where: str, *, is_objects: bool, is_limited: bool, by: str) -> Iterator[RenderableType]:
     columns = [name for name in COLUMNS if name in found.column_names] if is_objects else found.column_names
     rows = found.select(columns).slice(0, len(found) if is_limited else SHOWN).to_pylist()
+    if is_objects:
+        columns = [name for name in columns if any(row[name] is not None for row in rows)]
     left = {name for name in columns if any(isinstance(row[name], (str, datetime)) for row in rows)}
     table = plain_table('', columns, left)
     table.title = None

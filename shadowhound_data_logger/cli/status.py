@@ -27,7 +27,7 @@ from shadowhound_data_logger.cli.common import (
 from shadowhound_data_logger.cli.output import (
     duration,
     figure,
-    fit,
+    fitted,
     number,
     plain,
     plain_table,
@@ -150,9 +150,7 @@ def _watch(look: Callable[[], Page], console: Console, interval: float, *, as_js
                 time.sleep(interval)
         with Live(console=console, auto_refresh=False, screen=True) as live:
             while True:
-                parts = view(look(), console)
-                fit(parts, console)
-                live.update(Group(*parts), refresh=True)
+                live.update(Group(*fitted(view(look(), console), console)), refresh=True)
                 time.sleep(interval)
     except KeyboardInterrupt:
         if console.is_terminal and not as_json:
