@@ -94,7 +94,7 @@ class Robot:
 
     def prepare(self, act: str, chance: random.Random) -> Round:
         """Something to do from here: nothing is pinned, no version is bad, and what a rollback leads to was active before."""
-        before, installed = str(self.folder.current()), self.folder.installed()
+        before, installed = str(self.folder.current()), self.folder.versions.ids()
         is_new = act == 'sync'
         others = set(self.manifests).difference(installed) if is_new else {*installed} - {before}
         after = chance.choice(sorted(others))

@@ -120,7 +120,7 @@ def list_(*, as_json: bool) -> ExitCode:
     why_not = {**state.bad, **dict.fromkeys(state.withdrawn, 'no signer lists it any longer')}
     rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': why_not.get(name, ''),
              'isolation': state.verified.get(name)}
-            for name in folder.installed()]  # fmt: skip
+            for name in folder.versions.ids()]  # fmt: skip
     stale = why_stale(folder.path, time.time_ns())
     if as_json:
         print_json({'policies': rows, 'stale': stale})
@@ -141,14 +141,14 @@ def list_(*, as_json: bool) -> ExitCode:
 def show(*, name: str | None, as_json: bool) -> ExitCode:
     """Describe and verify the active version, or NAME@7."""
     folder = _policies()
-    found = folder.find(name) if name else folder.current()
+    found = folder.versions.find(name) if name else folder.current()
     if found is None:
         raise PolicyError('no policy is active')
     try:
         manifest, why = folder.check(found, folder.state()), ''
     except PolicyRefused as error:
         manifest, why = None, f'{error.reason}: {error.what}'
-    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions / found), 'refused': why,
+    told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions.path / found), 'refused': why,
             'isolation': folder.state().verified.get(found), 'stale': why_stale(folder.path, time.time_ns())}  # fmt: skip
     if manifest is not None:
         told |= {'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
@@ -172,7 +172,7 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
 def use(*, name: str, now: bool, isolation: str, as_json: bool) -> ExitCode:
     """Activate a version that is on this robot, and pin it."""
     folder = _policies()
-    found = folder.find(name)
+    found = folder.versions.find(name)
     tried = folder.state().verified.get(found, 'no isolation that is known')
     if not is_enough(tried, isolation):
         raise PolicyError(f'the smoke run of {found} was in {tried}, required is {isolation}',
@@ -238,7 +238,7 @@ def report(*, failures: int, p99_ms: float, as_json: bool) -> ExitCode:
 
 def _told(result: SyncResult) -> dict[str, object]:
     return {'wanted': result.wanted, 'active': result.active, 'done': result.done, 'p99_ms': result.p99_ms,
-            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.begun_anew, 'stale': result.stale,
+            'fetched_bytes': result.fetched_bytes, 'begun_anew': result.restarted_files, 'stale': result.stale,
             'isolation': result.isolation}  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
     root.json for robots. With --root-key, several people keep the root: each signs root.json by policy sign-root.
     """
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
-    files, repository = _signers()
+    files, roots, _ = _signers()
     if person:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         private = place / f'{person}{files.PRIVATE}'
@@ -76,16 +76,16 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
         told: dict[str, object] = {'key': keyid, 'private': str(private), 'public': str(public)}
         lines = [f'{private}: keep it', f'{public}: for who runs policy keys or policy delegate']
     else:
-        found = repository.create(place, [files.load_public(path) for path in publics], threshold, passphrase)
+        found = roots.create(place, [files.load_public(path) for path in publics], threshold, passphrase)
         told = {'folder': str(place), 'root': str(place / ROOT), 'missing_signatures': found.missing}
         lines = [
-            f'{place / repository.TARGETS_KEY}: signs versions; stays with who publishes',
-            f'{place / repository.ONLINE_KEY}: dates what is signed, for policy publish and a daily policy refresh',
+            f'{place / roots.TARGETS_KEY}: signs versions; stays with who publishes',
+            f'{place / roots.ONLINE_KEY}: dates what is signed, for policy publish and a daily policy refresh',
             f'{place / ROOT}: ' + (f'lacks {found.missing} signatures (policy sign-root)' if found.missing else
                                    'for each robot, as policies/root.json in its SHADOWHOUND_HOME'),
         ]  # fmt: skip
         if not publics:
-            lines.insert(0, f'{place / repository.ROOT_KEY}: move it offline, to two places; it replaces all other keys')
+            lines.insert(0, f'{place / roots.ROOT_KEY}: move it offline, to two places; it replaces all other keys')
     print_json(told) if as_json else click.echo('\n'.join(lines))
     return ExitCode.FINE
 
@@ -96,11 +96,11 @@ def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encry
 @as_json
 def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
     """Sign a new root with another key."""
-    repository = _signers()[1]
-    lines = [*repository.described(root)]
+    roots = _signers()[1]
+    lines = [*roots.described(root)]
     if not as_json:
         click.echo('\n'.join(lines))  # before the passphrase is asked for
-    found = repository.sign_root(root, key, _passphrase)
+    found = roots.sign_root(root, key, _passphrase)
     missing = f', {found.missing} missing' if found.missing else ': complete'
     told = {'root': str(root), 'content': lines, 'signatures': found.signed, 'missing_signatures': found.missing}
     print_json(told) if as_json else click.echo(f'{found.signed} signatures{missing}')
@@ -128,7 +128,7 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
     if (publics or threshold) and 'root' not in roles:
         raise BadUsage('--root-key and --threshold are of a new root', 'policy rotate root --root-key alice.pub')
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
-    files, repository = _signers()
+    files, roots, _ = _signers()
     new_root = [files.load_public(path) for path in publics]
     with _signing(folder) as signing:
         before = signing.listed()
@@ -136,16 +136,16 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
         listed = before if found.missing else signing.listed()
     gone = sorted({*before} - {*listed})
     if found.missing:
-        lines = [f'{place / repository.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh']
+        lines = [f'{place / roots.PENDING} lacks {found.missing} signatures: policy sign-root, then policy refresh']
     else:
         lines = [f'root version {found.version} is in force; listed are: {", ".join(listed) or "no policies"}']
         if gone:
             lines.append(f'not signed in this folder, and no longer listed: {", ".join(gone)}; '
                          'policy publish lists what is yours again')  # fmt: skip
         if 'online' in roles or 'targets' in roles or not roles:
-            lines.append(f'copy {place / repository.ONLINE_KEY} to where policy refresh runs')
-        if (place / repository.ROOT_KEY).is_file():
-            lines.append(f'move {place / repository.ROOT_KEY} offline')
+            lines.append(f'copy {place / roots.ONLINE_KEY} to where policy refresh runs')
+        if (place / roots.ROOT_KEY).is_file():
+            lines.append(f'move {place / roots.ROOT_KEY} offline')
     told = {'folder': str(place), 'root_version': found.version, 'missing_signatures': found.missing, 'listed': listed,
             'no_longer_listed': gone}  # fmt: skip
     print_json(told) if as_json else click.echo('\n'.join(lines))
@@ -189,7 +189,7 @@ def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
         state = signing.refresh()
         listed = signing.listed()
     told = {'expires': f'{state.expires:%Y-%m-%dT%H:%M:%SZ}', 'root_expires': f'{state.root.signed.expires:%Y-%m-%dT%H:%M:%SZ}',
-            'listed': listed, 'soon': (soon := [*state.soon()])}  # fmt: skip
+            'listed': listed, 'soon': (soon := [*state.expiring()])}  # fmt: skip
     fresh = f'fresh until {told["expires"]}; the root until {told["root_expires"]}; {len(listed)} versions are listed'
     print_json(told) if as_json else click.echo('\n'.join((fresh, *soon)))
     return exit_code(finding=soon)
@@ -253,7 +253,7 @@ def publish(
     May be repeated, also to give a version that is there another alias. Nothing is overwritten.
     """
     with the_store() as store:
-        signing = _signers()[1].Repository(_keys_folder(folder), store, _passphrase)
+        signing = _signers()[2].Repository(_keys_folder(folder), store, _passphrase)
         manifest, is_told = packing.publish(packed, store, registry(), signing, key=key, aliases=aliases, robots=robots)
     told = {'policy': manifest.id, 'aliases': list(aliases), 'robots': list(robots), 'refreshed': is_told}
     text = f'published {manifest.id}{" as " if aliases else ""}{", ".join(aliases)}'
@@ -308,16 +308,16 @@ def _keys_folder(folder: Path | None) -> Path:
 @contextmanager
 def _signing(folder: Path | None, days: float = FRESH_DAYS) -> Iterator[Any]:
     with the_store() as store:
-        yield _signers()[1].Repository(_keys_folder(folder), store, _passphrase, days=days)
+        yield _signers()[2].Repository(_keys_folder(folder), store, _passphrase, days=days)
 
 
-def _signers() -> tuple[Any, Any]:
-    """The modules ``keys`` and ``repository``, which need packages of the extra."""
+def _signers() -> tuple[Any, Any, Any]:
+    """The modules ``keys``, ``roots`` and ``repository``, which need packages of the extra."""
     try:
-        from shadowhound_data_logger.policies import keys, repository  # noqa: PLC0415 - see above
+        from shadowhound_data_logger.policies import keys, repository, roots  # noqa: PLC0415 - see above
     except ImportError as error:
         raise PolicyError(f'signatures need a package that is missing: {error}', remedy=MISSING_PACKAGE) from error
-    return keys, repository
+    return keys, roots, repository
 
 
 def _passphrase(path: Path) -> str:

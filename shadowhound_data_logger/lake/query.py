@@ -50,7 +50,7 @@ from shadowhound_data_logger.lake.tables import (
 )
 from shadowhound_data_logger.lake.views import rows_of, views
 from shadowhound_data_logger.policies.manifest import BUCKET as POLICIES
-from shadowhound_data_logger.policies.manifest import MANIFEST, MOST_MANIFEST_BYTES, PREFIX, parse_manifest, split_id
+from shadowhound_data_logger.policies.manifest import MANIFEST, MAX_MANIFEST_BYTES, PREFIX, parse_manifest, split_id
 
 ALL: Final = 'all_objects'
 """The view of the table; ``objects`` is restricted by the flags."""
@@ -385,7 +385,7 @@ def _dataset_of(source: Bucket, policy: str) -> str | None:
         for robot_type in models.folders(f'{PREFIX}/') if name else ():
             key = f'{PREFIX}/{robot_type}/{name}_v{version}/{MANIFEST}'
             if is_name(robot_type) and models.head(key) is not None:
-                manifest = parse_manifest(models.get(key, MOST_MANIFEST_BYTES))
+                manifest = parse_manifest(models.get(key, MAX_MANIFEST_BYTES))
                 if manifest.sha256.startswith(sha256):
                     return manifest.dataset or None
     return None

@@ -104,11 +104,11 @@ class Mission:
             self._recorder.append('event', name=values.text(name, values.MAX_KEY), data=values.bounded(values.plain(data)))
 
     def log_trajectory(self, trajectory_csv_path: str | os.PathLike[str]) -> None:
-        """Copy a CSV file with the header ``timestamp,x,y,yaw`` as it is now; it is stored unchanged."""
+        """Copy the current content of a CSV file with the header ``timestamp,x,y,yaw``. It is stored unchanged."""
         self._log_file('trajectory', trajectory_csv_path, {})
 
     def log_artifact(self, path: str | os.PathLike[str], artifact_path: str | None = None) -> None:
-        """Copy a file as it is now to the run's artifacts, in the folder ``artifact_path``.
+        """Copy the current content of a file to the run's artifacts, in the folder ``artifact_path``.
 
         A name that MLflow does not accept, such as ``map#1.png``, is changed (``map=231.png``), with a warning; the summary has
         both names.

@@ -47,7 +47,7 @@ LOGIN_CODES: Final = frozenset({'PERMISSION_DENIED', 'UNAUTHENTICATED', 'CUSTOME
 STATUS_CODES: Final = {401: 'UNAUTHENTICATED', 403: 'PERMISSION_DENIED'}
 """HTTP status -> error code, for responses without a code, such as those of the artifact proxy."""
 TOO_LARGE: Final = 413
-"""The HTTP status with which a proxy refuses a file permanently."""
+"""The HTTP status of a proxy that permanently refuses a file because of its size."""
 OF_OBJECT: Final = frozenset({400, 404, 406, 409, 410, 412, 414, 422, 431, 451})
 """HTTP statuses whose cause may be the object: it is, if the server accepts other objects."""
 OF_PATH: Final = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.EEXIST})

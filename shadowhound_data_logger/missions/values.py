@@ -36,7 +36,7 @@ _ARRAYS: Final = ('__array__', '__array_interface__')
 _SPACES: Final = {(): 'GRAY', (1,): 'GRAY', (3,): 'RGB', (4,): 'RGBA'}
 """Shape of a pixel -> simplejpeg's name of the color space."""
 MAX_NAME_BYTES: Final = 240
-"""File systems allow 255, of which boto3 needs 9 while it downloads a file."""
+"""File systems allow 255, and boto3 appends 9 while it downloads a file."""
 MAX_EXTENSION: Final = 16
 _ODD: Final = re.compile(r'[\x00-\x1f\x7f-\x9f#?\\\ud800-\udfff]|%(?=[0-9A-Fa-f]{2})|=(?=[0-9A-F]{2})|^ ')
 """Characters that do not arrive, tested with MLflow 3.17 through its proxy, with S3 and with folders. The server decodes ``%XX``

@@ -1,6 +1,6 @@
-"""Policies: trained models on their way to the robot; which one by MLflow's registry, bytes from the store.
+"""Policies: trained models that robots run. MLflow's registry selects the version; its files come from the store.
 
-Whether one may run is said by a signature and by what it does on this machine.
+A robot runs a version only if it is signed and passes a smoke run on the robot.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ['ActivePolicy', 'active']
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:  # imported when used: `status` looks at the folder alone
+    if name in __all__:  # imported when used: `status` reads only the folder
         from shadowhound_data_logger.policies import running  # noqa: PLC0415
 
         return getattr(running, name)

@@ -1,7 +1,7 @@
-"""The keys of people who sign: a private key in a file, and what others need of it in ``NAME.pub``.
+"""The keys of signers: a file with the private key, and ``NAME.pub`` with its public part.
 
-A public file holds the key and an empty list of policies that it signed: who delegates to it knows that its owner has the private
-one, and robots find metadata of the new signer before the first policy is published.
+The public file contains the public key and an empty list of policies signed with the private key. The signature proves to the
+delegator that the owner has the private key, and robots find metadata of the new signer before it publishes a policy.
 """
 
 from __future__ import annotations
@@ -29,24 +29,27 @@ PRIVATE: Final = '.key'
 PUBLIC: Final = '.pub'
 MAX_KEY_FILE_BYTES: Final = 64 << 10
 SIGNED_DAYS: Final = 365
-"""Lists of policies expire after a year: a signer who has left ends that way at the latest."""
+"""Lists of policies expire after a year, so that a signer who has left the team cannot be trusted for longer."""
 
 Passphrase = Callable[[Path], str]
-"""Asks for the passphrase of a file."""
+"""Returns the passphrase of a key file, usually by prompting for it."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """What ``NAME.pub`` holds."""
+    """The content of ``NAME.pub``."""
 
     name: str
     key: SSlibKey
     empty: bytes
-    """Metadata of the role ``targets``, version 1, without any policy, signed with the key."""
+    """Metadata of a ``targets`` role, version 1, without policies, signed with the key."""
 
 
 def make_key(path: Path, passphrase: str = '') -> CryptoSigner:
-    """A new Ed25519 key at ``path`` (mode 600, encrypted by the passphrase if any), and its public file. Overwrites nothing."""
+    """Create an Ed25519 key at ``path`` (mode 600, encrypted if there is a passphrase) and its public file.
+
+    Raises PolicyError if the file exists.
+    """
     signer = CryptoSigner.generate_ed25519()
     body = signer.private_bytes
     if passphrase:
@@ -62,30 +65,32 @@ def make_key(path: Path, passphrase: str = '') -> CryptoSigner:
             os.fsync(file.fileno())
     except FileExistsError as error:
         raise PolicyError(
-            f'{path} exists already', remedy='keys are not overwritten: move it away, or choose another name'
+            f'{path} already exists', remedy='keys are not overwritten: move it away, or choose another name'
         ) from error
     path.with_suffix(PUBLIC).write_text(json.dumps(_public(path.stem, signer), indent=1) + '\n', encoding='ascii')
     return signer
 
 
 def load_key(path: Path, passphrase: Passphrase) -> CryptoSigner:
-    """Raises PolicyError for a file that is not a private key, or that this passphrase does not open."""
+    """Load a private key. Raises PolicyError for a file that is not one, or that the passphrase does not decrypt."""
     try:
         body = path.read_bytes()[:MAX_KEY_FILE_BYTES]
         password = passphrase(path).encode() if b'ENCRYPTED' in body else None
         return CryptoSigner(serialization.load_pem_private_key(body, password))
     except OSError as error:
-        raise PolicyError(f'{path} cannot be read: {error.strerror}', remedy='policy keys makes keys') from error
+        raise PolicyError(f'{path} cannot be read: {error.strerror}', remedy='policy keys creates keys') from error
     except (ValueError, TypeError) as error:
-        raise PolicyError(f'{path} is not a private key, or the passphrase is wrong', remedy='policy keys makes keys') from error
+        raise PolicyError(
+            f'{path} is not a private key, or the passphrase is wrong', remedy='policy keys creates keys'
+        ) from error
 
 
 def load_public(path: Path) -> PublicKey:
-    """Raises PolicyError for a file that ``make_key`` did not write, or whose writer does not have the private key."""
+    """Load a public file. Raises PolicyError if ``make_key`` did not write it, or its writer did not have the private key."""
     try:
         given = from_strict_json(path.read_bytes()[: MAX_KEY_FILE_BYTES + 1], MAX_KEY_FILE_BYTES)
         name, empty = str(given['name']), json.dumps(given['metadata']).encode()
-        # Its id is derived here: nobody chooses that of another key.
+        # The id is derived from the key, so that a file cannot claim the id of another key.
         key = SSlibKey.from_crypto(Ed25519PublicKey.from_public_bytes(bytes.fromhex(given['public'])))
         metadata: Metadata[Targets] = Metadata.from_bytes(empty)
         key.verify_signature(metadata.signatures[key.keyid], metadata.signed_bytes)
@@ -101,12 +106,11 @@ def load_public(path: Path) -> PublicKey:
 
 
 def _public(name: str, signer: CryptoSigner) -> dict[str, Any]:
-
     empty = Metadata(Targets(version=1, expires=in_days(SIGNED_DAYS)))
     empty.sign(signer)
     return {'name': name, 'public': signer.public_key.keyval['public'], 'metadata': empty.to_dict()}
 
 
 def in_days(days: float) -> datetime:
-    """When something that is signed now expires."""
+    """The time so many days from now, at which metadata expires."""
     return datetime.now(timezone.utc) + timedelta(days=days)

@@ -1,7 +1,8 @@
-"""What a policy is: ``manifest.json``, which names every file of it, what it takes and gives, and what it promises.
+"""``manifest.json``: describes a policy: its files with hashes, its inputs and outputs, and its limits.
 
-The format is of this package (docs/policies.md). A manifest is believed after its hash was found in signed metadata
-(``trust.py``), and its fields are checked all the same: a key can sign nonsense. The hashes of the other files are in it alone.
+The format belongs to this package (docs/policies.md). A manifest is trusted only if signed metadata contains its hash
+(``trust.py``), and its fields are checked even then, because a signed manifest may be invalid. Only the manifest contains the
+hashes of the other files.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from shadowhound_data_logger.core.untrusted import from_strict_json, is_path
 
 BUCKET: Final = 'lerobot'
 PREFIX: Final = 'policies'
-"""Where policies are in the store."""
+"""Bucket and prefix of policies in the store."""
 FORMAT: Final = 1
 MANIFEST: Final = 'manifest.json'
-MOST_MANIFEST_BYTES: Final = 1 << 20
-MOST_FILES: Final = 100
-MOST_POLICY_BYTES: Final = 16 << 30
-MOST_VALUES: Final = 1 << 24
-"""Of one tensor."""
+MAX_MANIFEST_BYTES: Final = 1 << 20
+MAX_FILES: Final = 100
+MAX_POLICY_BYTES: Final = 16 << 30
+MAX_VALUES: Final = 1 << 24
+"""Elements of one tensor."""
 SUFFIXES: Final = frozenset({'.json', '.safetensors', '.onnx', '.npy'})
-"""Of the files of a policy: formats that hold data, and that no reader executes."""
+"""Allowed for the files of a policy: data formats that no reader executes."""
 ONNX: Final = 'onnx'
 DTYPES: Final = ('float32', 'float64', 'int64', 'int32', 'uint8')
 ID_DIGITS: Final = 16
@@ -54,24 +55,24 @@ class TensorSpec:
     shape: tuple[int, ...]
     dtype: str
     names: tuple[str, ...]
-    """Of its elements along the last axis, in order; empty where nobody said."""
+    """Names of the elements along the last axis, in order; empty if unknown."""
     units: tuple[str, ...]
-    """Of the same; empty where nobody said."""
+    """Units of the same elements; empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmokeSample:
-    """One input with the output that the model has to give for it: tensor name -> file (``.npy``)."""
+    """A sample input with the expected output: tensor name -> file (``.npy``)."""
 
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     tolerance: float
-    """Most that an element may differ, absolute."""
+    """Largest allowed absolute difference of an element of the output."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyManifest:
-    """A manifest that was checked."""
+    """A valid manifest."""
 
     name: str
     version: int
@@ -79,51 +80,51 @@ class PolicyManifest:
     model: str
     robot_types: tuple[str, ...]
     fps: float
-    """Steps a second."""
+    """Steps per second."""
     inputs: tuple[TensorSpec, ...]
     outputs: tuple[TensorSpec, ...]
     dataset: str
-    """Digest of the training set; empty where nobody said."""
+    """Digest of the training set; empty if unknown."""
     run: str
-    """MLflow run that trained it; empty where nobody said."""
+    """The MLflow run that trained the policy; empty if unknown."""
     smoke: SmokeSample
     p99_ms: float
-    """The slowest 99th percentile of a step that is allowed."""
+    """Largest allowed 99th percentile of the duration of a step."""
     failures: int
-    """So many failed steps are allowed in a window of ``running.WINDOW``."""
+    """Failed steps allowed in a window of ``running.WINDOW`` steps."""
     files: tuple[PolicyFile, ...]
     sha256: str
-    """Of the manifest itself, which stands for the whole policy."""
+    """SHA-256 of the manifest, which identifies the policy with all its files."""
 
     @property
     def id(self) -> str:
-        """Such as ``go2_patrol@7#0123456789abcdef``: what missions and the folder of the version are named by."""
+        """Such as ``go2_patrol@7#0123456789abcdef``: the name of the version's folder, and in missions."""
         return f'{self.name}@{self.version}#{self.sha256[:ID_DIGITS]}'
 
     @property
     def size(self) -> int:
-        """Bytes of all files."""
+        """Total bytes of all files."""
         return sum(file.size for file in self.files)
 
 
 def split_id(text: str) -> tuple[str, int, str] | None:
-    """Name, version and the first digits of the manifest's SHA-256; None for what is no id of a policy."""
+    """Name, version and the first digits of the manifest's SHA-256; None for a text that is not the id of a policy."""
     found = _ID.fullmatch(text)
     return (found[1], int(found[2]), found[3]) if found and '..' not in found[1] else None
 
 
 def parse_manifest(content: bytes) -> PolicyManifest:
-    """Raises PolicyRefused: ``manifest`` for what is none, ``path``, ``twice`` or ``file_type`` for a file that may not be."""
+    """Parse a manifest. Raises PolicyRefused: ``manifest``, ``size``, or for a file ``path``, ``twice`` or ``file_type``."""
     try:
-        return _manifest(from_strict_json(content, MOST_MANIFEST_BYTES), hashlib.sha256(content).hexdigest())
+        return _manifest(from_strict_json(content, MAX_MANIFEST_BYTES), hashlib.sha256(content).hexdigest())
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        text = f'no field {error}' if isinstance(error, KeyError) else str(error)
-        raise PolicyRefused('manifest', f'{MANIFEST} is not one of a policy: {text[:200]}') from error
+        text = f'the field {error} is missing' if isinstance(error, KeyError) else str(error)
+        raise PolicyRefused('manifest', f'{MANIFEST} is not the manifest of a policy: {text[:200]}') from error
 
 
 def _manifest(given: Any, sha256: str) -> PolicyManifest:
     if not isinstance(given, dict) or given.get('format') != FORMAT:
-        raise ValueError(f'it has not the format {FORMAT}')
+        raise ValueError(f'its format is not {FORMAT}')
     smoke, limits = given['smoke'], given['limits']
     manifest = PolicyManifest(
         name=_name(given['name']), version=_count(given['version'], 999_999_999),
@@ -131,40 +132,40 @@ def _manifest(given: Any, sha256: str) -> PolicyManifest:
         fps=_number(given['fps'], 1e4), inputs=_tuple(given['inputs'], _tensor, 100),
         outputs=_tuple(given['outputs'], _tensor, 100), dataset=_text(given['dataset']), run=_text(given['run']),
         smoke=SmokeSample(_texts(smoke['inputs']), _texts(smoke['outputs']), _number(smoke['tolerance'], 1e6)),
-        p99_ms=_number(limits['p99_ms'], 1e6), failures=_count(limits['failures'], 1 << 20, least=0),
-        files=_tuple(given['files'], _file, MOST_FILES), sha256=sha256,
+        p99_ms=_number(limits['p99_ms'], 1e6), failures=_count(limits['failures'], 1 << 20, low=0),
+        files=_tuple(given['files'], _file, MAX_FILES), sha256=sha256,
     )  # fmt: skip
     _check_files(manifest)
     return manifest
 
 
 def _check_files(manifest: PolicyManifest) -> None:
-    """Each name once, all that is referred to there, none that is a folder of another."""
+    """Names must be unique and not a folder of another file; every file and tensor that is referred to must exist."""
     paths = [file.path for file in manifest.files]
     lower = [path.lower() for path in (*paths, MANIFEST)]
     if len(set(lower)) < len(lower):
-        raise PolicyRefused('twice', f'{MANIFEST} of {manifest.id} names a file twice')
+        raise PolicyRefused('twice', f'{MANIFEST} of {manifest.id} lists a file twice')
     folders = {str(parent) for path in paths for parent in PurePosixPath(path).parents}
     if folders.intersection(paths):
-        raise PolicyRefused('path', f'{MANIFEST} of {manifest.id} names a file that is a folder of another')
+        raise PolicyRefused('path', f'{MANIFEST} of {manifest.id} lists a file that is also the folder of another file')
     referred = [manifest.model, *manifest.smoke.inputs.values(), *manifest.smoke.outputs.values()]
     if missing := sorted(set(referred) - set(paths)):
         raise ValueError(f'{missing[0]!r} is not among its files')
     if {spec.name for spec in manifest.inputs} != set(manifest.smoke.inputs):
-        raise ValueError('the smoke sample has not its inputs')
+        raise ValueError('the smoke sample does not have the inputs of the model')
     if {spec.name for spec in manifest.outputs} != set(manifest.smoke.outputs):
-        raise ValueError('the smoke sample has not its outputs')
+        raise ValueError('the smoke sample does not have the outputs of the model')
     if not manifest.model.endswith('.onnx'):
-        raise ValueError(f'the model {manifest.model!r} is no .onnx file')
-    if manifest.size > MOST_POLICY_BYTES:
-        raise PolicyRefused('size', f'{manifest.id} has {manifest.size:,} bytes; more than {MOST_POLICY_BYTES:,} are not taken')
+        raise ValueError(f'the model {manifest.model!r} is not an .onnx file')
+    if manifest.size > MAX_POLICY_BYTES:
+        raise PolicyRefused('size', f'{manifest.id} has {manifest.size:,} bytes, more than the allowed {MAX_POLICY_BYTES:,}')
 
 
 def check_file_name(path: str) -> str:
-    """The path unchanged where a policy may have such a file. Raises PolicyRefused: ``path`` or ``file_type``."""
+    """Return the path unchanged if a policy may have such a file. Raises PolicyRefused: ``path`` or ``file_type``."""
     parts = path.split('/')
     if not is_path(path) or len(parts) > 3 or not all(is_name(part, 200) for part in parts):
-        raise PolicyRefused('path', f'a policy cannot have a file {path[:100]!r}: it is not a plain path below its folder')
+        raise PolicyRefused('path', f'a policy cannot have a file {path[:100]!r}: it is not a plain path below the folder')
     if PurePosixPath(path).suffix not in SUFFIXES:
         allowed = ' '.join(sorted(SUFFIXES))
         raise PolicyRefused('file_type', f'a policy cannot have a file {path[:100]!r}: allowed are {allowed}')
@@ -172,31 +173,31 @@ def check_file_name(path: str) -> str:
 
 
 def _file(given: Any) -> PolicyFile:
-    size, sha256 = _count(given['bytes'], MOST_POLICY_BYTES, least=0), _text(given['sha256'])
+    size, sha256 = _count(given['bytes'], MAX_POLICY_BYTES, low=0), _text(given['sha256'])
     if not _SHA256.fullmatch(sha256):
-        raise ValueError(f'{sha256[:80]!r} is no SHA-256')
+        raise ValueError(f'{sha256[:80]!r} is not a SHA-256')
     return PolicyFile(check_file_name(_text(given['path'])), size, sha256)
 
 
 def _tensor(given: Any) -> TensorSpec:
     spec = TensorSpec(
-        _text(given['name']), _tuple(given['shape'], lambda size: _count(size, MOST_VALUES), 8),
-        _one_of(given['dtype'], DTYPES), _tuple(given['names'], _text, MOST_VALUES), _tuple(given['units'], _text, MOST_VALUES),
+        _text(given['name']), _tuple(given['shape'], lambda size: _count(size, MAX_VALUES), 8),
+        _one_of(given['dtype'], DTYPES), _tuple(given['names'], _text, MAX_VALUES), _tuple(given['units'], _text, MAX_VALUES),
     )  # fmt: skip
     values = 1
     for size in spec.shape:
         values *= size
-    if values > MOST_VALUES:
-        raise ValueError(f'{spec.name[:80]!r} has more than {MOST_VALUES:,} values')
+    if values > MAX_VALUES:
+        raise ValueError(f'{spec.name[:80]!r} has more than {MAX_VALUES:,} elements')
     last = spec.shape[-1] if spec.shape else 1
     if any(words and len(words) != last for words in (spec.names, spec.units)):
-        raise ValueError(f'{spec.name[:80]!r} has not one name and unit for each of its {last} elements')
+        raise ValueError(f'{spec.name[:80]!r} must have one name and unit for each of the {last} elements, or none')
     return spec
 
 
 def _text(given: Any) -> str:
     if not isinstance(given, str) or len(given) > 1000 or not given.isprintable():
-        raise ValueError(f'{str(given)[:80]!r} is no printable text')
+        raise ValueError(f'{str(given)[:80]!r} is not a printable text of at most 1000 characters')
     return given
 
 
@@ -206,7 +207,7 @@ def _texts(given: Any) -> Mapping[str, str]:
 
 def _name(given: Any) -> str:
     if not is_name(_text(given)):
-        raise ValueError(f'{given[:80]!r} is no name: letters, digits, "_", "-" and ".", at most 64')
+        raise ValueError(f'{given[:80]!r} is not a name: use letters, digits, "_", "-" and ".", at most 64')
     return str(given)
 
 
@@ -216,19 +217,19 @@ def _one_of(given: Any, allowed: tuple[str, ...]) -> str:
     return str(given)
 
 
-def _count(given: Any, most: int, least: int = 1) -> int:
-    if type(given) is not int or not least <= given <= most:
-        raise ValueError(f'{str(given)[:80]} is no whole number from {least} to {most}')
+def _count(given: Any, high: int, low: int = 1) -> int:
+    if type(given) is not int or not low <= given <= high:
+        raise ValueError(f'{str(given)[:80]} is not an integer from {low} to {high}')
     return given
 
 
-def _number(given: Any, most: float) -> float:
-    if type(given) not in {int, float} or not isfinite(given) or not 0.0 < given <= most:
-        raise ValueError(f'{str(given)[:80]} is no number above 0, at most {most:g}')
+def _number(given: Any, high: float) -> float:
+    if type(given) not in {int, float} or not isfinite(given) or not 0.0 < given <= high:
+        raise ValueError(f'{str(given)[:80]} is not a number above 0 and at most {high:g}')
     return float(given)
 
 
-def _tuple(given: Any, one: Callable[[Any], Any], most: int) -> tuple[Any, ...]:
-    if not isinstance(given, list) or len(given) > most:
-        raise ValueError(f'there is no list of at most {most}')
-    return tuple(one(each) for each in given)
+def _tuple(given: Any, parse: Callable[[Any], Any], limit: int) -> tuple[Any, ...]:
+    if not isinstance(given, list) or len(given) > limit:
+        raise ValueError(f'{str(given)[:80]} is not a list of at most {limit} items')
+    return tuple(parse(each) for each in given)

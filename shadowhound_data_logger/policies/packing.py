@@ -1,4 +1,4 @@
-"""A policy on its way out of the machine that trained it: packed with a manifest, and published."""
+"""Packs a trained policy with a manifest, and publishes it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shadowhound_data_logger.policies.manifest import (
     BUCKET,
     FORMAT,
     MANIFEST,
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     ONNX,
     PolicyManifest,
     check_file_name,
@@ -42,7 +42,7 @@ ROBOT_TYPES: Final = ('go2',)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Packing:
-    """What a manifest says that is in no file of the policy."""
+    """The fields of a manifest that are not derived from the policy's files."""
 
     name: str
     version: int
@@ -56,22 +56,22 @@ class Packing:
 
 
 def pack(folder: Path, smoke: Path, packed: Path, packing: Packing) -> PolicyManifest:
-    """Copy the files of a policy to ``packed`` and write its manifest; what is promised of the sample is what comes out here.
+    """Copy the files of a policy to ``packed`` and write its manifest, with the model's output for the sample.
 
-    ``folder`` has model.onnx and any .json, .safetensors and .npy beside it; config.json may name the elements of inputs and
-    outputs (``input_features`` and ``output_features``: name -> names, units). ``smoke`` is an .npz with an array for each
-    input. Raises PolicyError, PolicyRefused, OSError.
+    ``folder`` contains model.onnx and optionally .json, .safetensors and .npy files; config.json may name the elements of inputs
+    and outputs (``input_features`` and ``output_features``: name -> names, units). ``smoke`` is an .npz file with an array for
+    each input. Raises PolicyError, PolicyRefused, OSError.
     """
     if packed.exists():
-        raise PolicyError(f'{packed} exists already', remedy='name a new folder: what was packed is not overwritten')
+        raise PolicyError(f'{packed} already exists', remedy='choose a new folder: packed policies are not overwritten')
     files = _files(folder)
     part = packed.with_name(f'{packed.name}.part')
     shutil.rmtree(part, ignore_errors=True)
     for name in files:
         (part / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(folder / name, part / name, follow_symlinks=False)
-    told = _tried(part, smoke)
-    files += [*told['smoke']['inputs'].values(), *told['smoke']['outputs'].values()]
+    described = _run_model(part, smoke)
+    files += [*described['smoke']['inputs'].values(), *described['smoke']['outputs'].values()]
     listed = []
     for name in sorted(files):
         check_content(part / name, name)
@@ -80,8 +80,8 @@ def pack(folder: Path, smoke: Path, packed: Path, packing: Packing) -> PolicyMan
     manifest = {
         'format': FORMAT, 'name': packing.name, 'version': packing.version,
         'kind': ONNX, 'model': MODEL, 'robot_types': list(packing.robot_types), 'fps': packing.fps,
-        'inputs': told['inputs'], 'outputs': told['outputs'], 'dataset': packing.dataset, 'run': packing.run,
-        'smoke': {**told['smoke'], 'tolerance': packing.tolerance},
+        'inputs': described['inputs'], 'outputs': described['outputs'], 'dataset': packing.dataset, 'run': packing.run,
+        'smoke': {**described['smoke'], 'tolerance': packing.tolerance},
         'limits': {'p99_ms': packing.p99_ms, 'failures': packing.failures}, 'files': listed,
     }  # fmt: skip
     content = json.dumps(manifest, indent=1).encode() + b'\n'
@@ -92,7 +92,7 @@ def pack(folder: Path, smoke: Path, packed: Path, packing: Packing) -> PolicyMan
 
 
 def _files(folder: Path) -> list[str]:
-    """All files below it. Raises PolicyRefused for what no policy may have."""
+    """All files below a folder. Raises PolicyRefused for files that a policy may not have."""
     found = []
     for path in sorted(folder.rglob('*')):
         name = path.relative_to(folder).as_posix()
@@ -103,19 +103,19 @@ def _files(folder: Path) -> list[str]:
     if MODEL not in found:
         raise PolicyError(f'{folder} has no {MODEL}', remedy='export the policy to ONNX, as docs/policies.md shows')
     if any(name == MANIFEST or name.startswith('smoke/') for name in found):
-        raise PolicyError(f'{folder} was packed already', remedy='pack the folder that the training wrote')
+        raise PolicyError(f'{folder} is already packed', remedy='pack the folder that the training wrote')
     return found
 
 
-def _tried(part: Path, smoke: Path) -> dict[str, Any]:
-    """Inputs, outputs and the sample of a manifest, from one run of the model. Writes the sample."""
+def _run_model(part: Path, smoke: Path) -> dict[str, Any]:
+    """Run the model and write the sample; returns the fields ``inputs``, ``outputs`` and ``smoke`` of the manifest."""
     import numpy as np  # noqa: PLC0415
 
     check_content(part / MODEL, MODEL)
     try:
         session = open_model(part / MODEL)
     except ImportError as error:
-        raise PolicyError(f'packing runs the model: {error}', remedy=MISSING_PACKAGE) from error
+        raise PolicyError(f'the model cannot be run: {error}', remedy=MISSING_PACKAGE) from error
     with np.load(smoke, allow_pickle=False) as arrays:
         given = {spec.name: arrays[spec.name] for spec in session.get_inputs() if spec.name in arrays}
     if missing := [spec.name for spec in session.get_inputs() if spec.name not in given]:
@@ -125,19 +125,19 @@ def _tried(part: Path, smoke: Path) -> dict[str, Any]:
     again = dict(zip(names, session.run(names, given), strict=True))
     for name, array in outputs.items():
         if not np.isfinite(array).all() or worst_difference(array, again[name]):
-            raise PolicyError(f'{name} is not finite, or not twice the same for one input')
+            raise PolicyError(f'{name} is not finite, or differs between two runs with the same input')
     (part / 'smoke').mkdir()
-    placed: dict[str, dict[str, str]] = {}
+    paths: dict[str, dict[str, str]] = {}
     for kind, tensors in (('inputs', given), ('outputs', outputs)):
-        placed[kind] = {name: f'smoke/{kind}_{number}.npy' for number, name in enumerate(tensors)}
-        for name, path in placed[kind].items():
+        paths[kind] = {name: f'smoke/{kind}_{number}.npy' for number, name in enumerate(tensors)}
+        for name, path in paths[kind].items():
             np.save(part / path, tensors[name], allow_pickle=False)
     config = from_json((part / CONFIG).read_bytes()) if (part / CONFIG).is_file() else {}
-    return {'smoke': placed, 'inputs': [_told(name, array, config, 'input_features') for name, array in given.items()],
-            'outputs': [_told(name, array, config, 'output_features') for name, array in outputs.items()]}  # fmt: skip
+    return {'smoke': paths, 'inputs': [_tensor(name, array, config, 'input_features') for name, array in given.items()],
+            'outputs': [_tensor(name, array, config, 'output_features') for name, array in outputs.items()]}  # fmt: skip
 
 
-def _told(name: str, array: Any, config: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _tensor(name: str, array: Any, config: Mapping[str, Any], key: str) -> dict[str, Any]:
     feature = config.get(key, {}).get(name, {})
     return {'name': name, 'shape': list(array.shape), 'dtype': str(array.dtype), 'names': feature.get('names', []),
             'units': feature.get('units', [])}  # fmt: skip
@@ -145,10 +145,10 @@ def _told(name: str, array: Any, config: Mapping[str, Any], key: str) -> dict[st
 
 def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, repository: Repository, *, key: Path | None = None,
             aliases: Sequence[str] = (), robots: Sequence[str] = ()) -> tuple[PolicyManifest, bool]:  # fmt: skip
-    """Upload a policy, register it, list it in the signed metadata, and then give it its aliases; may be repeated.
+    """Upload a policy, register it, list it in the signed metadata, and then set its aliases; can be repeated.
 
-    ``robots`` are those that take it as a canary. Nothing is ever overwritten: a version is published once. Also returned is
-    whether robots learn of it now; otherwise ``policy refresh`` elsewhere has to run first. Raises PolicyError, StoreError.
+    ``robots`` are those that try it as a canary. A published version is never overwritten. Also returns whether robots see it
+    now; otherwise ``policy refresh`` must run on the machine that has online.key. Raises PolicyError, StoreError.
     """
     content = _content(packed)
     manifest = parse_manifest(content)
@@ -159,39 +159,39 @@ def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, reposito
     remedy = f'pack it with --version {following}'
     if all(each.source != source for each in known):
         _check_number(manifest, following)
-        remedy = f'publish the folder whose publication was cut off, or remove {source}/, which the registry does not name'
+        remedy = f'publish the folder whose publication was interrupted, or delete {source}/, which is not in the registry'
     folder = source.removeprefix(f's3://{BUCKET}/')
-    for name in (*(file.path for file in manifest.files), MANIFEST):  # the manifest last: with it, all is there
+    for name in (*(file.path for file in manifest.files), MANIFEST):  # the manifest last: then the upload is complete
         size, sha256 = fingerprint(packed / name)
         item = _item(f'{folder}/{name}', packed / name, size, sha256)
         try:
             steadily(lambda item=item: store.put(item))  # type: ignore[misc]
         except ForeignObject as error:
-            text = f'another {manifest.name}@{manifest.version} is there already: {error.what}'
+            text = f'the store already has a different {manifest.name}@{manifest.version}: {error.what}'
             raise PolicyError(text, remedy=remedy) from error
     tags = {ID_TAG: manifest.id, 'shadowhound.dataset': manifest.dataset}
     number = registry.register(manifest.name, source, {key: value for key, value in tags.items() if value}, manifest.run)
     _check_number(manifest, number)
-    is_told = repository.publish(
+    is_visible = repository.publish(
         {target_of(kind, manifest.name, manifest.version): content for kind in manifest.robot_types}, key
     )
     if robots:
         registry.tag(manifest.name, number, ROBOTS_TAG, ','.join(robots))
     for alias in aliases:
         registry.set_alias(manifest.name, alias, number)
-    return manifest, is_told
+    return manifest, is_visible
 
 
 def _check_number(manifest: PolicyManifest, number: int) -> None:
-    """Raises PolicyError where the registry gives the version another number than its manifest has."""
+    """Raises PolicyError if the registry's version number differs from that of the manifest."""
     if number != manifest.version:
-        raise PolicyError(f'in the registry this is version {number} of {manifest.name}, and it is packed as {manifest.version}',
+        raise PolicyError(f'in the registry this is version {number} of {manifest.name}, but it is packed as {manifest.version}',
                           remedy=f'pack it with --version {number}')  # fmt: skip
 
 
 def _content(packed: Path) -> bytes:
     with (packed / MANIFEST).open('rb') as file:
-        return file.read(MOST_MANIFEST_BYTES + 1)
+        return file.read(MAX_MANIFEST_BYTES + 1)
 
 
 def _item(key: str, path: Path, size: int, sha256: str) -> SpooledObject:

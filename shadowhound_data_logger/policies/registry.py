@@ -1,7 +1,7 @@
-"""Which version a robot should run, as MLflow's registry says: aliases of a registered model; and the way of a version into it.
+"""MLflow's registry: aliases of a registered model select the version that a robot runs; publishing adds versions.
 
-By hand (``mlflow_rest.py``): an answer has some 500 bytes, and MLflow's own client takes seconds to import.
-https://mlflow.org/docs/latest/api_reference/rest-api.html
+Uses MLflow's REST API directly (``mlflow_rest.py``), because a response has about 500 bytes and importing MLflow's client takes
+seconds. https://mlflow.org/docs/latest/api_reference/rest-api.html
 """
 
 from __future__ import annotations
@@ -17,62 +17,62 @@ from shadowhound_data_logger.policies.manifest import BUCKET, PREFIX
 
 CHAMPION, CANARY = 'champion', 'canary'
 ROBOTS_TAG: Final = 'shadowhound.robots'
-"""Of a version: the robots that take it as a canary, with commas between them."""
+"""Tag of a version: the robots that try it as a canary, separated by commas."""
 ID_TAG: Final = 'shadowhound.policy'
 PAGE: Final = 200
-"""Versions that are asked for at once: an answer with them has some 200 KB."""
-MOST_PAGES: Final = 500
-_NOT_THERE: Final = frozenset({'RESOURCE_DOES_NOT_EXIST', 'INVALID_PARAMETER_VALUE'})
-"""MLflow says the latter of an alias that a model does not have."""
+"""Versions per request: the response has about 200 KB."""
+MAX_PAGES: Final = 500
+_MISSING: Final = frozenset({'RESOURCE_DOES_NOT_EXIST', 'INVALID_PARAMETER_VALUE'})
+"""Error codes for an alias that does not exist; MLflow returns the latter if the model exists."""
 
 
 @dataclass(frozen=True, slots=True)
 class RegisteredVersion:
-    """A version in the registry, none of which is believed."""
+    """A version in the registry. Its fields are not trusted."""
 
     name: str
     version: int
     source: str
     robots: frozenset[str]
-    """Those that are to try it."""
+    """The robots that try it as a canary."""
 
 
 class PolicyRegistry(Protocol):
-    """What a robot asks."""
+    """The requests of a robot."""
 
     def alias(self, name: str, alias: str) -> RegisteredVersion | None:
-        """The version that has an alias; None where there is none. Raises TrackingError."""
+        """The version with this alias; None if there is none. Raises TrackingError."""
 
 
 class MlflowRegistry:
-    """The registry of an MLflow server. One request a call."""
+    """The registry of an MLflow server."""
 
     def __init__(self, rest: MlflowRest) -> None:
         self._rest = rest
 
     def alias(self, name: str, alias: str) -> RegisteredVersion | None:
         try:
-            told = self._rest.json('GET', 'registered-models/alias?' + urlencode({'name': name, 'alias': alias}))
+            found = self._rest.json('GET', 'registered-models/alias?' + urlencode({'name': name, 'alias': alias}))
         except TrackingRefused as error:
-            if error.data['code'] in _NOT_THERE:
+            if error.data['code'] in _MISSING:
                 return None
             raise
-        return _version(told.get('model_version'))
+        return _version(found.get('model_version'))
 
     def versions(self, name: str) -> list[RegisteredVersion]:
-        """All of a model, the newest first. Raises PolicyError for more than anybody can have made."""
-        asked = {'filter': f"name='{name}'", 'max_results': str(PAGE), 'order_by': 'version_number DESC'}
+        """All versions of a model, the newest first. Raises PolicyError if there are implausibly many."""
+        query = {'filter': f"name='{name}'", 'max_results': str(PAGE), 'order_by': 'version_number DESC'}
         found: list[RegisteredVersion] = []
-        for _ in range(MOST_PAGES):
-            told = self._rest.json('GET', f'model-versions/search?{urlencode(asked)}')
-            found += map(_version, told.get('model_versions', []))
-            if not (token := told.get('next_page_token')):
+        for _ in range(MAX_PAGES):
+            page = self._rest.json('GET', f'model-versions/search?{urlencode(query)}')
+            found += map(_version, page.get('model_versions', []))
+            if not (token := page.get('next_page_token')):
                 return found
-            asked['page_token'] = str(token)
-        raise PolicyError(f'the registry names more than {PAGE * MOST_PAGES:,} versions of {name}')
+            query['page_token'] = str(token)
+        raise PolicyError(f'the registry lists more than {PAGE * MAX_PAGES:,} versions of {name}')
 
     def register(self, name: str, source: str, tags: dict[str, str], run: str) -> int:
-        """The number of a new version, or of the one that has this source already."""
+        """Register a version and return its number; if a version already has this source, return its number."""
         try:
             self._rest.json('POST', 'registered-models/create', {'name': name})
         except TrackingRefused as error:
@@ -86,15 +86,16 @@ class MlflowRegistry:
         return number
 
     def tag(self, name: str, version: int, key: str, value: str) -> None:
+        """Set a tag of a version."""
         self._rest.json('POST', 'model-versions/set-tag', {'name': name, 'version': str(version), 'key': key, 'value': value})
 
     def set_alias(self, name: str, alias: str, version: int) -> None:
-        """Give a version an alias, which another one loses."""
+        """Move an alias to a version."""
         self._rest.json('POST', 'registered-models/alias', {'name': name, 'alias': alias, 'version': str(version)})
 
 
 def choose(registry: PolicyRegistry, name: str, robot: str) -> RegisteredVersion | None:
-    """What a robot should run: its own alias, else the canary if that lists it, else the champion."""
+    """The version that a robot should run: its own alias, or the canary if that names the robot, or the champion."""
     if (own := registry.alias(name, f'robot-{robot}')) is not None:
         return own
     canary = registry.alias(name, CANARY)
@@ -104,25 +105,25 @@ def choose(registry: PolicyRegistry, name: str, robot: str) -> RegisteredVersion
 
 
 def source_of(robot_type: str, name: str, version: int) -> str:
-    """Where a version is: ``s3://lerobot/policies/go2/go2_patrol_v7``."""
+    """The location of a version: ``s3://lerobot/policies/go2/go2_patrol_v7``."""
     return f's3://{BUCKET}/{PREFIX}/{robot_type}/{name}_v{version}'
 
 
 def folder_of(chosen: RegisteredVersion, name: str) -> str:
-    """The prefix of the keys of a version. Raises PolicyRefused (``source``) where the registry names anything else."""
+    """The prefix of a version's keys. Raises PolicyRefused (``source``) if the registry's source is not where it must be."""
     source = chosen.source.rstrip('/')
     robot_type = source.removeprefix(f's3://{BUCKET}/{PREFIX}/').partition('/')[0]
     if chosen.name != name or not is_name(robot_type) or source != source_of(robot_type, name, chosen.version):
-        text = f'the registry says that {name}@{chosen.version} is at {chosen.source[:200]!r}, where it cannot be'
+        text = f'the source of {name}@{chosen.version} in the registry, {chosen.source[:200]!r}, is not a location of policies'
         raise PolicyRefused('source', text)
     return source.removeprefix(f's3://{BUCKET}/')
 
 
-def _version(told: Any) -> RegisteredVersion:
+def _version(given: Any) -> RegisteredVersion:
     try:
-        number = int(str(told['version'])[:9])
-        tags = {str(tag['key']): str(tag.get('value', '')) for tag in told.get('tags', [])}
+        number = int(str(given['version'])[:9])
+        tags = {str(tag['key']): str(tag.get('value', '')) for tag in given.get('tags', [])}
         robots = frozenset(robot.strip() for robot in tags.get(ROBOTS_TAG, '').split(',') if robot.strip())
-        return RegisteredVersion(str(told['name']), number, str(told.get('source', '')), robots)
+        return RegisteredVersion(str(given['name']), number, str(given.get('source', '')), robots)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise PolicyError(f'the registry answers with something that is no version of a model: {str(told)[:100]!r}') from error
+        raise PolicyError(f'the registry returned something other than a version of a model: {str(given)[:100]!r}') from error

@@ -1,4 +1,4 @@
-"""The policy that is active, for the program that runs it: its files, kept on the disk and verified; and what it reports."""
+"""The active policy, for the program that runs it: verified files that stay on disk, and reports of failures and latency."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import PolicyManifest
 
 WINDOW: Final = 100
-"""Steps over which failures and latency are judged."""
-LEAST_STEPS: Final = 20
-"""Of a window before a p99 means anything."""
+"""Number of steps over which failures and latency are measured."""
+MIN_STEPS: Final = 20
+"""With fewer steps the p99 is not checked."""
 
 
 @dataclass(slots=True)
 class ActivePolicy:
-    """A verified version of a policy, which stays on the disk while the ``with`` of ``active`` lasts. For one thread."""
+    """A verified version of a policy, which stays on disk until the ``with`` block of ``active`` ends. For one thread."""
 
     id: str
     """Such as ``go2_patrol@7#0123456789abcdef``."""
@@ -35,11 +35,11 @@ class ActivePolicy:
 
     @property
     def model(self) -> Path:
-        """The file of the model."""
+        """The path of the model file."""
         return self.path / self.manifest.model
 
     def is_current(self) -> bool:
-        """Whether it is still the active one. If not, leave the ``with`` and call ``active`` again."""
+        """Whether this version is still active. If not, leave the ``with`` block and call ``active`` again."""
         return self._folder.current() == self.id
 
     def report(self, latency_s: float, *, failed: bool = False) -> bool:
@@ -50,17 +50,17 @@ class ActivePolicy:
             failed: whether it failed.
 
         Returns:
-            Whether the policy may continue. One that exceeds the limits of its manifest has been rolled back.
+            Whether the policy may continue. A policy that exceeds the limits of its manifest is rolled back before this returns.
         """
         self._steps.append((failed, latency_s * 1000.0))
         failures = sum(failed for failed, _ in self._steps)
         slowest = sorted(ms for _, ms in self._steps)
-        p99_ms = slowest[int(0.99 * (len(slowest) - 1))] if len(slowest) >= LEAST_STEPS else 0.0
+        p99_ms = slowest[int(0.99 * (len(slowest) - 1))] if len(slowest) >= MIN_STEPS else 0.0
         return judge(self._folder, self.id, self.manifest, failures, p99_ms)
 
 
 def judge(folder: PolicyFolder, name: str, manifest: PolicyManifest, failures: int, p99_ms: float) -> bool:
-    """Whether a policy keeps its limits; one that does not is rolled back, and never comes back by itself."""
+    """Whether a policy keeps its limits; otherwise roll it back, after which only ``policy use`` activates it again."""
     why = ''
     if failures > manifest.failures:
         why = f'{failures} steps failed, allowed are {manifest.failures}'
@@ -73,7 +73,7 @@ def judge(folder: PolicyFolder, name: str, manifest: PolicyManifest, failures: i
 
 @contextmanager
 def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str] = os.environ) -> Iterator[ActivePolicy]:
-    """The active policy as a context manager. Every hash is verified again; the files are not removed within the ``with``.
+    """The active policy as a context manager. Verifies all hashes again, and keeps the files on disk until the block ends.
 
     Args:
         home: the folder; by default SHADOWHOUND_HOME.
@@ -89,17 +89,17 @@ def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str
         if name is None:
             raise PolicyError(f'no policy is active in {folder.path}')
         try:
-            descriptor = os.open(folder.versions / name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            descriptor = os.open(folder.versions.path / name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         except FileNotFoundError:
             if folder.current() == name:
                 raise
             continue
         try:
             durable_files.lock(descriptor, shared=True)
-            if os.fstat(descriptor).st_nlink and (folder.versions / name).exists():
+            if os.fstat(descriptor).st_nlink and (folder.versions.path / name).exists():
                 folder.check_owner()
                 manifest = folder.check(name, folder.state())
-                yield ActivePolicy(name, folder.versions / name, manifest, folder)
+                yield ActivePolicy(name, folder.versions.path / name, manifest, folder)
                 return
         finally:
             os.close(descriptor)

@@ -19,6 +19,7 @@ from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.policies import sync, trust
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.repository import Repository
+from shadowhound_data_logger.policies.signed_metadata import SignedMetadata
 from shadowhound_data_logger.policies.smoke import SANDBOX, SmokeRun
 from shadowhound_data_logger.stores import open_store
 
@@ -72,7 +73,7 @@ def test_a_team_of_one_has_its_keys_with_one_command(team: Team) -> None:
     assert {path.stat().st_mode & 0o777 for path in team.keys.glob('*.key')} == {0o600}
     assert team.keys.stat().st_mode & 0o777 == 0o700
     before = {path: path.read_bytes() for path in team.keys.iterdir()}
-    assert 'exists already' in team.run('keys', code=1)
+    assert 'already exists' in team.run('keys', code=1)
     assert {path: path.read_bytes() for path in team.keys.iterdir()} == before
 
 
@@ -98,7 +99,7 @@ def test_a_team_whose_root_needs_two(team: Team) -> None:
     for name in people:
         team.run('keys', '--person', name, '--keys', team.home / 'people')
     publics = [part for key in people.values() for part in ('--root-key', key.with_suffix('.pub'))]
-    assert 'cannot sign' in team.run('keys', '--threshold', 4, *publics, code=1)
+    assert 'the threshold 4' in team.run('keys', '--threshold', 4, *publics, code=1)
     assert 'lacks 2 signatures' in team.run('keys', '--threshold', 2, *publics)
     assert not (team.keys / 'root.key').exists()
     assert 'lacks 2 signatures' in team.run('refresh', code=1)
@@ -126,9 +127,10 @@ def test_a_rotation_that_was_cut_off(team: Team, monkeypatch: pytest.MonkeyPatch
     team.run('keys')
     robot = team.robot('thor')
     team.publish('go2/go2_patrol/1')
-    for version, step in enumerate(('_place', '_newest', '_sign', '_put'), 2):
+    for version, step in enumerate(('upload', '_newest_root', 'sign', '_put'), 2):
         with monkeypatch.context() as patch:
-            patch.setattr(Repository, step, _dying(getattr(Repository, step), after={'_newest': 1, '_put': 2}.get(step, 0)))
+            after = {'_newest_root': 1, '_put': 2}.get(step, 0)
+            patch.setattr(SignedMetadata, step, _dying(getattr(SignedMetadata, step), after=after))
             with pytest.raises(ZeroDivisionError):
                 Repository(team.keys, team.store, lambda _: '').rotate(('targets', 'online'))
         assert json.loads(team.run('refresh', '--json'))['listed'] == ['go2/go2_patrol/1'], step
@@ -158,7 +160,7 @@ def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
     vault.mkdir()
     (team.keys / 'root.key').rename(vault / 'root.key')
     shutil.copy(team.keys / 'root.json', vault)
-    assert 'not in' in team.run('rotate', code=1)
+    assert 'has no root.key' in team.run('rotate', code=1)
     said = team.run('rotate', '--keys', vault)
     assert 'listed are: go2/go2_patrol/1' in said
     assert 'copy' in said
@@ -178,14 +180,14 @@ def test_two_rotations_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> N
     team.publish('go2/go2_patrol/1')
     shutil.copytree(team.keys, team.home / 'other')
     other = Repository(team.home / 'other', team.store, lambda _: '')
-    with pytest.raises(DataLoggerError, match='is not a key of the root'):
+    with pytest.raises(DataLoggerError, match='is not a key of root version'):
         other.rotate(('online',), [team.keys / 'targets.key'])
     with monkeypatch.context() as patch:
-        patch.setattr(Repository, '_place', _dying(Repository._place, after=0))
+        patch.setattr(SignedMetadata, 'upload', _dying(SignedMetadata.upload, after=0))
         with pytest.raises(ZeroDivisionError):
             other.rotate(('online',))
     assert 'version 2 is in force' in team.run('rotate')
-    with pytest.raises(DataLoggerError, match='is not the key of root version 2'):
+    with pytest.raises(DataLoggerError, match='is not a key of root version 2'):
         other.refresh()
     assert list((team.home / 'other').glob('*.next*')) == []
     assert 'version 3 is in force' in team.run('rotate', 'root', 'online')
@@ -255,7 +257,7 @@ def test_two_who_sign_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> No
         return state
 
     monkeypatch.setattr(one, 'load', and_another_signs)
-    with pytest.raises(DataLoggerError, match='by somebody else'):
+    with pytest.raises(DataLoggerError, match='another process signed'):
         one.publish({'go2/go2_patrol/3': b'{}'})
     one.publish({'go2/go2_patrol/3': b'{}'})
     assert one.listed() == [f'go2/go2_patrol/{number}' for number in (1, 2, 3)]

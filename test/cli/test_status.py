@@ -158,7 +158,7 @@ def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolatio
     name = f'go2_patrol@1#{"a" * 16}'
     folder = PolicyFolder(tmp_path)
     folder.make()
-    (folder.versions / name).mkdir()
+    (folder.versions.path / name).mkdir()
     (folder.path / 'current').symlink_to(Path('versions') / name)
     with folder.changing() as state:
         state.verified |= {name: isolation} if isolation else {}

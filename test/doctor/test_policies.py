@@ -16,7 +16,7 @@ def activate(scene: Scene, isolation: str) -> None:
     """A version whose smoke run was in this isolation; no root of trust is installed."""
     folder = PolicyFolder(scene.folder / 'home')
     folder.make()
-    (folder.versions / NAME).mkdir()
+    (folder.versions.path / NAME).mkdir()
     (folder.path / 'current').symlink_to(Path('versions') / NAME)
     with folder.changing() as state:
         state.verified[NAME] = isolation

@@ -19,7 +19,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.core.errors import PolicyRefused
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.policies import packing, repository
+from shadowhound_data_logger.policies import packing, roots
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
 from shadowhound_data_logger.policies.registry import RegisteredVersion, source_of
@@ -81,7 +81,7 @@ class Spark:
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.keys = self.folder / 'keys'
-        repository.create(self.keys)
+        roots.create(self.keys)
 
     @property
     def root(self) -> Path:

@@ -84,9 +84,12 @@ def test_a_service_ends_at_once_also_while_it_downloads(tower: Tower, tmp_path: 
     for number in (signal.SIGTERM, signal.SIGINT):
         service = Process('policy run', command, tmp_path / 'run.log', {**os.environ, **thor.environ})
         try:
-            before = sum(path.stat().st_size for path in thor.folder.incoming.rglob('*.onnx*'))
+            incoming = thor.folder.versions.incoming
+            before = sum(path.stat().st_size for path in incoming.rglob('*.onnx*'))
             until(
-                lambda before=before: sum(path.stat().st_size for path in thor.folder.incoming.rglob('*.onnx*')) > before,
+                lambda before=before: (
+                    sum(path.stat().st_size for path in thor.folder.versions.incoming.rglob('*.onnx*')) > before
+                ),
                 lambda service=service: f'it downloads: {service.log}',
             )
             service.signal(number)
@@ -135,7 +138,7 @@ def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
             until(lambda: tachi.folder.current() == ids[1], lambda: f'it goes back: {service.log}')
             took_s.append(time.monotonic() - began)
         assert statistics.median(took_s) < 1.0, took_s
-        service.said(f'{ids[2]} was taken out here: 4 steps failed')  # the registry says the same, and is not followed
+        service.said(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry says the same, and is not followed
         assert tachi.folder.current() == ids[1]
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
         assert [robot.folder.state().bad for robot in others] == [{}, {}]

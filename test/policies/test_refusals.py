@@ -76,7 +76,7 @@ def test_an_old_version_that_is_replayed(second: Scene) -> None:
     second.registry.say('champion', 2)
     assert second.refused() == 'old'
     second.registry.say('champion', 1)
-    assert second.robot.run().active == second.folder.find('go2_patrol@1')
+    assert second.robot.run().active == second.folder.versions.find('go2_patrol@1')
 
 
 @pytest.mark.parametrize(('path', 'reason'), [
@@ -160,7 +160,7 @@ def test_another_version_than_the_registry_says(second: Scene) -> None:
 
 def test_a_link_in_a_version(second: Scene, tmp_path: Path) -> None:
     """Neither on the robot, whoever put it there, nor on the way into a package."""
-    place = second.folder.versions / str(second.folder.current())
+    place = second.folder.versions.path / str(second.folder.current())
     place.chmod(0o700)
     (place / 'config.json').unlink()
     (place / 'config.json').symlink_to('/etc/hostname')
@@ -176,7 +176,7 @@ def test_a_link_in_a_version(second: Scene, tmp_path: Path) -> None:
 
 def test_what_was_verified_is_what_runs(second: Scene) -> None:
     """A file that changed since, one too many, and a link that leads elsewhere."""
-    place = second.folder.versions / str(second.folder.current())
+    place = second.folder.versions.path / str(second.folder.current())
     model = place / 'model.onnx'
     model.chmod(0o600)
     content = model.read_bytes()
@@ -196,7 +196,7 @@ def test_what_was_verified_is_what_runs(second: Scene) -> None:
     with pytest.raises(PolicyError, match='no policy is active'), active(second.path / 'thor'):
         pass
     (second.folder.path / 'metadata').chmod(0o777)
-    with pytest.raises(PolicyError, match='others may write'):
+    with pytest.raises(PolicyError, match='other users'):
         second.robot.run()
 
 
@@ -345,7 +345,7 @@ def test_no_mission_is_disturbed_and_no_version_in_use_removed(second: Scene) ->
             second.robot.run()
         second.folder.clean(1)
         assert policy.model.is_file()
-        assert len(second.folder.installed()) == 3
+        assert len(second.folder.versions.ids()) == 3
     assert second.folder.clean(1) == [first]
 
 
@@ -401,7 +401,7 @@ def test_a_full_disk_while_activating_changes_nothing(second: Scene, monkeypatch
 
 def test_a_pinned_version_waits_for_the_end_of_a_mission_too(second: Scene) -> None:
     """Where its activation was cut off before."""
-    first, later = second.folder.find('go2_patrol@1'), str(second.robot.run().active)
+    first, later = second.folder.versions.find('go2_patrol@1'), str(second.robot.run().active)
     with second.folder.changing() as state:
         state.pin = first
     second.robot.may_activate = lambda: False
@@ -417,9 +417,9 @@ def test_a_folder_or_a_root_that_others_may_write(second: Scene, name: str) -> N
     place = second.folder.path / name
 
     def is_refused() -> None:
-        with pytest.raises(PolicyError, match='others may write'):
+        with pytest.raises(PolicyError, match='other users'):
             second.robot.run()
-        with pytest.raises(PolicyError, match='others may write'), active(second.path / 'thor'):
+        with pytest.raises(PolicyError, match='other users'), active(second.path / 'thor'):
             pass
 
     mode = place.stat().st_mode
@@ -453,11 +453,11 @@ def test_no_rollback_waits_for_gigabytes(second: Scene, monkeypatch: pytest.Monk
 
         return acts
 
-    monkeypatch.setattr('shadowhound_data_logger.policies.folder.check_files', asks(check_files))
+    monkeypatch.setattr('shadowhound_data_logger.policies.versions.check_files', asks(check_files))
     monkeypatch.setattr('shadowhound_data_logger.policies.folder.shutil.rmtree', asks(shutil.rmtree))
     second.robot.settings = replace(second.robot.settings, keep=2)
     assert second.robot.run().done == 'activated'
-    second.folder.use(second.folder.find('go2_patrol@3'))
+    second.folder.use(second.folder.versions.find('go2_patrol@3'))
     assert len(held) == 4
     assert not any(held)
 
@@ -468,9 +468,9 @@ def test_a_home_that_anybody_may_rename_things_in(second: Scene) -> None:
     home.chmod(0o1777)
     assert second.robot.run().done == 'activated'
     home.chmod(0o777)
-    with pytest.raises(PolicyError, match='others may write'):
+    with pytest.raises(PolicyError, match='other users'):
         second.robot.run()
-    with pytest.raises(PolicyError, match='others may write'), active(home):
+    with pytest.raises(PolicyError, match='other users'), active(home):
         pass
 
 
@@ -478,7 +478,7 @@ def test_a_home_that_anybody_may_rename_things_in(second: Scene) -> None:
 def test_what_lies_among_downloads_hinders_none(second: Scene, name: str) -> None:
     """Files, links and folders that are none of ours go, and the download goes on."""
     manifest = parse_manifest((second.place(2) / MANIFEST).read_bytes())
-    place = second.folder.incoming / name.format(id=manifest.id)
+    place = second.folder.versions.incoming / name.format(id=manifest.id)
     place.parent.mkdir(exist_ok=True)
     if 'link' in name:
         place.symlink_to(second.path)
@@ -487,7 +487,7 @@ def test_what_lies_among_downloads_hinders_none(second: Scene, name: str) -> Non
     else:
         place.write_bytes(b'stray')
     assert second.robot.run().done == 'activated'
-    assert list(second.folder.incoming.iterdir()) == []
+    assert list(second.folder.versions.incoming.iterdir()) == []
 
 
 def test_a_rollback_that_is_cut_off_is_ended_by_the_next(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -514,7 +514,7 @@ def test_one_that_is_too_large_for_the_quota_costs_no_other(second: Scene) -> No
     second.publish(4)
     second.robot.settings = replace(second.robot.settings, max_bytes=100)
     assert second.refused() == 'disk'
-    assert len(second.folder.installed()) == 3
+    assert len(second.folder.versions.ids()) == 3
 
 
 def test_a_policy_goes_out_though_the_disk_is_full(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -580,7 +580,7 @@ def test_a_smoke_run_that_crashes_or_does_not_end(tmp_path: Path, monkeypatch: p
         run_smoke(packed, manifest, LIMITS, limit_s=0.0)
     assert raised.value.reason == 'time'
     for told in ((b'', -11), (b'[' * 100_000, 0), (b'{"reason": ""}', 1), (b'\xff' * 70_000, -9)):
-        monkeypatch.setattr(smoke, '_ran', lambda *_, told=told: told)
+        monkeypatch.setattr(smoke, '_run_child', lambda *_, told=told: told)
         with pytest.raises(PolicyRefused) as raised:
             run_smoke(packed, manifest, LIMITS)
         assert raised.value.reason == 'smoke'
@@ -659,10 +659,10 @@ def test_what_the_smoke_run_started_ends_with_it(tmp_path: Path) -> None:
     """With a bound of what is read of it, and of its time."""
 
     def run(program: str, limit_s: float = 600.0) -> tuple[bytes, int | None]:
-        return smoke._ran([sys.executable, '-c', program, str(tmp_path / 'pid')], os.environ, str(tmp_path), limit_s)
+        return smoke._run_child([sys.executable, '-c', program, str(tmp_path / 'pid')], os.environ, str(tmp_path), limit_s)
 
     told, _ = run(STARTS)
-    assert len(told) <= 2 * smoke.MOST_ANSWER_BYTES
+    assert len(told) <= 2 * smoke.MAX_ANSWER_BYTES
     assert gone(int((tmp_path / 'pid').read_text()))
     assert run('print(1)') == (b'1\n', 0)
     assert run('import os; os.abort()') == (b'', -6)

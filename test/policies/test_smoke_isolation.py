@@ -95,7 +95,8 @@ with tempfile.TemporaryDirectory() as empty:
     command, problem = smoke.open_sandbox(folder, empty) if sandboxed else ([], '')
     assert not problem, problem
     arguments = [str(home), str(os.getpid()), str(victim.pid), str(servers[0].getsockname()[1])]
-    told, code = smoke._ran([*command, sys.executable, '-B', '-c', attacks, *arguments], smoke.environ_of(empty), empty, 60.0)
+    child = [*command, sys.executable, '-B', '-c', attacks, *arguments]
+    told, code = smoke._run_child(child, smoke.environ_of(empty), empty, 60.0)
 found = {
     **json.loads(told), 'code': code, 'victim': victim.poll(), 'current': os.readlink(home / 'policies/current'),
     'state': (home / 'policies/state.json').read_text(), 'spool': sorted(os.listdir(home / 'spool')),
@@ -161,7 +162,7 @@ def test_without_a_sandbox_nothing_is_run_unless_that_is_allowed(tmp_path: Path,
     broken.write_text('#!/bin/sh\necho "bwrap: setting up uid map: Permission denied" >&2\nexit 1\n')
     broken.chmod(0o755)
     runs: list[list[str]] = []
-    monkeypatch.setattr(smoke, '_ran', lambda command, *_: (runs.append(command), (b'', -9))[1])
+    monkeypatch.setattr(smoke, '_run_child', lambda command, *_: (runs.append(command), (b'', -9))[1])
     for path, why in ((str(tmp_path), 'bubblewrap is not installed'), (str(broken.parent), 'setting up uid map: Permission')):
         monkeypatch.setenv('PATH', path)
         with pytest.raises(PolicyError, match=why) as raised:
@@ -214,7 +215,7 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     monkeypatch.setattr(sync, 'run_smoke', tried)
     scene = Scene(tmp_path)
     first = scene.publish(1)
-    with pytest.raises(PolicyError, match='is not run'):
+    with pytest.raises(PolicyError, match='was not run'):
         scene.robot.run()
     assert scene.folder.current() is None
     scene.robot.settings = replace(scene.robot.settings, isolation=LIMITS)
@@ -230,7 +231,7 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
             state.pin = first
     else:
         scene.registry.say('champion', 1)
-    with pytest.raises(PolicyError, match='is not run'):
+    with pytest.raises(PolicyError, match='was not run'):
         scene.robot.run()
     assert scene.folder.current() == second
     possible = SANDBOX

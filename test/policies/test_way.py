@@ -57,7 +57,7 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     client.put_object(Body=b'of a publication that was cut off', **of_another)
     for version, remedy in (('1', '--version 2'), ('2', 'cut off')):
         packed(f'other_{version}', 0.7, '--version', version)
-        with pytest.raises(PolicyError, match=f'another {name}@{version} is there already') as raised:
+        with pytest.raises(PolicyError, match=f'already has a different {name}@{version}') as raised:
             run(spark, 'publish', str(tmp_path / f'other_{version}'))
         assert remedy in raised.value.remedy
     client.delete_object(**of_another)

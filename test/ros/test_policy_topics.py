@@ -68,7 +68,7 @@ def listener(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Listener]
 
 
 def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) -> None:
-    first, second = scene.folder.installed()
+    first, second = scene.folder.versions.ids()
     with telling(scene.folder) as topics:
         listener.until(lambda: listener.heard, 'a node that comes later hears it too')
         assert listener.heard[-1] == second
@@ -104,7 +104,7 @@ def test_what_cannot_be_judged_stays(scene: Scene, listener: Listener, caplog: p
     node = Node('judge', context=listener.node.context)
     try:
         topics = PolicyTopics(node, scene.folder)
-        manifest = scene.folder.versions / now / 'manifest.json'
+        manifest = scene.folder.versions.path / now / 'manifest.json'
         manifest.parent.chmod(0o700)
         manifest.unlink()
         topics._on_health(String(data=json.dumps({'policy': now, 'failures': 99})))
