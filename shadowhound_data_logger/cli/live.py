@@ -5,8 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
 import signal
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import click
@@ -26,9 +32,15 @@ from shadowhound_data_logger.cli.common import (
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.core import heap
 from shadowhound_data_logger.core.config import DEFAULT_ROBOT
+from shadowhound_data_logger.core.errors import DataLoggerError
+
+if TYPE_CHECKING:
+    from shadowhound_data_logger.live.server import LiveServer, LiveSettings
 
 PORT = 8765
 RTSP_PORT = 8554
+LOOK_S = 2.0
+"""How often it is checked whose page this is: a node may run here for the first time."""
 
 
 @click.command(
@@ -55,6 +67,8 @@ RTSP_PORT = 8554
               help='Limit of uploads in Mbit/s while a viewer watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--rtsp', type=click.IntRange(0, 65535), is_flag=False, flag_value=RTSP_PORT, metavar='[PORT]',
               help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
+@click.option('--tiles', default='', metavar='URL',
+              help='Show places on map tiles from here, such as https://tile.example/{z}/{x}/{y}.png.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
 @click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
@@ -64,12 +78,13 @@ RTSP_PORT = 8554
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
-         uploads_mbps: float, rtsp: int | None, new_tokens: bool, robot_url: str | None,
+         uploads_mbps: float, rtsp: int | None, tiles: str, new_tokens: bool, robot_url: str | None,
          robot_token: Path | None, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a page that shows robot and data.
 
     It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any moment before. On a
-    machine without a spool it is the page of the store: the past of every robot that has a folder there.
+    machine without a spool it is the page of the store: the past of every robot that has a folder there. It changes when a node
+    starts there.
 
     Ctrl-C ends it. On 127.0.0.1 everybody on this machine may watch; other addresses need a token. Actions (bags, events, flush,
     pause) always need the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
@@ -77,51 +92,104 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     try:
         from shadowhound_data_logger.live.access import RTSP_FILE, make_tokens  # noqa: PLC0415 - loaded by this verb alone
         from shadowhound_data_logger.live.rtsp import USER  # noqa: PLC0415 - the same
-        from shadowhound_data_logger.live.server import LiveServer, LiveSettings  # noqa: PLC0415 - aiohttp
+        from shadowhound_data_logger.live.server import LiveSettings  # noqa: PLC0415 - aiohttp
     except ImportError as error:
         raise BadUsage(f'the live page needs aiohttp: {error}', 'install requirements/robot.txt') from error
     folder = the_spool(spool)
     tokens = the_home() / 'live'
     paths = make_tokens(tokens, anew=new_tokens)
-    store = the_store_settings()
+    check_urls(folder, robot_url, rtsp, tiles)
+    given = LiveSettings(
+        spool=folder, robot=robot or '', tokens=tokens, bind=bind, port=port, names=names, certificate=tls or None, rtsp=rtsp,
+        uploads_mbps=uploads_mbps, robot_url=robot_url or '', robot_token=robot_token, tiles=tiles,
+    )  # fmt: skip
+    is_robot = spool is not None or rtsp is not None
+    settings = as_it_is(given, is_robot=is_robot)
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    heap.keep()
+
+    def announce(server: LiveServer) -> None:
+        if as_json:
+            print_json({'url': server.url, 'pid': os.getpid(), 'tokens': {role: str(path) for role, path in paths.items()},
+                        'rtsp': server.rtsp_url, 'problem': server.viewers.ros_problem})  # fmt: skip
+            return
+        click.echo(f"{server.url}\nthe operator's token is in {paths['operator']}, a viewer's in {paths['viewer']}")
+        if server.rtsp_url:
+            click.echo(f'{server.rtsp_url}/TOPIC: user {USER}, password in {tokens / RTSP_FILE}')
+        if server.viewers.ros_problem:
+            click.echo(server.viewers.ros_problem, err=True)
+
+    asyncio.run(serve(settings, lambda: as_it_is(given, is_robot=is_robot), announce))
+    return ExitCode.FINE
+
+
+def as_it_is(given: LiveSettings, *, is_robot: bool) -> LiveSettings:
+    """The settings for what is there now: where no node has run, those of the page of a store, unless ``is_robot``.
+
+    Raises BadUsage.
+    """
+    has_run, store = given.spool.is_dir(), the_store_settings()
     has_store = bool(store.endpoint_url) or store.directory.is_dir()
-    is_of_store = spool is None and not folder.is_dir() and (has_store or robot_url is not None)
-    if rtsp is not None and is_of_store:
-        raise BadUsage('this is the page of a store, which has no cameras', 'give --rtsp to the page of the robot')
+    is_of_store = bool(given.robot_url) or (has_store and not is_robot and not has_run)
+    waits = ''
+    if not has_run and not given.robot_url and find_spec('rclpy') is not None:
+        waits = f'No node has run on this machine yet: {given.spool} does not exist. '
+        waits += (
+            'Until one starts, this page shows the store.' if is_of_store else 'The page shows its data as soon as one starts.'
+        )
+    robot = given.robot or (DEFAULT_ROBOT if is_of_store else the_robot(None, given.spool))
+    return replace(given, robot=robot, is_of_store=is_of_store, waits=waits)
+
+
+async def serve(settings: LiveSettings, look: Callable[[], LiveSettings], announce: Callable[[LiveServer], None]) -> None:
+    """Serve until a signal; another page at the same port when what ``look`` finds is not what is served any more."""
+    from shadowhound_data_logger.live.server import LiveServer  # noqa: PLC0415 - aiohttp
+
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    is_first = True
+    served: LiveSettings | None = settings
+    while served is not None:
+        server = LiveServer(served)
+        try:
+            await server.open()
+            if is_first:
+                announce(server)
+            is_first = False
+            served = await changed(replace(served, port=settings.port), look, stop)
+        finally:
+            await server.close()
+        if served is not None:
+            logging.getLogger(__name__).info('this is the page of %s now', 'the store' if served.is_of_store else served.robot)
+            served = replace(served, port=server.port)
+
+
+async def changed(served: LiveSettings, look: Callable[[], LiveSettings], stop: asyncio.Event) -> LiveSettings | None:
+    """The settings once they differ, because a node has started here or its spool is gone; None at the end."""
+    while True:
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(stop.wait(), LOOK_S)
+            return None
+        with suppress(DataLoggerError, BadUsage):  # it cannot be decided now
+            if (found := look()) != served:
+                return found
+
+
+def check_urls(folder: Path, robot_url: str | None, rtsp: int | None, tiles: str) -> None:
+    """Raises BadUsage."""
     if robot_url is not None:
-        if not is_of_store:
+        if rtsp is not None:
+            raise BadUsage(
+                'a page with --robot-url is that of a store, which has no cameras', 'give --rtsp to the page of the robot'
+            )
+        if folder.is_dir():
             raise BadUsage(f'{folder} is a spool: this is the robot itself', 'omit --robot-url')
         parts = urlsplit(robot_url)
         if parts.scheme not in ('http', 'https') or not parts.hostname or '@' in parts.netloc:
             raise BadUsage(f'--robot-url {robot_url[:100]!r} is not a URL such as http://thor.local:8765/')
-    robot = robot or (DEFAULT_ROBOT if is_of_store else the_robot(robot, folder))
-    settings = LiveSettings(
-        spool=folder, robot=robot, tokens=tokens, bind=bind, port=port, names=names,
-        certificate=tls or None, uploads_mbps=uploads_mbps, rtsp=rtsp, is_of_store=is_of_store,
-        robot_url=robot_url or '', robot_token=robot_token,
-    )  # fmt: skip
-    logging.basicConfig(level=logging.INFO, format='%(message)s')
-    heap.keep()
-
-    async def serve() -> None:
-        server = LiveServer(settings)
-        stop = asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        try:
-            await server.open()
-            if as_json:
-                print_json({'url': server.url, 'pid': os.getpid(), 'tokens': {role: str(path) for role, path in paths.items()},
-                            'rtsp': server.rtsp_url, 'problem': server.viewers.ros_problem})  # fmt: skip
-            else:
-                click.echo(f"{server.url}\nthe operator's token is in {paths['operator']}, a viewer's in {paths['viewer']}")
-                if server.rtsp_url:
-                    click.echo(f'{server.rtsp_url}/TOPIC: user {USER}, password in {tokens / RTSP_FILE}')
-                if server.viewers.ros_problem:
-                    click.echo(server.viewers.ros_problem, err=True)
-            await stop.wait()
-        finally:
-            await server.close()
-
-    asyncio.run(serve())
-    return ExitCode.FINE
+    if tiles:
+        parts = urlsplit(tiles)
+        is_url = parts.scheme in ('http', 'https') and re.fullmatch(r'[A-Za-z0-9.:\[\]-]+', parts.netloc)
+        if not is_url or not all(f'{{{name}}}' in tiles for name in 'zxy'):
+            raise BadUsage(f'--tiles {tiles[:100]!r} is not a URL such as https://tile.example/{{z}}/{{x}}/{{y}}.png')

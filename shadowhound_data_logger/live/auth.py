@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from aiohttp import web
 
@@ -16,8 +17,9 @@ log = logging.getLogger(__name__)
 
 MAX_BODY: Final = 4096
 """Bytes of a request."""
+IMAGES: Final = "img-src 'self';"
 SECURITY: Final[Mapping[str, str]] = {
-    'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self';"
+    'Content-Security-Policy': f"default-src 'none'; script-src 'self'; style-src 'self'; {IMAGES}"
                                " connect-src 'self'; font-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'self';"
                                " frame-ancestors 'none'",
     'X-Content-Type-Options': 'nosniff', 'X-Frame-Options': 'DENY', 'Referrer-Policy': 'no-referrer',
@@ -30,9 +32,15 @@ class Auth:
     """Guards the routes of a page. Used by one event loop."""
 
     def __init__(self, access: Access, names: OwnNames, scheme: str, about: Callable[[], Mapping[str, Any]],
-                 end: Callable[[str], None]) -> None:  # fmt: skip
-        """``about`` is what a signed-in page is told besides its role; ``end`` closes the connections of a sign-in's nonce."""
+                 end: Callable[[str], None], tiles: str = '') -> None:  # fmt: skip
+        """``about`` is what a signed-in page is told besides its role; ``end`` closes the connections of a sign-in's nonce.
+
+        ``tiles``: a URL whose origin the page may load pictures from.
+        """
         self.access = access
+        origin = urlsplit(tiles)
+        pictures = f"img-src 'self' {origin.scheme}://{origin.netloc};" if tiles else IMAGES
+        self._security = {name: value.replace(IMAGES, pictures) for name, value in SECURITY.items()}
         self._names, self._scheme, self._about, self._end = names, scheme, about, end
 
     def routes(self) -> list[web.RouteDef]:
@@ -63,7 +71,7 @@ class Auth:
         except web.HTTPException as error:
             response = problem(error.status, error.text or error.reason)
         if not response.prepared:
-            response.headers.update({name: value for name, value in SECURITY.items() if name not in response.headers})
+            response.headers.update({name: value for name, value in self._security.items() if name not in response.headers})
         return response
 
     def _problem_of(self, request: web.Request) -> web.StreamResponse | None:

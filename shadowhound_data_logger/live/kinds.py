@@ -57,6 +57,7 @@ MOST_NAMES, MAX_NAME = 64, 64
 """Figures in a row, and letters in the name of one."""
 _FAR: Final = 1e7
 """Metres: no point of a robot's lidar is further from where its frame begins."""
+_NO_FIX: Final = -1
 _GO2_IMU_NAMES: Final = [*(f'{name}.{axis}' for name in ('rpy', 'gyro', 'accel') for axis in _AXES), 'temperature']
 _GO2_IMU_BYTES: Final = range(57, 61)
 """A go2_interfaces/msg/IMU, serialized; some writers pad it."""
@@ -248,7 +249,7 @@ def _go2_state(message: Any) -> dict[str, float]:
 
 def _fix(message: Any) -> dict[str, float]:
     """Degrees as a float32 and what it lacks: one alone is wrong by up to a meter. NaN without a fix."""
-    has_fix = message.status.status >= 0
+    has_fix = message.status.status != _NO_FIX
     latitude, longitude = (value if has_fix else math.nan for value in (message.latitude, message.longitude))
     lat, lon = float(np.float32(latitude)), float(np.float32(longitude))
     error_m = math.sqrt(max(0.0, float(message.position_covariance[0]))) if message.position_covariance_type else math.nan
@@ -322,7 +323,7 @@ def frames(topic: str, type_name: str, types: MessageTypes, at_ms: float, cdr: b
     for size in sizes:
         side = _SIDE.get(size, 1) // (_SIDE.get(min(sizes), 1) if 'scale' in head else 1)
         chosen = np.ascontiguousarray(pixels[::side, ::side])
-        sampling = 'Gray' if chosen.shape[2] == 1 else '420'
+        sampling = 'Gray' if chosen.shape[2] == 1 else '444' if 'scale' in head else '420'
         jpeg = simplejpeg.encode_jpeg(chosen, _QUALITY[size], colorspace, sampling, fastdct=True)
         yield LiveItem(topic, 'camera', size, head, bytes(jpeg))
 

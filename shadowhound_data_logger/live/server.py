@@ -78,6 +78,10 @@ class LiveSettings:
     """The file with the token of a viewer there."""
     rtsp: int | None = None
     """The port of RTSP; None: it is not served."""
+    tiles: str = ''
+    """The URL of a map's tiles, with {z}, {x} and {y}; empty: places are shown on a plain grid."""
+    waits: str = ''
+    """What the page is waiting for, in words; empty: nothing."""
     uploads_mbps: float = 4.0
     """What uploads are limited to while somebody watches over the network; 0: they are not limited."""
 
@@ -94,8 +98,9 @@ class LiveServer:
         names = OwnNames(settings.bind, settings.names)
         access = Access(make_tokens(settings.tokens), is_open=is_loopback(settings.bind))
         self.auth = Auth(
-            access, names, self._scheme, self._about, lambda nonce: self.viewers.end(lambda one: one.who.nonce == nonce)
-        )
+            access, names, self._scheme, self._about, lambda nonce: self.viewers.end(lambda one: one.who.nonce == nonce),
+            settings.tiles,
+        )  # fmt: skip
         self.cameras = Cameras(lambda: self.viewers.rewatch(), self._pool)  # noqa: PLW0108 - there are no viewers yet
         self.viewers = Viewers(self.auth, self.cameras, self._wake, is_of_store=settings.is_of_store)
         history = HistoryProcess([] if settings.is_of_store else [str(settings.spool), settings.robot])
@@ -183,7 +188,7 @@ class LiveServer:
 
     def _about(self) -> dict[str, Any]:
         return {'robot': self._settings.robot, 'has_live': not self._settings.is_of_store or self._relay is not None,
-                'no_video': self.cameras.no_video}  # fmt: skip
+                'no_video': self.cameras.no_video, 'tiles': self._settings.tiles, 'waits': self._settings.waits}  # fmt: skip
 
     # -- topics ----------------------------------------------------------------------------------------------------
 
@@ -317,7 +322,7 @@ def _static(folder: Path) -> list[tuple[str, tuple[bytes, bytes, str, str]]]:
     for path in sorted(path for path in folder.rglob('*') if path.is_file() and path.suffix != '.json'):
         body = path.read_bytes()
         kind = (
-            {'.js': 'text/javascript', '.svg': 'image/svg+xml'}.get(path.suffix)
+            {'.js': 'text/javascript', '.svg': 'image/svg+xml', '.webmanifest': 'application/manifest+json'}.get(path.suffix)
             or mimetypes.guess_type(path.name)[0]
             or 'text/plain'
         )

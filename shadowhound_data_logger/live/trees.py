@@ -15,6 +15,7 @@ from itertools import islice
 from typing import Any, Final
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.formats.types import PLACEHOLDER, MessageTypes, nested_type
@@ -48,22 +49,24 @@ class _Builder:
                 fields[CUT] = CUT
                 break
             if name != PLACEHOLDER:
-                fields[name] = self._node(nested_type(description), getattr(value, name), depth + 1)
+                is_single = _is_single(description)
+                fields[name] = self._node(nested_type(description), getattr(value, name), depth + 1, is_single=is_single)
         return {'t': type_name, 'f': fields}
 
-    def _node(self, nested: str | None, value: Any, depth: int) -> Any:
+    def _node(self, nested: str | None, value: Any, depth: int, *, is_single: bool = False) -> Any:
         self._nodes -= 1
         if isinstance(value, (list, tuple, np.ndarray)):
             shown = []
             for each in islice(value, MAX_SHOWN):
                 if self._nodes <= 0:
                     break
-                shown.append(self._node(nested, each, depth))
+                shown.append(self._node(nested, each, depth, is_single=is_single))
             kind = nested or (str(value.dtype) if isinstance(value, np.ndarray) else '')
             return {'t': kind, 'n': len(value), 'a': shown}
         if nested is not None:
             return self.message(nested, value, depth)
-        return self._scalar(value.item() if isinstance(value, np.generic) else value)
+        plain = value.item() if isinstance(value, np.generic) else value
+        return self._scalar(float(f'{plain:.7g}') if is_single else plain)
 
     def _scalar(self, value: Any) -> Any:
         if isinstance(value, bool):
@@ -76,6 +79,12 @@ class _Builder:
         most = max(0, min(MAX_TEXT, self._characters))
         self._characters -= min(len(text), most)
         return text if len(text) <= most else text[:most] + CUT
+
+
+def _is_single(description: Any) -> bool:
+    """Whether a field has float32, of which seven digits are significant."""
+    kind, of = description
+    return _is_single(of[0]) if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else kind == Nodetype.BASE and of[0] == 'float32'
 
 
 def tree(types: MessageTypes, type_name: str, message: Any) -> Any:

@@ -1,106 +1,99 @@
 // The live page: what the robot sees now, its data, and what is missing.
-import { batch, html, render, signal, useEffect, useRef, useState } from './vendor/preact.js';
-import { Cards, Controls, Findings, TopicTable } from './data.js';
+import { batch, html, render, useRef, useState } from './vendor/preact.js';
+import { Cards, Controls, Findings, Glance, TopicTable } from './data.js';
 import { Link } from './link.js';
-import { Plot, Ring } from './plots.js';
-import { busy, openRobot, past, show } from './past.js';
+import { fromAddress, toAddress } from './moments.js';
+import { Age, Views, noteScale, transforms } from './panels.js';
+import { openRobot, past, show } from './past.js';
+import {
+  chosen, connection, figures, give, layout, loadLayout, pastRings, present, problem, rewatch, rings, seen, session, shared, tellProblem, topics, total, views,
+} from './state.js';
 import { Timeline } from './timeline.js';
-import { Video, VideoChoice } from './video.js';
-import { span } from './words.js';
+import { Video } from './video.js';
 
-const calm = matchMedia('(prefers-reduced-motion: reduce)');
-const OLD_MS = { camera: 1500, cloud: 2000, odom: 1500, imu: 1500, joints: 1500, battery: 5000, state: 2000, figures: 4000 };
-const session = signal(null);
-const connection = signal('connecting');
-const figures = signal(null);
-const topics = signal([]);
-const problem = signal('');
-const picked = signal({});
-const seen = new Map(); // kind -> { at } of what is shown, by the robot's clock
-const rings = { imu: new Ring(30), joints: new Ring(30), battery: new Ring(900), odom: new Ring(30), state: new Ring(30) };
-const pastRings = Object.fromEntries(Object.keys(rings).map((kind) => [kind, new Ring(10)]));
-const views = {};
-const ringOf = (kind) => (past.value ? pastRings : rings)[kind];
-// Pictures are drawn where the processor is: without a graphics card all that comes would otherwise wait for the drawing of it.
-const IN_MEMORY = { willReadFrequently: true };
 // For whoever measures: how late items were when they came and when they were drawn, ms.
-const stats = (window.shadowhound = { came: {}, drawn: {}, count: {}, link: null, ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])) });
-let link;
-let video;
-const present = signal(null); // the robot's time, ms
-setInterval(() => { if (!document.hidden) present.value = link?.now() ?? null; }, 100);
+const stats = (window.shadowhound = {
+  came: {}, drawn: {}, count: {}, wrong: 0, link: null, robot: () => transforms.robot(),
+  ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, stats.link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])),
+});
+const newest = new Map(); // of kinds that are drawn in space, for a view that is loaded later
+views.late = { [Symbol.iterator]: () => newest.values() };
+setInterval(() => { if (!document.hidden) present.value = shared.link?.now() ?? null; }, 100);
 
 function note(where, kind, at) {
-  const now = link?.now() ?? null;
+  const now = shared.link?.now() ?? null;
   if (now !== null && !past.value) (where[kind] ??= []).push(now - at);
   if (where[kind]?.length > 4000) where[kind].splice(0, 2000);
 }
 
-// [topic, kind, type] of what can be shown.
-const having = (kind) => (past.value ? past.value.shown : topics.value).filter(([, each]) => each === kind);
-
-function chosen(kind) {
-  const found = having(kind);
-  const wanted = found.find(([topic]) => topic === picked.value[kind]);
-  if (wanted) return wanted[0];
-  const logged = new Set((figures.value?.topics ?? []).filter((row) => row.sensor && row.publishers).map((row) => row.topic));
-  const rank = ([topic, , type]) => (logged.has(topic) ? 0 : 2) + (String(type).endsWith('/Image') ? 1 : 0);
-  return found.sort((a, b) => rank(a) - rank(b) || (a[0] < b[0] ? -1 : 1))[0]?.[0];
-}
-
-const KINDS = ['camera', 'cloud', 'odom', 'imu', 'joints', 'battery', 'state'];
-function rewatch() {
-  video?.want(past.value ? null : chosen('camera') ?? null);
-  link?.watch(past.value ? [] : KINDS.map(chosen).filter((topic) => topic && topic !== video?.shown));
-}
-
-let decoding = false;
-let waiting = null;
-async function showFrame(head, body) {
-  waiting = { head, body };
-  if (decoding || !views.camera) return;
-  decoding = true;
-  while (waiting) {
-    const { head: now, body: jpeg } = waiting;
-    waiting = null;
-    try {
-      const picture = await createImageBitmap(new Blob([jpeg], { type: 'image/jpeg' }));
-      const canvas = views.camera;
-      if (canvas.width !== picture.width) canvas.width = picture.width;
-      if (canvas.height !== picture.height) canvas.height = picture.height;
-      canvas.getContext('2d', IN_MEMORY).drawImage(picture, 0, 0);
-      picture.close();
-      note(stats.drawn, 'camera', now.at);
-      stats.first ??= performance.now();
-    } catch { /* a broken frame: the next one comes */ }
-  }
-  decoding = false;
-}
+const drawn = (head) => {
+  note(stats.drawn, 'camera', head.at);
+  stats.first ??= performance.now();
+};
 
 function drawVideo(element, at) {
-  const canvas = views.camera;
-  if (past.value || !canvas) return;
+  if (past.value || !views.camera) return;
   note(stats.came, 'camera', at);
   seen.set('camera', { at });
   stats.count.camera = (stats.count.camera ?? 0) + 1;
-  if (canvas.width !== element.videoWidth) canvas.width = element.videoWidth;
-  if (canvas.height !== element.videoHeight) canvas.height = element.videoHeight;
-  canvas.getContext('2d', IN_MEMORY).drawImage(element, 0, 0);
+  views.camera.draw(element, element.videoWidth, element.videoHeight);
   note(stats.drawn, 'camera', at);
 }
 
-function onItem(head, body) {
+const SOON_MS = 5000; // until the page of a store looks whether it is a robot's now
+const IN_SPACE = ['cloud', 'scan', 'map', 'model'];
+const MOST_CELLS = 512 * 512;
+
+// The cells of a map are deflated; no more of them are unpacked than it says.
+async function unpacked(body, size) {
+  const reader = new Blob([body]).stream().pipeThrough(new DecompressionStream('deflate')).getReader();
+  const cells = new Uint8Array(size);
+  for (let at = 0; at < size;) {
+    const { done, value } = await reader.read();
+    if (done || at + value.length > size) throw new Error('its size is wrong');
+    cells.set(value, at);
+    at += value.length;
+  }
+  reader.cancel();
+  return cells;
+}
+
+async function inSpace(head, body) {
   const { kind } = head;
-  if (kind === 'video') return video.take(head);
+  if (kind === 'map') {
+    if (!(head.width > 0 && head.height > 0 && head.width * head.height <= MOST_CELLS)) throw new Error('no map');
+    body = await unpacked(body, head.width * head.height);
+    views.plan?.map(head, body);
+  }
+  newest.set(kind, [head, body]);
+  views.cloud?.take(head, body, () => note(stats.drawn, kind, head.at));
+  if (kind === 'cloud') views.plan?.cloud(head, body);
+  if (kind === 'scan') views.plan?.scan(head, body);
+}
+
+function onItem(head, body) {
+  try {
+    take(head, body)?.catch(() => { stats.wrong += 1; });
+  } catch (error) {
+    stats.wrong += 1; // a robot may say what cannot be shown: then the rest of the page continues
+    stats.error = String(error);
+  }
+}
+
+function take(head, body) {
+  const { kind } = head;
+  if (kind === 'video') return void shared.video.take(head);
   if (past.value && kind !== 'topics' && kind !== 'figures') return; // on its way when somebody looked back
   stats.count[kind] = (stats.count[kind] ?? 0) + 1;
-  if (head.at !== undefined) {
+  const isChosen = !head.topic || head.topic === chosen(kind) || kind === 'tf';
+  if (head.at !== undefined && isChosen) {
     seen.set(kind, { at: head.at });
     note(stats.came, kind, head.at);
   }
   if (kind === 'topics') {
     batch(() => {
       topics.value = head.topics;
+      total.value = head.total;
       problem.value = head.problem;
     });
     rewatch();
@@ -108,19 +101,29 @@ function onItem(head, body) {
     figures.value = { ...head.figures, at: head.at };
     document.title = `${head.figures.robot} · live`;
     rewatch();
+  } else if (kind === 'problem') {
+    tellProblem(head);
+  } else if (kind === 'tf') {
+    transforms.add(head, body);
+    if (views.plan?.follow()) views.cloud?.trail(views.plan.path);
+    views.cloud?.take(head, body);
   } else if (kind === 'camera') {
-    showFrame(head, body);
-  } else if (kind === 'cloud') {
-    views.cloud?.cloud(head, body, () => note(stats.drawn, 'cloud', head.at));
-    views.plan?.cloud(head, body);
+    noteScale(head);
+    if (isChosen) views.camera?.show(head, body);
+  } else if (!isChosen) {
+    // a panel of its own has it
+  } else if (IN_SPACE.includes(kind)) {
+    return inSpace(head, body);
   } else if (rings[kind]) {
     rings[kind].add(head, body);
+    if (kind === 'joints') views.cloud?.joints(rings.joints.last());
     if (kind === 'odom') {
       const pose = rings.odom.last();
       views.cloud?.pose(pose);
       if (views.plan?.pose(pose)) views.cloud?.trail(views.plan.path);
     }
   }
+  give(head, body);
 }
 
 // Of a moment that is past, all there is of it, at once.
@@ -137,12 +140,15 @@ show((head, items) => {
     } else if (topic !== chosen(kind)) {
       // another topic of the kind is shown
     } else if (kind === 'camera') {
-      showFrame(item, body);
+      noteScale(item);
+      views.camera?.show(item, body);
     } else if (kind === 'cloud') {
-      views.cloud?.cloud(item, body);
+      newest.set(kind, [item, body]);
+      views.cloud?.take(item, body);
       views.plan?.cloud(item, body, true);
     } else if (pastRings[kind]) {
       pastRings[kind].add(item, body);
+      if (kind === 'joints') views.cloud?.joints(pastRings.joints.last());
       if (kind === 'odom') {
         views.cloud?.pose(pastRings.odom.last());
         views.plan?.pose(pastRings.odom.last());
@@ -153,96 +159,16 @@ show((head, items) => {
 });
 let wasPast = false;
 past.subscribe((now) => {
+  toAddress(now);
   if (Boolean(now) === wasPast) return;
   wasPast = Boolean(now);
+  newest.clear();
+  transforms.clear();
   views.plan?.clear();
   views.cloud?.trail([]);
   rewatch();
 });
-
-function Age({ kind, children }) {
-  const [, again] = useState(0);
-  useEffect(() => {
-    const timer = setInterval(() => again((count) => count + 1), 100);
-    return () => clearInterval(timer);
-  }, []);
-  if (past.value && kind !== 'figures') {
-    const before = past.value.shown.find(([topic]) => topic === chosen(kind))?.[2];
-    if (past.value.read === undefined) return html`<span class="age" data-age=${kind}>${busy.value ? 'reading…' : ''}</span>${children}`;
-    return html`<span class=${`age ${before === undefined ? 'old' : ''}`} data-age=${kind} data-before=${before ?? ''}>${before === undefined ? 'nothing then' : `${span(Math.max(0, before) / 1000)} before`}</span>${children}`;
-  }
-  const at = seen.get(kind)?.at;
-  const now = link?.now();
-  const age = at === undefined || now === null || now === undefined ? null : Math.max(0, now - at);
-  const isOld = age === null || age > OLD_MS[kind];
-  return html`<span class=${`age ${isOld ? 'old' : ''}`} data-age=${kind} data-ms=${age === null ? '' : Math.round(age)}>${age === null ? 'nothing yet' : isOld ? `${span(age / 1000)} old` : `${Math.round(age)} ms`}</span>${children}`;
-}
-
-function Panel({ title, kind, className = '', tools, children }) {
-  const found = having(kind);
-  return html`<section class=${`panel view ${className}`} aria-label=${title}><div class="panel-head"><h3>${title}</h3>
-    ${found.length > 1 && html`<select aria-label=${`Topic of ${title}`} value=${chosen(kind)} onChange=${(event) => { picked.value = { ...picked.value, [kind]: event.target.value }; rewatch(); }}>
-      ${found.map(([topic]) => html`<option>${topic}</option>`)}</select>`}
-    ${tools}<${Age} kind=${kind} /></div>${children}</section>`;
-}
-
-function Camera() {
-  const canvas = useRef(null);
-  useEffect(() => { views.camera = canvas.current; }, []);
-  return html`<${Panel} title="Camera" kind="camera" className="camera" tools=${video && !past.value && html`<${VideoChoice} video=${video} lacks=${session.value.no_video} />`}><div class="stage"><canvas ref=${canvas} width="640" height="480" role="img" aria-label="The newest frame of the camera"></canvas></div></${Panel}>`;
-}
-
-function Cloud() {
-  const canvas = useRef(null);
-  const [follows, setFollows] = useState(true);
-  const [lacks, setLacks] = useState('');
-  useEffect(() => {
-    import('./scene.js').then(({ CloudView }) => { views.cloud = new CloudView(canvas.current); }).catch(() => setLacks('This browser shows no 3D (WebGL).'));
-  }, []);
-  const turn = () => { views.cloud?.follow(!follows); setFollows(!follows); };
-  return html`<${Panel} title="Point cloud" kind="cloud" className="cloud" tools=${html`<button type="button" aria-pressed=${follows} onClick=${turn} title="Keep the robot in the middle">Follow</button>`}>
-    <div class="stage">${lacks && html`<p class="empty">${lacks}</p>`}<canvas ref=${canvas} tabindex="0" role="img" aria-label="The points of the lidar around the robot; drag to turn, scroll to zoom, arrow keys to move"></canvas></div></${Panel}>`;
-}
-
-function Plan() {
-  const canvas = useRef(null);
-  useEffect(() => {
-    let timer;
-    import('./scene.js').then(({ FloorPlan }) => {
-      views.plan = new FloorPlan(canvas.current);
-      timer = setInterval(() => !document.hidden && views.plan.draw(), calm.matches ? 1000 : 250);
-    });
-    return () => clearInterval(timer);
-  }, []);
-  return html`<${Panel} title="Path" kind="odom" className="plan"><div class="stage"><canvas ref=${canvas} role="img" aria-label="Where the robot went, on the floor plan that its lidar makes"></canvas></div></${Panel}>`;
-}
-
-function Chart({ title, kind, lines, options, className = '', figure }) {
-  const box = useRef(null);
-  const [, again] = useState(0);
-  useEffect(() => {
-    const plot = new Plot(box.current, rings[kind], lines, options);
-    let rounds = 0;
-    const timer = setInterval(() => {
-      if (document.hidden) return;
-      plot.ring = ringOf(kind);
-      plot.seconds = past.value ? 10 : options.seconds ?? 30;
-      plot.draw();
-      if ((rounds += 1) % 4 === 0) again(rounds);
-    }, calm.matches ? 1000 : 200);
-    return () => clearInterval(timer);
-  }, []);
-  const last = ringOf(kind).last();
-  return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
-    ${(lines ?? []).map(([name, label, factor], place) => html`<span><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
-    ${!lines && html`<span>${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div></${Panel}>`;
-}
-
-const DEGREES = 180 / Math.PI;
-const ATTITUDE = [['rpy.x', 'roll', DEGREES], ['rpy.y', 'pitch', DEGREES], ['rpy.z', 'yaw', DEGREES]];
-const FORCE = [['accel.x', 'x', 1], ['accel.y', 'y', 1], ['accel.z', 'z', 1]];
-const POWER = [['battery', 'battery', 1], ['volts', 'voltage', 1]];
-const HEAT = [['body', 'body', 1], ['motor', 'warmest motor', 1], ['cells', 'cells', 1]];
+layout.subscribe(() => rewatch());
 
 function SignIn({ box, why, onDone }) {
   const [wrong, setWrong] = useState('');
@@ -298,32 +224,29 @@ function App() {
     start();
   };
   if (who === null) return html`<main class="alone"><p class="empty">Connecting …</p></main>`;
-  if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} why=${link && 'Your sign-in has ended.'} onDone=${done} /></div></main>`;
+  if (who === false) return html`<main class="alone"><div class="panel"><${SignIn} why=${shared.link && 'Your sign-in has ended.'} onDone=${done} /></div></main>`;
   const told = figures.value;
   return html`<${Head} onSignIn=${open} />
     <main class=${past.value ? 'past' : connection.value === 'connected' || !who.has_live ? '' : 'stale'}>
-      <section id="now" aria-label="Now">${problem.value && !past.value && html`<p class="banner">${problem.value}</p>`}
-        <div class="views"><${Camera} /><${Cloud} /><${Plan} />
-        <${Chart} title="Attitude" kind="imu" lines=${ATTITUDE} options=${{ unit: '°' }} />
-        <${Chart} title="Acceleration" kind="imu" lines=${FORCE} options=${{ unit: 'm/s²' }} />
-        <${Chart} title="Joints" kind="joints" lines=${null} options=${{ unit: 'rad' }} figure="joints, rad" />
-        <${Chart} title="Battery" kind="battery" lines=${POWER} options=${{ unit: '%', units: ['%', 'V'], seconds: 600 }} />
-        <${Chart} title="Temperature" kind="battery" lines=${HEAT} options=${{ unit: '°C', seconds: 600, digits: 0 }} /></div></section>
-      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} />
+      <section id="now" aria-label="Now">${who.waits && (!past.value || !who.has_live) && html`<p class="banner" data-waits>${who.waits}</p>`}${problem.value && !past.value && html`<p class="banner">${problem.value}</p>`}
+        ${!past.value && who.has_live && told && html`<${Glance} session=${who} figures=${told} onSignIn=${open} />`}<${Views} drawn=${drawn} /></section>
+      ${!past.value && who.has_live && html`<section id="data" aria-label="The data"><h2>The data</h2>${told ? html`<${Guarded} of=${told}><${Cards} figures=${told} /><div class="halves"><${TopicTable} figures=${told} now=${present} session=${who} />
         <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}>` : html`<p class="empty">…</p>`}</section>`}
       <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;
 }
 
-function start() {
+async function start() {
+  loadLayout();
+  const isThere = past.value !== null || await fromAddress();
   if (!session.value.has_live) {
-    if (!past.value) openRobot(session.value.robot);
+    if (!isThere) openRobot(session.value.robot);
     return;
   }
-  if (link) return link.start();
-  link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') { video.lost(); check(); } else video.follow(); } });
-  video = stats.video = new Video({ link, onFrame: drawVideo, onChange: rewatch });
+  if (shared.link) return shared.link.start();
+  const link = (shared.link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') { video.lost(); check(); } else video.follow(); } }));
+  const video = (shared.video = stats.video = new Video({ link, onFrame: drawVideo, onChange: rewatch }));
 }
 
 // Whether the cookie is still good: its time, a sign-out elsewhere or a new token ends it. Where everybody may watch a viewer is left.
@@ -333,8 +256,12 @@ async function check() {
     const answer = await fetch('/api/session', { signal: AbortSignal.timeout(5000) });
     const told = answer.status === 401 ? false : answer.ok ? await answer.json() : before;
     if (session.value !== before) return; // somebody signed in meanwhile
+    if (before && told && (told.has_live !== before.has_live || told.robot !== before.robot || told.waits !== before.waits)) {
+      history.replaceState(null, '', location.pathname); // it is another page now
+      return location.reload();
+    }
     if (JSON.stringify(told) !== JSON.stringify(before)) session.value = told;
-    if (told === false) link?.stop();
+    if (told === false) shared.link?.stop();
   } catch { /* the link says that the robot cannot be reached, or begin asks again */ }
 }
 
@@ -342,6 +269,7 @@ async function check() {
 async function begin() {
   for (await check(); session.value === null; await check()) await new Promise((done) => { setTimeout(done, 1000); });
   if (session.value) start();
+  setInterval(() => session.value && !session.value.has_live && !document.hidden && check(), SOON_MS);
 }
 
 render(html`<${App} />`, document.getElementById('app'));

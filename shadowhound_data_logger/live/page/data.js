@@ -1,16 +1,26 @@
 // The data: topics with the ledger's figures, queue, spool, delivery, findings, and the buttons of an operator.
 import { html, signal, useState } from './vendor/preact.js';
+import { Message, inspected, measured } from './message.js';
+import { total, topics } from './state.js';
 import { digits, span, volume } from './words.js';
 
-const COLUMNS = [['rate', 'Hz'], ['received', 'Received'], ['stored', 'Stored'], ['missed', 'Missed'], ['age', 'Age']];
-const MARKS = { good: ['●', 'as it should be'], watch: ['▲', 'needs a look'], bad: ['■', 'something is wrong'], none: ['○', 'nothing is published'] };
+const COLUMNS = [
+  ['rate', 'Hz', 'Messages per second: as the node counts them, or while the topic’s message is shown'], ['size', 'Size', 'Bytes of the newest message, serialized; known once its message was shown'],
+  ['received', 'Received', 'Messages that the node received since it first ran'], ['stored', 'Stored', 'Messages that are in objects, delivered or waiting'],
+  ['missed', 'Missed', 'Messages that were published and did not reach the node; ~ is an estimate'], ['age', 'Age', 'Seconds since the newest message'],
+];
+const MARKS = { good: ['●', 'as it should be'], watch: ['▲', 'needs a look'], bad: ['■', 'something is wrong'], none: ['○', 'nobody publishes this now'], idle: ['◌', 'published, and not logged'] };
+const MOST_ROWS = 100;
+const MOST_FINDINGS = 10;
+const SEARCHED = 12; // more rows than these get a search box
 
 function state(row) {
   if (row.unavailable) return ['bad', row.unavailable];
   if (row.lost) return ['bad', `${row.lost} messages were rejected or dropped`];
   if (row.missed || row.missed_estimated) return ['watch', `${row.missed ?? row.missed_estimated} messages were missed`];
   if (row.stamps) return ['watch', row.stamps];
-  if (row.publishers === 0) return ['none', 'nobody publishes it now'];
+  if (row.publishers === 0) return ['none', MARKS.none[1]];
+  if (!row.isLogged) return ['idle', MARKS.idle[1]];
   if (row.age_s !== null && row.age_s > 5 && !row.may_be_silent) return ['watch', `silent for ${span(row.age_s)}`];
   return ['good', MARKS.good[1]];
 }
@@ -30,26 +40,51 @@ function TopicAge({ row, figures, now }) {
   return (goesOn ? Math.min(row.age_s, 1 / row.rate_hz) : row.age_s + since).toFixed(1);
 }
 
+// Every topic: those of the node's report, and those that are published now. Publishers are counted by this page where it reads ROS.
+function allTopics(figures) {
+  const told = new Map(topics.value.map(([topic, kind, type, publishers]) => [topic, { kind, type, publishers }]));
+  const rows = figures.topics.map((row) => ({ ...row, isLogged: Boolean(row.sensor || row.received), publishers: told.get(row.topic)?.publishers ?? (told.size ? 0 : row.publishers) }));
+  const known = new Set(rows.map((row) => row.topic));
+  for (const [topic, { type, publishers }] of told) if (!known.has(topic)) rows.push({ topic, type, publishers, isLogged: false });
+  // What has a publisher comes first, and of that what can be drawn, then what is logged.
+  const rank = (row) => (row.publishers > 0 ? (told.get(row.topic)?.kind ? 0 : row.isLogged ? 1 : 2) : row.publishers === 0 ? 4 : 3);
+  return rows.sort((a, b) => rank(a) - rank(b) || (a.topic < b.topic ? -1 : 1));
+}
+
 export function TopicTable({ figures, now }) {
-  const rows = figures.topics;
+  const [wanted, setWanted] = useState('');
+  const [isAll, setIsAll] = useState(false);
+  const rows = allTopics(figures);
   if (!rows.length) return html`<div class="panel"><p class="empty">No topic has been heard yet.</p></div>`;
+  const words = wanted.toLowerCase().split(/\s+/).filter(Boolean);
+  const found = rows.filter(({ topic, type }) => words.every((word) => `${topic} ${type}`.toLowerCase().includes(word)));
+  const shown = isAll ? found : found.slice(0, MOST_ROWS);
+  const untold = total.value - topics.value.length;
   const cell = (row, name) => {
-    if (name === 'rate') return row.rate_hz === null || row.rate_hz === undefined ? '–' : row.rate_hz.toFixed(1);
+    const own = measured.value[row.topic];
+    if (name === 'rate') return (row.rate_hz || own?.hz)?.toFixed(1) ?? '–';
+    if (name === 'size') return own ? volume(own.bytes) : '–';
+    if (name === 'age' && !row.isLogged) return own && now.value !== null ? (Math.max(0, now.value - own.at) / 1e3).toFixed(1) : '–';
     if (name === 'age') return html`<${TopicAge} row=${row} figures=${figures} now=${now} />`;
     if (name === 'missed' && row.missed === null && row.missed_estimated !== null) return html`~${digits(row.missed_estimated)}`;
     return digits(row[name]);
   };
-  return html`<div class="panel"><div class="panel-head"><h3>Topics</h3>
-      <span class=${`verdict ${figures.balanced ? 'good' : 'bad'}`}>${figures.balanced === null ? '' : figures.balanced ? 'the ledger balances' : 'the ledger does not balance'}</span></div>
+  return html`<div class="panel topics-panel"><div class="panel-head"><h3>Topics</h3>${rows.length > SEARCHED && html`<input type="search" aria-label="Search topics and types" placeholder=${`search ${rows.length} topics`} value=${wanted} onInput=${(event) => setWanted(event.target.value)} />`}
+      <span class=${`verdict ${figures.balanced ? 'good' : 'bad'}`} title="Whether, for each topic, received = stored + skipped + rejected + dropped + open">${figures.balanced === null ? '' : figures.balanced ? 'the ledger balances' : 'the ledger does not balance'}</span></div>
     <div class="scroll"><table class="topics">
-      <thead><tr><th><span class="visually-hidden">State</span></th><th>Topic</th>${COLUMNS.map(([, label]) => html`<th class="n">${label}</th>`)}</tr></thead>
-      <tbody>${rows.map((row) => {
+      <thead><tr><th><span class="visually-hidden">State</span></th><th title="A click shows the newest message">Topic</th>${COLUMNS.map(([, label, what]) => html`<th class="n" title=${what}>${label}</th>`)}</tr></thead>
+      <tbody>${shown.map((row) => {
         const [kind, why] = state(row);
-        return html`<tr key=${row.topic}><td><${Mark} kind=${kind} why=${why} /></td>
-          <td><b>${row.topic}</b><small>${row.sensor || '–'} · ${row.type.split('/').at(-1)}</small>
+        const isOpen = inspected.value === row.topic;
+        return [html`<tr key=${row.topic} class=${row.publishers === 0 ? 'silent' : ''}><td><${Mark} kind=${kind} why=${why} /></td>
+          <td><button type="button" class="topic" aria-expanded=${isOpen} data-inspect=${row.topic} title="Show the newest message" onClick=${() => { inspected.value = isOpen ? null : row.topic; }}><b>${row.topic}</b></button>
+            <small>${row.publishers === 0 ? 'nobody publishes this · ' : row.isLogged ? `${row.sensor || '–'} · ` : 'not logged · '}<span title=${row.type}>${row.type.split('/').at(-1)}</span></small>
             ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps">${row.stamps}</small>`}</td>
-          ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`;
-      })}</tbody></table></div></div>`;
+          ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`,
+        isOpen && html`<tr key=${`${row.topic}#`} class="inspected"><td></td><td colspan=${COLUMNS.length + 1}><${Message} key=${row.topic} topic=${row.topic} /></td></tr>`];
+      })}</tbody></table></div>
+    ${found.length > shown.length && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${found.length}</button>`}
+    ${!found.length && html`<p class="empty">No topic matches.</p>`}${untold > 0 && html`<p class="note">The robot has ${untold} topics more, which are not told: most of them have no publisher.</p>`}</div>`;
 }
 
 function Bar({ part, whole, label }) {
@@ -58,27 +93,36 @@ function Bar({ part, whole, label }) {
     <i class=${share > 0.9 ? 'bad' : share > 0.7 ? 'watch' : ''} style=${{ width: `${share * 100}%` }}></i></div>`;
 }
 
+const T = ({ children, what }) => html`<dt title=${what}>${children}</dt>`;
+
+// When all that waits will be there, in words.
+function arrival(waiting, store) {
+  if (waiting === 0) return 'nothing waits';
+  if (store?.left_s !== null && store?.left_s !== undefined) return span(store.left_s);
+  if (Object.keys(store?.waits_for ?? {}).length) return 'once a rule holds';
+  return { idle: 'about to be sent', shipping: 'not known yet', store_down: 'once the store can be reached', paused: 'once the error is corrected', not_draining: 'another process sends it' }[store?.state] ?? 'once the node runs';
+}
+
 export function Cards({ figures }) {
   const { queue, spool, store, objects } = figures;
   const waiting = spool?.pending ?? objects?.pending ?? 0;
-  const bytes = figures.bytes?.pending ?? 0;
+  const bytes = waiting ? figures.bytes?.pending : 0;
   const rules = Object.entries(store?.waits_for ?? {});
-  const left = store?.left_s ?? null;
   const storeState = store?.state ? store.state.replaceAll('_', ' ') : 'no node runs';
   const isFine = ['idle', 'shipping', 'not_draining', 'waiting'].includes(store?.state);
   return html`<div class="cards">
-    <div class="panel card"><h3>Delivery</h3><p class="big"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
-      <dl><dt>to</dt><dd>${store?.target || '–'}</dd><dt>sends</dt><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
-      <dt>delivered</dt><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${name}>waits for ${why}</p>`)}</div>
-    <div class="panel card"><h3>Waiting</h3><p class="big">${digits(waiting)} <small>objects</small></p>
-      <dl><dt>size</dt><dd>${volume(bytes)}</dd><dt>there in</dt><dd data-field="left">${waiting === 0 ? 'nothing waits' : left !== null ? span(left) : rules.length ? 'once a rule holds' : 'not at today’s pace'}</dd>
-      <dt>oldest</dt><dd>${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</dd></dl></div>
-    <div class="panel card"><h3>Spool</h3><p class="big">${volume(spool?.bytes)}</p>
+    <div class="panel card"><h3>Delivery</h3><p class="big" title="What the node does with objects that are ready: sending, waiting for a rule, or trying again"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
+      <dl><${T} what="The store that objects are sent to">to</${T}><dd>${store?.target || '–'}</dd><${T} what="The rate of uploads now">sends</${T}><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
+      <${T} what="Objects that the store has confirmed, since the node first ran">delivered</${T}><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${name}>waits for ${why}</p>`)}</div>
+    <div class="panel card"><h3>Waiting</h3><p class="big" title="Objects on the robot’s disk that are not delivered yet">${digits(waiting)} <small>objects</small></p>
+      <dl><${T} what="Their bytes on disk">size</${T}><dd>${volume(bytes)}</dd><${T} what="When all of them will be in the store, at the rate of the last seconds">delivered in</${T}><dd data-field="left">${arrival(waiting, store)}</dd>
+      <${T} what="How long the oldest of them has been waiting">oldest</${T}><dd>${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</dd></dl></div>
+    <div class="panel card"><h3>Spool</h3><p class="big" title="What the folder for objects on the robot’s disk contains now">${volume(spool?.bytes)}</p>
       <${Bar} part=${spool?.bytes ?? 0} whole=${spool?.max_bytes} label="how full the spool is" />
-      <dl><dt>of at most</dt><dd>${volume(spool?.max_bytes)}</dd><dt>disk has free</dt><dd>${volume(spool?.free_bytes)}</dd><dt>quarantined</dt><dd>${digits(spool?.quarantined)}</dd></dl></div>
-    <div class="panel card"><h3>Queue</h3><p class="big">${digits(queue?.messages)} <small>messages</small></p>
+      <dl><${T} what="spool.max_bytes: when it is reached, the least important objects are deleted, and the ledger lists them">of at most</${T}><dd>${volume(spool?.max_bytes)}</dd><${T} what="Free space of the disk that the spool is on">disk has free</${T}><dd>${volume(spool?.free_bytes)}</dd><${T} what="Objects that the store refuses; they stay on the robot, with the reason">quarantined</${T}><dd>${digits(spool?.quarantined)}</dd></dl></div>
+    <div class="panel card"><h3>Queue</h3><p class="big" title="Messages in memory that are not encoded yet">${digits(queue?.messages)} <small>messages</small></p>
       <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="how full the queue is" />
-      <dl><dt>in memory</dt><dd>${volume(queue?.bytes)}</dd><dt>mission</dt><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd>${figures.mission?.policy ? html`<dt>policy</dt><dd data-field="policy">${figures.mission.policy}</dd>` : ''}<dt>bag</dt><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
+      <dl><${T} what="Their bytes">in memory</${T}><dd>${volume(queue?.bytes)}</dd><${T} what="The mission that is running">mission</${T}><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd>${figures.mission?.policy ? html`<${T} what="The policy that this mission runs">policy</${T}><dd data-field="policy">${figures.mission.policy}</dd>` : ''}<${T} what="The bag that is being recorded">bag</${T}><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
   </div>`;
 }
 
@@ -97,45 +141,63 @@ async function examine() {
   }
 }
 
+// A check that did not end in time has found nothing, neither good nor bad.
+const isLate = ({ check }) => String(check).endsWith('.deadline');
+
 export function Findings({ figures }) {
+  const [isAll, setIsAll] = useState(false);
   const { state: asked, results, error } = doctor.value;
   const wrong = results.filter((each) => ['warning', 'error'].includes(each.severity));
   return html`<div class="panel"><div class="panel-head"><h3>Findings</h3><button type="button" onClick=${examine} disabled=${asked === 'asking'}>${asked === 'asking' ? 'The doctor looks…' : 'Ask the doctor'}</button></div>
-    ${figures.findings.length ? html`<ul class="findings">${figures.findings.map((text) => html`<li><${Mark} kind="watch" why="finding" /><span>${text}</span></li>`)}</ul>`
+    ${figures.findings.length ? html`<ul class="findings">${figures.findings.slice(0, isAll ? undefined : MOST_FINDINGS).map((text) => html`<li><${Mark} kind="watch" why="finding" /><span>${text}</span></li>`)}</ul>${!isAll && figures.findings.length > MOST_FINDINGS && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${figures.findings.length}</button>`}`
       : html`<p class="empty good">The node has nothing to complain about.</p>`}
     ${asked === 'told' && html`<div class="doctor" aria-live="polite"><h4>The doctor</h4>
       ${error ? html`<p class="note bad">${error}</p>` : !wrong.length ? html`<p class="good">${results.length} checks, nothing is wrong.</p>`
-      : html`<ul class="findings">${wrong.map((each) => html`<li><${Mark} kind=${each.severity === 'error' ? 'bad' : 'watch'} why=${each.severity} />
-        <span><b>${each.seen}</b>${each.cause ? html`<br />${each.cause}` : ''}${each.remedy ? html`<br /><code>${each.remedy}</code>` : ''}</span></li>`)}</ul>`}</div>`}
+      : html`<ul class="findings">${wrong.map((each) => html`<li><${Mark} kind=${each.severity === 'error' && !isLate(each) ? 'bad' : 'watch'} why=${isLate(each) ? 'not known: the check did not end in time' : each.severity} />
+        <span><b>${isLate(each) ? `Not known (${each.check.split('.')[0]}): ${each.seen}` : each.seen}</b>${each.cause ? html`<br />${each.cause}` : ''}${each.remedy ? html`<br /><code>${each.remedy}</code>` : ''}</span></li>`)}</ul>`}</div>`}
   </div>`;
 }
 
 const answers = signal([]);
+const busy = signal('');
+
+// Ask the node for something; its answer is listed.
+async function act(session, do_, more = {}) {
+  busy.value = do_;
+  let said = { ok: false, error: 'the robot cannot be reached' };
+  try {
+    const answer = await fetch('/api/act', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ do: do_, ...more }) });
+    said = await answer.json();
+  } catch { /* said already */ }
+  answers.value = [{ at: new Date().toISOString().slice(11, 19), do: do_, ok: said.ok === true, text: said.message ?? said.error ?? '' }, ...answers.value].slice(0, 6);
+  busy.value = '';
+}
+
+// On a phone, first of all: the state in a line, and the button that matters most.
+export function Glance({ session, figures, onSignIn }) {
+  const { spool, store } = figures;
+  const waiting = spool?.pending ?? 0;
+  const findings = figures.findings.length;
+  const last = answers.value[0];
+  const save = () => (session.role === 'operator' ? act(session, 'event', { name: 'manual' }) : onSignIn());
+  return html`<div class="glance"><button type="button" class="primary" disabled=${Boolean(busy.value)} onClick=${save} data-glance="save" title="Keeps what the robot recorded around this moment, at its full rate">Save this moment</button>
+    <span><b>${digits(waiting)}</b> waiting</span><span>${arrival(waiting, store)}</span><a href="#data" class=${findings ? 'watch' : 'good'}>${findings ? `${findings} ${findings === 1 ? 'finding' : 'findings'}` : 'no findings'}</a>
+    ${last && html`<small class=${last.ok ? '' : 'bad'} role="status">${last.text}</small>`}</div>`;
+}
 
 export function Controls({ session, figures, onSignIn }) {
   const [name, setName] = useState('');
   const [note, setNote] = useState('');
-  const [busy, setBusy] = useState('');
-  const act = async (do_, more = {}) => {
-    setBusy(do_);
-    let said = { ok: false, error: 'the robot cannot be reached' };
-    try {
-      const answer = await fetch('/api/act', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ do: do_, ...more }) });
-      said = await answer.json();
-    } catch { /* said already */ }
-    answers.value = [{ at: new Date().toISOString().slice(11, 19), do: do_, ok: said.ok === true, text: said.message ?? said.error ?? '' }, ...answers.value].slice(0, 6);
-    setBusy('');
-  };
   if (session.role !== 'operator') {
     return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3></div><p class="empty">You may watch. To trigger events and record bags, sign in with the operator’s token.</p>
       <button type="button" class="primary" onClick=${onSignIn}>Sign in as operator</button></div>`;
   }
-  const button = (do_, label, kind = '') => html`<button type="button" class=${kind} disabled=${Boolean(busy)} onClick=${() => act(do_)} data-act=${do_}>${busy === do_ ? '…' : label}</button>`;
+  const button = (do_, label, kind = '') => html`<button type="button" class=${kind} disabled=${Boolean(busy.value)} onClick=${() => act(session, do_)} data-act=${do_}>${busy.value === do_ ? '…' : label}</button>`;
   return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3><span class="unit">you are an operator</span></div>
-    <form class="row" onSubmit=${(event) => { event.preventDefault(); act('event', { name: name || 'manual', ...(note ? { note } : {}) }); }}>
+    <form class="row" onSubmit=${(event) => { event.preventDefault(); act(session, 'event', { name: name || 'manual', ...(note ? { note } : {}) }); }}>
       <input aria-label="Name of the event" placeholder="what happened" maxlength="100" value=${name} onInput=${(event) => setName(event.target.value)} />
       <input aria-label="Note" placeholder="a note" maxlength="1000" value=${note} onInput=${(event) => setNote(event.target.value)} />
-      <button class="primary" disabled=${Boolean(busy)} data-act="event">${busy === 'event' ? '…' : 'Save this moment'}</button></form>
+      <button class="primary" disabled=${Boolean(busy.value)} data-act="event">${busy.value === 'event' ? '…' : 'Save this moment'}</button></form>
     <div class="row"><span class="row-name">Bag</span>${button('bag start', 'Begin')}${button('bag split', 'Split')}${button('bag stop', 'End')}</div>
     <div class="row"><span class="row-name">Node</span>${button('flush', 'Flush')}${figures.paused ? button('resume', 'Resume', 'primary') : button('pause', 'Pause')}</div>
     <ol class="answers" aria-live="polite">${answers.value.map((each) => html`<li class=${each.ok ? '' : 'bad'}><time>${each.at}</time> <b>${each.do}</b> ${each.text}</li>`)}</ol></div>`;

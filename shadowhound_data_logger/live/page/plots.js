@@ -128,8 +128,17 @@ export class Plot {
       event.preventDefault();
       this.compare(JSON.parse(event.dataTransfer.getData(FIELD)));
     });
-    new ResizeObserver(() => this.make()).observe(box);
-    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.make());
+    this.sizes = new ResizeObserver(() => this.make());
+    this.sizes.observe(box);
+    this.schemes = matchMedia('(prefers-color-scheme: dark)');
+    this.onScheme = () => this.make();
+    this.schemes.addEventListener('change', this.onScheme);
+  }
+
+  end() {
+    this.sizes.disconnect();
+    this.schemes.removeEventListener('change', this.onScheme);
+    this.plot?.destroy();
   }
 
   chosen() {

@@ -1,7 +1,8 @@
-// The point cloud in 3D with the robot in it, and the floor plan that the lidar makes with the robot's path.
+// What the robot's sensors measure around it, in 3D, with the robot in it: by its own model, as a dog, or as a plain shape.
 import {
-  BoxGeometry, BufferAttribute, BufferGeometry, Color, ConeGeometry, GridHelper, Group, Line, LineBasicMaterial, Mesh, MeshLambertMaterial,
-  AmbientLight, DirectionalLight, OrbitControls, PerspectiveCamera, Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
+  AmbientLight, AxesHelper, BoxGeometry, BufferAttribute, BufferGeometry, CanvasTexture, Color, ConeGeometry, DirectionalLight, GridHelper, Group, Line, LineBasicMaterial,
+  LineSegments, Mesh, MeshBasicMaterial, MeshLambertMaterial, NearestFilter, OrbitControls, PerspectiveCamera, PlaneGeometry, Points, Scene, ShaderMaterial, SphereGeometry,
+  TOUCH, URDFLoader, Vector3, WebGLRenderer,
 } from './vendor/three.js';
 
 const VERTEX = `
@@ -26,33 +27,77 @@ void main() {
 }`;
 const ON_ROBOT = /base|body|lidar|radar|laser|sensor/;
 
-function robot(accent) {
+const MOST_LINKS = 500; // of a robot's model
+const DOG_HEIGHT = 0.32;
+
+const shell = new MeshLambertMaterial({ color: 0xe7ecef });
+const dark = new MeshLambertMaterial({ color: 0x37414a });
+const accent = new MeshLambertMaterial({ color: 0x06b6d4, emissive: 0x06b6d4, emissiveIntensity: 0.5 });
+
+function box(parent, size, place, material) {
+  const mesh = new Mesh(new BoxGeometry(...size), material);
+  mesh.position.set(...place);
+  parent.add(mesh);
+  return mesh;
+}
+
+function arrow(parent, length, place) {
+  const heading = new Mesh(new ConeGeometry(length * 0.35, length, 20), accent);
+  heading.rotation.z = -Math.PI / 2;
+  heading.position.set(...place);
+  parent.add(heading);
+}
+
+function dog() {
   const group = new Group();
-  const shell = new MeshLambertMaterial({ color: 0xe7ecef });
-  const dark = new MeshLambertMaterial({ color: 0x37414a });
-  const add = (size, place, material, parent = group) => {
-    const mesh = new Mesh(new BoxGeometry(...size), material);
-    mesh.position.set(...place);
-    parent.add(mesh);
-    return mesh;
-  };
-  add([0.44, 0.2, 0.12], [0, 0, 0], shell);
-  add([0.16, 0.14, 0.1], [0.28, 0, 0.04], dark);
+  box(group, [0.44, 0.2, 0.12], [0, 0, 0], shell);
+  box(group, [0.16, 0.14, 0.1], [0.28, 0, 0.04], dark);
   for (const x of [0.18, -0.18]) {
     for (const y of [0.13, -0.13]) {
-      add([0.07, 0.05, 0.2], [x - 0.03, y, -0.1], dark).rotation.y = 0.5;
-      add([0.05, 0.04, 0.2], [x - 0.03, y, -0.24], shell).rotation.y = -0.5;
+      box(group, [0.07, 0.05, 0.2], [x - 0.03, y, -0.1], dark).rotation.y = 0.5;
+      box(group, [0.05, 0.04, 0.2], [x - 0.03, y, -0.24], shell).rotation.y = -0.5;
     }
   }
-  const heading = new Mesh(new ConeGeometry(0.07, 0.2, 20), new MeshLambertMaterial({ color: accent, emissive: accent, emissiveIntensity: 0.5 }));
-  heading.rotation.z = -Math.PI / 2;
-  heading.position.set(0.52, 0, 0.02);
-  group.add(heading);
+  arrow(group, 0.2, [0.52, 0, 0.02]);
   return group;
 }
 
+// Of a robot whose shape is not known: its place and where it looks.
+function plain() {
+  const group = new Group();
+  box(group, [0.36, 0.28, 0.12], [0, 0, 0.1], shell);
+  arrow(group, 0.16, [0.26, 0, 0.1]);
+  group.add(new AxesHelper(0.35));
+  return group;
+}
+
+// A model from its description (URDF), without the files that it names: primitives as they are, and a line to each link that has none.
+function modelOf(xml) {
+  const text = new TextDecoder().decode(xml);
+  if (/<!(DOCTYPE|ENTITY)/i.test(text)) throw new Error('it defines entities');
+  const described = new DOMParser().parseFromString(text, 'text/xml');
+  if (described.querySelector('parsererror') || !described.querySelector('robot')) throw new Error('it is not URDF');
+  const links = described.querySelectorAll('link').length;
+  if (links > MOST_LINKS) throw new Error(`it has ${links} links`);
+  const meshes = described.querySelectorAll('visual mesh').length;
+  for (const each of [...described.querySelectorAll('texture, mesh, collision, gazebo, transmission')]) (each.closest('visual geometry') ?? each).remove();
+  for (const visual of [...described.querySelectorAll('visual')]) if (!visual.querySelector('geometry')) visual.remove();
+  const model = new URDFLoader().parse(described);
+  model.updateMatrixWorld(true);
+  const from = new Vector3();
+  const to = new Vector3();
+  for (const joint of Object.values(model.joints)) {
+    const length = from.setFromMatrixPosition(joint.parent.matrixWorld).distanceTo(to.setFromMatrixPosition(joint.matrixWorld));
+    const line = new LineSegments(new BufferGeometry().setFromPoints([new Vector3(), joint.position.clone()]), new LineBasicMaterial({ color: 0x06b6d4 }));
+    if (length > 0) joint.parent.add(line);
+    joint.add(new Mesh(new SphereGeometry(0.012, 8, 6), accent));
+  }
+  return { model, meshes, links };
+}
+
 export class CloudView {
-  constructor(canvas) {
+  constructor(canvas, { transforms, onNotes, isDog }) {
+    Object.assign(this, { transforms, onNotes, isDog, notes: {} });
     this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: 'low-power' });
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(50, 1, 0.05, 200);
@@ -65,23 +110,85 @@ export class CloudView {
     this.controls.maxDistance = 60;
     this.controls.listenToKeyEvents(canvas);
     this.controls.addEventListener('change', () => this.ask(0));
+    // One finger scrolls the page, two turn the view; in full screen there is nothing to scroll.
+    const touches = () => {
+      const isAlone = Boolean(document.fullscreenElement?.contains(canvas));
+      this.controls.touches = isAlone ? { ONE: TOUCH.ROTATE, TWO: TOUCH.DOLLY_PAN } : { ONE: null, TWO: TOUCH.DOLLY_ROTATE };
+      canvas.style.touchAction = isAlone ? 'none' : 'pan-y';
+    };
+    document.addEventListener('fullscreenchange', touches);
+    touches();
     this.follows = true;
     this.material = new ShaderMaterial({ vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: { size: { value: 26 }, fog: { value: new Color() } } });
     this.points = new Points(new BufferGeometry(), this.material);
-    this.points.frustumCulled = false;
-    this.robot = robot(0x06b6d4);
+    this.rays = new Points(new BufferGeometry(), this.material);
+    this.points.frustumCulled = this.rays.frustumCulled = false;
+    [this.cloudAt, this.scanAt, this.mapAt] = [this.points, this.rays, null].map((points) => {
+      const group = new Group();
+      if (points) group.add(points);
+      return group;
+    });
+    this.robot = new Group();
     this.robot.visible = false;
     this.path = new Line(new BufferGeometry(), new LineBasicMaterial({ color: 0x06b6d4 }));
     this.path.frustumCulled = false;
     const sun = new DirectionalLight(0xffffff, 2.2);
     sun.position.set(2, -3, 6);
-    this.scene.add(new AmbientLight(0xffffff, 1.3), sun, this.points, this.robot, this.path);
+    this.scene.add(new AmbientLight(0xffffff, 1.3), sun, this.robot, this.path, this.cloudAt, this.scanAt, this.mapAt);
+    this.undo = isDog.subscribe(() => this.reshape());
     this.target = new Vector3();
     this.drawn = null;
-    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.sizes = new ResizeObserver(() => this.resize());
+    this.sizes.observe(canvas.parentElement);
     this.theme();
-    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.theme());
+    this.schemes = matchMedia('(prefers-color-scheme: dark)');
+    this.onScheme = () => this.theme();
+    this.schemes.addEventListener('change', this.onScheme);
     this.resize();
+  }
+
+  end() {
+    this.isEnded = true;
+    this.undo();
+    this.sizes.disconnect();
+    this.schemes.removeEventListener('change', this.onScheme);
+    this.controls.dispose();
+    this.renderer.dispose();
+  }
+
+  // What cannot be drawn as it should be, and why; empty: it can.
+  note(what, why) {
+    if ((this.notes[what] ?? '') === why) return;
+    this.notes[what] = why;
+    this.onNotes(Object.values(this.notes).filter(Boolean));
+  }
+
+  // The robot's model, or else a shape.
+  reshape() {
+    this.shape?.removeFromParent();
+    this.shape = this.model ?? (this.isDog.value ? dog() : plain());
+    this.robot.add(this.shape);
+    this.ask();
+  }
+
+  take(item, body, drawn) {
+    const { kind } = item;
+    if (kind === 'cloud') this.cloud(item, body, drawn);
+    else if (kind === 'scan') this.scan(item, body);
+    else if (kind === 'map') this.map(item, body);
+    else if (kind === 'model') this.describe(body);
+    else if (kind === 'tf') this.toTransforms();
+  }
+
+  // A group where its frame is: by the robot's transforms, on the robot by its name, or in the frame of odometry.
+  place(group, frame, what) {
+    const near = this.transforms.near(frame);
+    const known = this.transforms.has(frame);
+    const parent = !near && ON_ROBOT.test(frame) ? this.robot : this.scene;
+    if (group.parent !== parent) parent.add(group);
+    group.position.set(...(near?.place ?? [0, 0, 0]));
+    group.quaternion.set(...(near?.turn ?? [0, 0, 0, 1]));
+    this.note(what, !near && this.transforms.robot() ? `${what}: its frame ${frame || '(no name)'} is ${known ? 'not connected with the robot' : 'in no transform'}` : '');
   }
 
   theme() {
@@ -106,23 +213,100 @@ export class CloudView {
     this.ask();
   }
 
-  cloud({ low, step, points, frame }, body, drawn) {
+  cloud({ topic, low, step, points, frame }, body, drawn) {
     const values = new Uint16Array(body.slice(0, points * 6).buffer);
     this.points.geometry.dispose();
     this.points.geometry = new BufferGeometry();
     this.points.geometry.setAttribute('position', new BufferAttribute(values, 3));
     this.points.scale.set(...step);
     this.points.position.set(...low);
-    const parent = ON_ROBOT.test(frame) ? this.robot : this.scene;
-    if (this.points.parent !== parent) parent.add(this.points);
+    this.place(this.cloudAt, frame, topic);
     this.drawn = drawn;
     this.ask();
   }
 
+  scan({ topic, frame, first, turn, step }, body) {
+    const ranges = new Uint16Array(body.slice(0, body.length & ~1).buffer);
+    const values = new Float32Array(ranges.length * 3);
+    let count = 0;
+    ranges.forEach((range, ray) => {
+      if (!range) return;
+      const angle = first + ray * turn;
+      values.set([range * step * Math.cos(angle), range * step * Math.sin(angle), 0], count * 3);
+      count += 1;
+    });
+    this.rays.geometry.dispose();
+    this.rays.geometry = new BufferGeometry();
+    this.rays.geometry.setAttribute('position', new BufferAttribute(values.slice(0, count * 3), 3));
+    this.place(this.scanAt, frame, topic);
+    this.ask();
+  }
+
+  map({ topic, width, height, resolution, x, y, yaw, frame }, cells) {
+    const picture = document.createElement('canvas');
+    picture.width = width;
+    picture.height = height;
+    const to = picture.getContext('2d', { willReadFrequently: true });
+    const data = to.createImageData(width, height);
+    for (let cell = 0; cell < cells.length; cell += 1) {
+      const at = (height - 1 - Math.floor(cell / width)) * width * 4 + (cell % width) * 4;
+      const shade = 255 - Math.min(100, cells[cell]) * 2.2;
+      data.data.set([shade, shade, shade, cells[cell] > 100 ? 0 : cells[cell] ? 255 : 90], at);
+    }
+    to.putImageData(data, 0, 0);
+    this.ground?.material.map.dispose();
+    this.ground?.geometry.dispose();
+    this.ground?.removeFromParent();
+    const texture = new CanvasTexture(picture);
+    texture.magFilter = NearestFilter;
+    const size = [width * resolution, height * resolution];
+    this.ground = new Mesh(new PlaneGeometry(...size), new MeshBasicMaterial({ map: texture, transparent: true, depthWrite: false }));
+    const corner = new Group();
+    corner.position.set(x, y, 0.005);
+    corner.rotation.z = yaw;
+    this.ground.position.set(size[0] / 2, size[1] / 2, 0);
+    corner.add(this.ground);
+    this.mapAt.clear();
+    this.mapAt.add(corner);
+    this.place(this.mapAt, frame, topic);
+    this.ask();
+  }
+
+  describe(xml) {
+    try {
+      const { model, meshes, links } = modelOf(xml);
+      this.model?.removeFromParent();
+      this.model = model;
+      this.note('model', meshes ? `the model of ${links} links: meshes are files on the robot, which a page cannot fetch; joints are drawn instead` : '');
+    } catch (error) {
+      this.model = null;
+      this.note('model', `the model of the robot cannot be drawn: ${error.message}`);
+    }
+    this.reshape();
+  }
+
+  // Joints of the model, by name.
+  joints(values) {
+    if (!this.model) return;
+    for (const [name, value] of Object.entries(values)) if (Number.isFinite(value)) this.model.joints[name]?.setJointValue(value);
+    this.ask();
+  }
+
   pose({ x, y, z, qx, qy, qz, qw }) {
+    if (!this.transforms.robot()) this.move([x, y, this.isDog.value ? Math.max(z, DOG_HEIGHT) : z], [qx, qy, qz, qw]);
+  }
+
+  // The robot's place by its transforms, if they tell it.
+  toTransforms() {
+    const robot = this.transforms.robot();
+    const near = this.model && this.transforms.near(this.model.name ?? '');
+    if (robot) this.move(...(near ? [near.place, near.turn] : [robot.place, robot.turn]));
+  }
+
+  move(place, turn) {
     const before = this.robot.position.clone();
-    this.robot.position.set(x, y, Math.max(z, 0.32));
-    this.robot.quaternion.set(qx, qy, qz, qw);
+    this.robot.position.set(...place);
+    this.robot.quaternion.set(...turn);
     if (this.follows) {
       const moved = this.robot.visible ? this.robot.position.clone().sub(before) : this.robot.position.clone();
       this.camera.position.add(moved);
@@ -148,11 +332,12 @@ export class CloudView {
 
   // Only when something changed, and so seldom that a machine without a graphics card keeps up with everything else.
   ask(pause = Math.max(50, 3 * (this.took ?? 0))) {
-    if (this.asked) return;
+    if (this.asked || this.isEnded) return;
     this.asked = true;
     const due = Math.max(0, pause - (performance.now() - (this.began ?? -1e9)));
     setTimeout(() => requestAnimationFrame(() => {
       this.asked = false;
+      if (this.isEnded) return;
       this.began = performance.now();
       this.controls.update();
       this.renderer.render(this.scene, this.camera);
@@ -161,134 +346,5 @@ export class CloudView {
       drawn?.();
       this.took = performance.now() - this.began;
     }), due);
-  }
-}
-
-const CELL = 0.06; // m
-const SIDE = 1024; // cells
-const LOWEST = 0.15;
-const HIGHEST = 1.6;
-
-export class FloorPlan {
-  constructor(canvas) {
-    this.canvas = canvas;
-    this.cells = document.createElement('canvas');
-    this.cells.width = this.cells.height = SIDE;
-    this.plan = this.cells.getContext('2d', { willReadFrequently: true });
-    this.hits = new Uint8Array(SIDE * SIDE);
-    this.path = [];
-    this.bounds = null;
-    this.robot = null;
-    this.cloudAt = 0;
-    new ResizeObserver(() => this.draw()).observe(canvas.parentElement);
-  }
-
-  clear() {
-    this.plan.clearRect(0, 0, SIDE, SIDE);
-    this.hits.fill(0);
-    this.path = [];
-    this.bounds = this.robot = null;
-  }
-
-  // Where it went, all of it at once: x, y and yaw.
-  trail(poses) {
-    this.path = poses.map(([x, y]) => [x, y]);
-    for (const [x, y] of this.path) this.reach(x / CELL + SIDE / 2, SIDE / 2 - y / CELL);
-    const [x, y, yaw] = poses.at(-1) ?? [];
-    this.robot = poses.length ? { x, y, yaw } : null;
-  }
-
-  cloud({ low, step, points, frame }, body, always = false) {
-    const now = performance.now();
-    if ((now - this.cloudAt < 500 && !always) || (ON_ROBOT.test(frame) && !this.robot)) return;
-    this.cloudAt = now;
-    const values = new Uint16Array(body.slice(0, points * 6).buffer);
-    const { x: rx = 0, y: ry = 0, yaw = 0 } = ON_ROBOT.test(frame) ? this.robot : {};
-    const [c, s] = [Math.cos(yaw), Math.sin(yaw)];
-    const picture = this.plan.getImageData(0, 0, SIDE, SIDE);
-    for (let at = 0; at < values.length; at += 3) {
-      const z = low[2] + values[at + 2] * step[2];
-      if (z < LOWEST || z > HIGHEST) continue;
-      const px = low[0] + values[at] * step[0];
-      const py = low[1] + values[at + 1] * step[1];
-      const x = Math.floor((rx + c * px - s * py) / CELL) + SIDE / 2;
-      const y = SIDE / 2 - Math.floor((ry + s * px + c * py) / CELL);
-      if (x < 0 || y < 0 || x >= SIDE || y >= SIDE) continue;
-      const cell = y * SIDE + x;
-      const hits = (this.hits[cell] = Math.min(255, this.hits[cell] + 1));
-      if (hits === 2 || always) this.reach(x, y);
-      picture.data[cell * 4 + 3] = hits < 2 && !always ? 0 : Math.min(255, 90 + hits * 14);
-    }
-    this.plan.putImageData(picture, 0, 0);
-  }
-
-  reach(x, y) {
-    const b = (this.bounds ??= { left: x, right: x, top: y, bottom: y });
-    b.left = Math.min(b.left, x);
-    b.right = Math.max(b.right, x);
-    b.top = Math.min(b.top, y);
-    b.bottom = Math.max(b.bottom, y);
-  }
-
-  pose({ x, y, qx, qy, qz, qw }) {
-    this.robot = { x, y, yaw: Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)) };
-    const last = this.path.at(-1);
-    if (last && Math.hypot(x - last[0], y - last[1]) < 0.05) return false;
-    this.path.push([x, y]);
-    if (this.path.length > 20000) this.path.splice(0, 1000);
-    this.reach(x / CELL + SIDE / 2, SIDE / 2 - y / CELL);
-    return true;
-  }
-
-  draw() {
-    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
-    if (!width || !height) return;
-    const ratio = Math.min(devicePixelRatio, 2);
-    this.canvas.width = width * ratio;
-    this.canvas.height = height * ratio;
-    const style = getComputedStyle(this.canvas);
-    const to = this.canvas.getContext('2d', { willReadFrequently: true }); // drawn by the processor, as the plots are
-    to.fillStyle = style.getPropertyValue('--stage');
-    to.fillRect(0, 0, this.canvas.width, this.canvas.height);
-    if (!this.bounds) return;
-    const { left, right, top, bottom } = this.bounds;
-    const [spanX, spanY] = [Math.max(right - left, 60) + 24, Math.max(bottom - top, 60) + 24];
-    const scale = Math.min(this.canvas.width / spanX, this.canvas.height / spanY);
-    to.translate(this.canvas.width / 2, this.canvas.height / 2);
-    to.scale(scale, scale);
-    to.translate(-(left + right) / 2, -(top + bottom) / 2);
-    to.imageSmoothingEnabled = false;
-    to.filter = matchMedia('(prefers-color-scheme: dark)').matches ? 'invert(0.85)' : 'none';
-    to.drawImage(this.cells, 0, 0);
-    to.filter = 'none';
-    const at = ([x, y]) => [x / CELL + SIDE / 2, SIDE / 2 - y / CELL];
-    to.strokeStyle = style.getPropertyValue('--accent');
-    to.lineWidth = (2.2 * ratio) / scale;
-    to.lineJoin = to.lineCap = 'round';
-    to.beginPath();
-    for (const point of this.path) to.lineTo(...at(point));
-    to.stroke();
-    if (this.robot) {
-      to.translate(...at([this.robot.x, this.robot.y]));
-      to.rotate(-this.robot.yaw);
-      const size = (9 * ratio) / scale;
-      to.fillStyle = style.getPropertyValue('--accent');
-      to.strokeStyle = style.getPropertyValue('--stage');
-      to.beginPath();
-      for (const [x, y] of [[1.2, 0], [-0.8, 0.8], [-0.4, 0], [-0.8, -0.8]]) to.lineTo(x * size, y * size);
-      to.closePath();
-      to.fill();
-      to.stroke();
-    }
-    const meter = 5 / CELL;
-    to.setTransform(1, 0, 0, 1, 0, 0);
-    to.strokeStyle = to.fillStyle = style.getPropertyValue('--faint');
-    to.lineWidth = 1.5 * ratio;
-    to.font = `${11 * ratio}px system-ui, sans-serif`;
-    to.beginPath();
-    to.moveTo(12 * ratio, this.canvas.height - 12 * ratio);
-    to.lineTo(12 * ratio + meter * scale, this.canvas.height - 12 * ratio);
-    to.stroke();
-    to.fillText('5 m', 12 * ratio, this.canvas.height - 18 * ratio);
   }
 }

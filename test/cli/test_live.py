@@ -1,0 +1,48 @@
+"""What ``shadowhound-data live`` decides before it serves: whose page it is, and which URLs it takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shadowhound_data_logger.cli.common import BadUsage
+from shadowhound_data_logger.cli.live import as_it_is, check_urls
+from shadowhound_data_logger.live.server import LiveSettings
+
+TILES = 'https://tile.example/{z}/{x}/{y}.png'
+
+
+@pytest.mark.parametrize('tiles', ['https://tile.example/', 'file:///{z}/{x}/{y}', "https://a b;'x/{z}/{x}/{y}", '{z}{x}{y}'])
+def test_tiles_are_a_url_with_places(tmp_path: Path, tiles: str) -> None:
+    """Nothing else gets into the policy of the page."""
+    check_urls(tmp_path / 'none', None, None, TILES)
+    with pytest.raises(BadUsage, match='--tiles'):
+        check_urls(tmp_path / 'none', None, None, tiles)
+
+
+def test_a_relayed_robot_is_on_another_machine(tmp_path: Path) -> None:
+    """Not where a spool is; and it has no cameras to serve."""
+    check_urls(tmp_path / 'none', 'http://thor:8765/', None, '')
+    for folder, url, rtsp in (
+        (tmp_path, 'http://thor:8765/', None),
+        (tmp_path / 'none', 'http://thor:8765/', 8554),
+        (tmp_path / 'none', 'thor', None),
+    ):
+        with pytest.raises(BadUsage):
+            check_urls(folder, url, rtsp, '')
+
+
+def test_whose_page_it_is_follows_from_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A store's where no node has run, unless something says that this is a robot; a robot's as soon as one has."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    for name in ('AWS_ENDPOINT_URL', 'SHADOWHOUND_ROBOT'):
+        monkeypatch.delenv(name, raising=False)
+    given = LiveSettings(spool=tmp_path / 'spool', robot='', tokens=tmp_path / 'live')
+    assert not as_it_is(given, is_robot=False).is_of_store  # there is no store either
+    (tmp_path / 'store').mkdir()
+    assert as_it_is(given, is_robot=False).is_of_store
+    assert not as_it_is(given, is_robot=True).is_of_store
+    (tmp_path / 'spool').mkdir()
+    found = as_it_is(given, is_robot=False)
+    assert (found.is_of_store, found.waits) == (False, '')
