@@ -5,8 +5,10 @@ import { Link } from './link.js';
 import { fromAddress, toAddress } from './moments.js';
 import { Age, Views, noteScale, transforms } from './panels.js';
 import { openRobot, past, show } from './past.js';
+import { Plot } from './plots.js';
+import { prefill } from './prefill.js';
 import {
-  chosen, connection, figures, give, layout, loadLayout, pastRings, present, problem, rewatch, rings, seen, session, shared, tellProblem, topics, total, views,
+  chosen, connection, figures, give, layout, loadLayout, pastRings, present, problem, rewatch, ringOf, rings, seen, session, shared, tellProblem, topics, total, views,
 } from './state.js';
 import { Timeline } from './timeline.js';
 import { Video } from './video.js';
@@ -16,6 +18,7 @@ const stats = (window.shadowhound = {
   came: {}, drawn: {}, count: {}, wrong: 0, link: null, robot: () => transforms.robot(),
   ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, stats.link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])),
 });
+Plot.rings = ringOf;
 const newest = new Map(); // of kinds that are drawn in space, for a view that is loaded later
 views.late = { [Symbol.iterator]: () => newest.values() };
 setInterval(() => { if (!document.hidden) present.value = shared.link?.now() ?? null; }, 100);
@@ -247,6 +250,7 @@ async function start() {
   if (shared.link) return shared.link.start();
   const link = (shared.link = stats.link = new Link({ onItem, onState: (state) => { connection.value = state; if (state === 'lost') { video.lost(); check(); } else video.follow(); } }));
   const video = (shared.video = stats.video = new Video({ link, onFrame: drawVideo, onChange: rewatch }));
+  prefill({ rings, chosen, plan: () => views.plan, onPath: (path) => views.cloud?.trail(path) });
 }
 
 // Whether the cookie is still good: its time, a sign-out elsewhere or a new token ends it. Where everybody may watch a viewer is left.

@@ -1,7 +1,7 @@
 // The panels of the page: cameras, the 3D view, the plan, plots, GPS, diagnostics and the log.
 import { html, signal, useEffect, useRef, useState } from './vendor/preact.js';
 import { busy, past } from './past.js';
-import { Plot, Ring } from './plots.js';
+import { Plot, Ring, drag } from './plots.js';
 import {
   MOST_CAMERAS, change, chosen, connection, having, isGo2, isLiving, lacks, layout, living, pick, present, problems, rings, ringOf, seen, session, shared, topics, useItems, useWatch, views,
 } from './state.js';
@@ -226,7 +226,7 @@ export function Chart({ title, kind, lines, options, className = '', figure }) {
   const last = ringOf(kind).last();
   const told = ringOf(kind).names;
   return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
-    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
+    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span draggable="true" title="Drag it onto another plot to compare" onDragStart=${(event) => drag(event, { kind, name, label, factor, unit: options.units?.[place] ?? options.unit })}><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
     ${!lines && html`<span>${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div><${Why} kind=${kind} /></${Panel}>`;
 }
 
