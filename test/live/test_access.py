@@ -871,7 +871,7 @@ def test_the_page_is_small_and_loads_nothing_from_elsewhere() -> None:
     assert sum(len(packed) for _, packed in served.values()) < 270_000
     assert sum(len(packed) for name, (_, packed) in served.items() if name not in {'vendor/three.js', 'scene.js'}) < 110_000
     ours = b''.join(body for name, (body, _) in served.items() if not name.startswith('vendor/'))
-    assert re.findall(rb'https?://(?!www\.w3\.org/2000/svg)', ours) == []
+    assert re.findall(rb'https?://(?!www\.w3\.org/2000/svg|app\.foxglove\.dev/~/view)', ours) == []
     sums = dict(line.split()[::-1] for line in files['vendor/SHA256SUMS'][0].decode().splitlines())
     assert sums == {name.partition('/')[2]: sha256(body).hexdigest() for name, (body, _) in served.items() if 'vendor/' in name}
     pinned = json.loads((Path(__file__).parents[2] / 'requirements' / 'page' / 'package.json').read_text())['dependencies']
