@@ -50,7 +50,7 @@ class Recorded:
 
 
 def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
-    """Record a bag of the topics that the node logs by default, at full rate, and upload it while it is recorded.
+    """Record a bag of all topics (of a Unitree, those of the default sensors) at full rate, and upload it while it is recorded.
 
     A server that is unreachable is not an error: ``delivered`` is then False, and the rest waits in the spool.
 

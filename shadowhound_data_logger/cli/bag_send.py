@@ -139,8 +139,8 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_
 def bag_record(*, topics: tuple[str, ...], robot: str | None, as_json: bool, **wanted: Any) -> ExitCode:
     """Record topics into a bag and upload it.
 
-    The bag is NAME_YYYYMMDD_HHMMSS; without --topic it has the topics that the node logs by default;
-    --regex '.*' records all.
+    The bag is NAME_YYYYMMDD_HHMMSS; without --topic and --regex it has all topics, of a Unitree those of the
+    default sensors.
 
     It needs ROS 2, but neither rosbag2 nor a running node. Slices are uploaded while it records. If Tower cannot be reached, the
     bag waits in the spool, and the exit code is 1.

@@ -209,7 +209,10 @@ class MissionSettings:
         'odom|nav_msgs/msg/Odometry',
         'Topic or message type of pose, trajectory and distance; alternatives separated by |; empty for none.',
     )
-    frames: str = _setting('camera', 'Sensor whose pictures become frames of the run; empty for none.')
+    frames: str = _setting(
+        'camera|sensor_msgs/msg/CompressedImage|sensor_msgs/msg/Image',
+        'Sensor or message type whose pictures become frames of the run; alternatives separated by |; empty for none.',
+    )
     frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
 
 

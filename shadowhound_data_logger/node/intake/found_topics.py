@@ -28,6 +28,12 @@ MAX_FOUND: Final = 200
 """Sensors made of topics that no settings name: a subscription takes 100 KB, and who publishes decides how many there are."""
 
 
+def is_unitree(node: Node, graph: Mapping[str, Collection[str]]) -> bool:
+    """Whether something publishes what only a Unitree does: the default sensors are made for that robot."""
+    topics = (topic for topic, types in graph.items() if any(map(is_of_go2, types)))
+    return any(is_of_go2(each.type) for topic in topics for each in endpoints(node, topic))
+
+
 def robots_in(topics: Collection[str], own: str) -> list[str]:
     """The namespaces below ``own`` that are each those of a robot: with several of the topics of the default sensors."""
     counts: Counter[str] = Counter()
@@ -59,7 +65,7 @@ class FoundTopics:
         """The sensors to add. A topic is judged once: what its publishers are when it is first seen decides."""
         graph = {name: types for name, types in self._node.get_topic_names_and_types() if is_plain_name(name)}
         self._since_s = now_s if self._since_s is None else self._since_s
-        self._is_go2 = self._is_auto and (self._is_go2 or self._has_go2(graph))
+        self._is_go2 = self._is_auto and (self._is_go2 or is_unitree(self._node, graph))
         has_settled = now_s - self._since_s >= SETTLE_S
         if has_settled and not self._has_told:
             self._tell_of_robots(graph)
@@ -86,11 +92,6 @@ class FoundTopics:
     def _is_own(self, topic: str) -> bool:
         """Whether it is the robot's: below the namespace of the node, and tf, which several robots share."""
         return topic in _SHARED or topic.startswith(self._namespace)
-
-    def _has_go2(self, graph: Mapping[str, list[str]]) -> bool:
-        """Whether somebody publishes what only a Unitree does: the default sensors subscribe to it in any case."""
-        topics = (topic for topic, types in graph.items() if any(map(is_of_go2, types)))
-        return any(is_of_go2(each.type) for topic in topics for each in endpoints(self._node, topic))
 
     def _tell_of_robots(self, graph: Mapping[str, list[str]]) -> None:
         """Once: topics of robots in namespaces, of which this node logs none, or all under one name."""

@@ -325,7 +325,10 @@ class Subscriber:
             if name not in self._told and (any(by) or self._has_waited(now_s)):
                 how = 'counted as rejected (wrong_type)' if name == counted else 'not listened to'
                 whose = ', '.join(filter(None, by[:MAX_NODES])) or 'a program that is not a ROS node'
-                text = f'{self._chosen} is published as {name} too, by {whose}; {type_name} is logged, and that is {how}'
+                if len(found) > sum(map(len, nodes.values())):
+                    text = f'{self._chosen} is published as {name} too, by {whose}; {type_name} is logged, and that is {how}'
+                else:
+                    text = f'{self._chosen} is published as {name}, by {whose}; only {type_name} is logged, and that is {how}'
                 self._tell(name, text)
         if not nodes:
             self._nameless_since_s = None

@@ -42,6 +42,7 @@ from shadowhound_data_logger.core.model import DataObject, RecordingRows
 from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.core.worker import Worker
 from shadowhound_data_logger.formats.types import MessageTypes
+from shadowhound_data_logger.node.intake.found_topics import is_unitree
 from shadowhound_data_logger.node.intake.intake import Intake
 from shadowhound_data_logger.node.node import StopSignals
 from shadowhound_data_logger.node.recording.bags import BagConsumer
@@ -144,8 +145,9 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
 
 def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[str, Any]:
     name = check_name(given.name, 'the mission')
-    topics = given.topic or ([] if given.regex else _topics_there(node, given.robot, stop))
-    parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex}
+    is_chosen = given.topic or given.regex
+    topics = given.topic if is_chosen else _topics_there(node, given.robot, stop)
+    parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex if is_chosen or topics else '.*'}
     settings = Settings.load(parameters, os.environ)
     wanted = _Wanted(name, given.duration, given.deadline)
     with _alone(settings), closing(open_store(settings.store, settings.upload)) as store:
@@ -215,7 +217,7 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
 
 
 def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
-    """Of each sensor the first topic that somebody publishes, else its first: what the node takes."""
+    """Of each sensor of a Unitree the first topic that is published, otherwise its first; none where the robot is another one."""
     sensors = [sensor.topics for sensor in Settings.load({'robot': robot}, {}).sensors if sensor.enabled]
     end_s = time.monotonic() + DISCOVERY_S
     while time.monotonic() < end_s and not stop.received:
@@ -223,6 +225,8 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
             time.sleep(MORE_S)
             break
         time.sleep(STEP_S)
+    if not is_unitree(node, dict(node.get_topic_names_and_types())):
+        return []
     return [next((topic for topic in topics if node.count_publishers(topic)), topics[0]) for topics in sensors]
 
 

@@ -27,7 +27,7 @@ from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE
 
 log = logging.getLogger(__name__)
 
-POSE: Final = 'pose'
+POSE, FRAMES = 'pose', 'frames'
 JPEG: Final = 'image/jpeg'
 BATTERY_STATE: Final = 'sensor_msgs/msg/BatteryState'
 _ROUNDING: Final = 1e-6
@@ -83,7 +83,7 @@ class MissionObserver:
         self._period_ns = max(1, round(settings.period_s * SECOND))
         self._marks = marks
         self._place = place
-        self._frames = settings.frames
+        self._frames = Sources(settings.frames, str)
         self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
         self._odometry = Sources(settings.odometry, resolve)
         self._fields = {BATTERY: Sources(settings.battery, resolve), TEMPERATURE: Sources(settings.temperature, resolve)}
@@ -105,7 +105,7 @@ class MissionObserver:
                     yield from self._readings(batch.type, sample, fields)
             if batch.type == POINT_CLOUD:
                 yield from (cloud for sample in self._some(batch, SECOND) if (cloud := self._cloud(sample)))
-            if batch.sensor == self._frames:
+            if self._choose(FRAMES, self._frames, batch, batch.sensor):
                 for sample in self._some(batch, self._frame_ns):
                     picture = self._jpeg(batch, sample, item)
                     if picture is not None:
@@ -113,9 +113,12 @@ class MissionObserver:
         except Rejected as error:
             self._tell(batch.topic, str(error))
 
-    def _choose(self, key: str, sources: Sources, batch: Batch) -> Source | None:
-        """The source that a batch is of, unless a preferred one was heard, or another topic of the same type."""
-        found, before = sources.find(batch.topic, batch.type), self._chosen.get(key)
+    def _choose(self, key: str, sources: Sources, batch: Batch, name: str = '') -> Source | None:
+        """The source that a batch is of, unless a preferred one was heard, or another topic of the same type.
+
+        ``name`` is what the setting names, by default the topic.
+        """
+        found, before = sources.find(name or batch.topic, batch.type), self._chosen.get(key)
         if found is None or (before is not None and before.topic != found.topic and before.rank <= found.rank):
             return None
         self._chosen[key] = found

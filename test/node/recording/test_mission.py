@@ -256,6 +256,32 @@ def test_a_picture_is_taken_every_few_seconds() -> None:
     assert list(observer.facts(batch('other', '/c', kind, image))) == []
 
 
+def test_pictures_of_a_robot_without_a_sensor_camera() -> None:
+    """Those of the first sensor with pictures, until there is a ``camera``."""
+    settings = given({}, Path('nowhere'))
+    camera = next(sensor for sensor in settings.sensors if sensor.name == 'camera')
+    shown = dict.fromkeys(('wrist', 'side', 'camera'), camera)
+    observer = MissionObserver(settings.mission, shown, 'thor', MessageTypes(), lambda topic: f'/{topic}')
+    kind = 'sensor_msgs/msg/CompressedImage'
+    image = STORE.types[kind](a_header(), 'jpeg', np.frombuffer(JPEG, np.uint8))
+    sensors = ('wrist', 'side', 'wrist', 'camera', 'wrist')
+    taken = [batch(name, f'/{name}', kind, image, start_ns=NOON_NS + 10 * place * SECOND) for place, name in enumerate(sensors)]
+    found = [[type(fact) for fact in observer.facts(each)] for each in taken]
+    assert found == [[Frame], [], [Frame], [Frame], []]
+
+
+def test_poses_without_odometry() -> None:
+    """They are those of tf, until there is odometry."""
+    kind = 'tf2_msgs/msg/TFMessage'
+    settings = given({}, Path('nowhere'))
+    place = Pose(NOON_NS, 1.0, 2.0, 0.5, 0.1, 'map')
+    observer = MissionObserver(settings.mission, {}, 'thor', MessageTypes(), lambda topic: f'/{topic}', place=lambda _: place)
+    moved = Batch('tf', '/tf', kind, (Sample(NOON_NS, b''),), 0)
+    assert list(observer.facts(moved)) == [place]
+    assert len(list(observer.facts(batch('odom', '/wheels', 'nav_msgs/msg/Odometry', odometry(1, 0.5))))) == 1
+    assert list(observer.facts(Batch('tf', '/tf', kind, (Sample(NOON_NS + SECOND, b''),), 0))) == []
+
+
 @pytest.mark.parametrize(
     ('parameters', 'again'), [({}, 0), ({'camera.format': 'png'}, 1), ({'camera.format': 'zip', 'camera.batch_s': 1.0}, 1)]
 )
