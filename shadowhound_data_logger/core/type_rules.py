@@ -24,7 +24,10 @@ _SENSOR: Final = (
     'FluidPressure Illuminance Imu JointState Joy LaserScan MagneticField MultiDOFJointState NavSatFix NavSatStatus Range '
     'RelativeHumidity Temperature TimeReference'
 )
-_STD: Final = 'Bool Byte Char Float32 Float64 Header Int16 Int32 Int64 Int8 String UInt16 UInt32 UInt64 UInt8'
+_STD: Final = (
+    'Bool Byte Char Float32 Float32MultiArray Float64 Float64MultiArray Header Int16 Int16MultiArray Int32 Int32MultiArray Int64 '
+    'Int64MultiArray Int8 String UInt16 UInt16MultiArray UInt32 UInt32MultiArray UInt64 UInt64MultiArray UInt8'
+)
 RULES: Final[Mapping[str, Mapping[str, Any]]] = {
     COMPRESSED_IMAGE: {'format': 'jpeg', 'priority': 6},
     IMAGE: {'format': 'jpeg', 'priority': 6},

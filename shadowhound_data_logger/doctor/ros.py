@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -11,15 +12,21 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.config import SensorSettings
-from shadowhound_data_logger.core.errors import SettingError
+from shadowhound_data_logger.core.errors import Rejected, SettingError
+from shadowhound_data_logger.core.keys import printable
+from shadowhound_data_logger.core.options import NAMED
 from shadowhound_data_logger.core.type_rules import is_of_go2
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
+from shadowhound_data_logger.formats.records import TRANSFORMS
+from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.ros.endpoints import alternatives, logged_type
 
 if TYPE_CHECKING:
+    from rclpy.node import Node
+
     from shadowhound_data_logger.doctor.ros_watch import Heard
 
 
@@ -43,6 +50,8 @@ STREAMS: Final = {
     'go2_states': Stream(20.0, reliable=True),
     'joint_states': Stream(50.0, reliable=True),
     'lowstate': Stream(20.0, optional=True),
+    'wirelesscontroller': Stream(0.0, optional=True),
+    'frontvideostream': Stream(0.0, optional=True),
     'utlidar/voxel_map_compressed': Stream(10.0, optional=True),
 }
 """By the topic's name in the settings."""
@@ -62,6 +71,9 @@ TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 ENOUGH: Final = 4
 """Messages that have to be expected within the window for a rate to mean something."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
+TF, CLOCK = '/tf', '/clock'
+STALE_S: Final = 5.0
+"""Age of a transform that is still one of now: localization is late, and clocks of two machines differ."""
 DRIVER: Final = 'go2_interfaces'
 """Expected while nothing is published at all: the driver may start later."""
 
@@ -80,6 +92,7 @@ def check(context: Context) -> Iterator[Result]:
     if listener is not None:
         listener.enter(os.environ)  # before ROS is loaded, as the node does
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
+    from shadowhound_data_logger.ros.reader import endpoints  # noqa: PLC0415 - as above
 
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
     with _profiled(listener), ros_watch.node(namespace=context.namespace) as node:
@@ -88,15 +101,65 @@ def check(context: Context) -> Iterator[Result]:
         found = ros_watch.discover(node, names)
         pairs = [pair for sensor in sensors for pair in zip(sensor.topics, sensor.types, strict=False)]
         types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
+        found |= {topic: publishers for topic in (TF,) if (publishers := endpoints(node, topic))}
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
         others = [] if heard else list(ros_watch.published(node))
+        yield from _clock(node)
     packages = {each.type.partition('/')[0] for publishers in found.values() for each in publishers}
     yield from _types(sensors, packages if heard else packages | {DRIVER})
     if not heard:
         yield from _nobody(context, names, listener, others)
         return
+    if TF in heard:
+        yield from _transforms(heard[TF])
+    is_complete = context.settings.capture.topics == NAMED or any(map(is_of_go2, (f'{name}/' for name in packages)))
     for sensor in sensors:
-        yield from _sensor(sensor, [heard[resolved[topic]] for topic in sensor.topics], context.rates_hz)
+        topics = [heard[resolved[topic]] for topic in sensor.topics]
+        if is_complete or any(one.publishers for one in topics):  # the default sensors are those of a Unitree
+            yield from _sensor(sensor, topics, context.rates_hz)
+
+
+def _clock(node: Node) -> Iterator[Result]:
+    """Nodes that take their time from a simulator that does not run."""
+    if node.count_publishers(CLOCK):
+        return
+    names = {f'{each.node_namespace.rstrip("/")}/{each.node_name}' for each in node.get_subscriptions_info_by_topic(CLOCK)}
+    if names:
+        shown = sorted(map(printable, names))[:MAX_SHOWN]
+        yield warning(
+            'ros.clock',
+            f'{", ".join(shown)} use sim time, and nothing publishes {CLOCK}',
+            'the time of these nodes is 0: their messages are dated by arrival',
+            f'start the simulator, or: ros2 param set {shown[0]} use_sim_time false',
+        )
+
+
+def _transforms(one: Heard) -> Iterator[Result]:
+    """Frames that do not move any more."""
+    if one.unavailable:
+        return
+    if not one.received:
+        text = f'{TF} has a publisher, and no transform came in {WINDOW_S:g} s'
+    elif (age_s := _age_s(one.newest)) > STALE_S:
+        text = f'the newest transform on {TF} is {age_s:.0f} s old'
+    else:
+        yield ok('ros.tf', f'{TF} has {one.rate_hz:.0f} messages per second')
+        return
+    yield warning(
+        'ros.tf',
+        text,
+        'the place of the robot is unknown, or that of some time ago',
+        f'ros2 topic hz {TF} ; ros2 run tf2_ros tf2_monitor',
+    )
+
+
+def _age_s(cdr: bytes) -> float:
+    """Of the newest transform of a message; 0 where it has none."""
+    try:
+        stamps = [each.header.stamp for each in MessageTypes().deserialize(TRANSFORMS, cdr).transforms]
+    except Rejected:
+        return 0.0
+    return time.time() - max(stamp.sec + stamp.nanosec / 1e9 for stamp in stamps) if stamps else 0.0
 
 
 def _listener(context: Context) -> Middleware | None:
@@ -130,10 +193,20 @@ def _types(sensors: Sequence[SensorSettings], packages: Collection[str]) -> Iter
             'ros.types',
             f'{", ".join(by_type)} cannot be received: {next(iter(by_type.values()))}',
             'the workspace with this package is not sourced in this shell, was not built for this Python, or has no such type',
-            TYPES_REMEDY.format(package=package),
+            _types_remedy(package),
         )
     if not missing:
         yield ok('ros.types', 'all message types can be received')
+
+
+def _types_remedy(package: str) -> str:
+    """Of a message package that is missing."""
+    from shadowhound_data_logger.ros.reader import SHIPPED  # noqa: PLC0415 - rclpy
+
+    remedy = TYPES_REMEDY.format(package=package)
+    if package in SHIPPED:
+        return remedy
+    return f'sudo apt install ros-{os.environ.get("ROS_DISTRO", "$ROS_DISTRO")}-{package.replace("_", "-")}  # or {remedy}'
 
 
 def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None, published: Sequence[str]) -> Iterator[Result]:
@@ -221,7 +294,7 @@ def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: floa
             'ros.types',
             f'{one.topic} cannot be received: {one.unavailable}',
             'only topics whose type is installed here can be received',
-            TYPES_REMEDY.format(package=one.type.partition('/')[0]),
+            _types_remedy(one.type.partition('/')[0]),
         )
         return
     yield from _qos(one, stream)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
@@ -19,6 +20,10 @@ DRIVERS: Final = ('go2_driver', 'sim_go2_node')
 """Programs that publish what a Go2 senses: go2_ros2_sdk's, and the simulated one."""
 RANGES: Final = ('SUBNET', 'LOCALHOST', 'OFF', 'SYSTEM_DEFAULT')
 """https://docs.ros.org/en/rolling/Tutorials/Advanced/Improved-Dynamic-Discovery.html"""
+ZENOH: Final = 'rmw_zenoh_cpp'
+ROUTER: Final = ('localhost', 7447)
+"""Of Zenoh, unless a configuration names another one (rmw_zenoh's README)."""
+ROUTER_S: Final = 1.0
 AGREE: Final = ('ROS_DOMAIN_ID', 'RMW_IMPLEMENTATION', 'ROS_LOCALHOST_ONLY')
 DEFAULTS: Final = {'ROS_DOMAIN_ID': '0', 'ROS_LOCALHOST_ONLY': '0'}
 
@@ -117,6 +122,16 @@ def _middleware(environ: Mapping[str, str]) -> Iterator[Result]:
         )
     elif given or there:
         yield ok('ros.middleware', f'the middleware is {given or "the default"}')
+    if given == ZENOH and not (environ.get('ZENOH_SESSION_CONFIG_URI') or environ.get('ZENOH_CONFIG_OVERRIDE')):
+        try:
+            socket.create_connection(ROUTER, timeout=ROUTER_S).close()
+        except OSError as failure:
+            yield error(
+                'ros.zenoh',
+                f'no Zenoh router answers at tcp/{ROUTER[0]}:{ROUTER[1]} ({failure.strerror or failure})',
+                'without a router, nodes find nobody',
+                'ros2 run rmw_zenoh_cpp rmw_zenohd',
+            )
 
 
 def _driver(context: Context) -> Iterator[Result]:

@@ -81,7 +81,10 @@ def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     """With and without a slash they are the same in the root namespace: two sensors of it are both judged."""
     from shadowhound_data_logger.doctor import ros, ros_watch
 
-    here = SimpleNamespace(resolve_topic_name=lambda topic: '/' + topic.lstrip('/'))
+    here = SimpleNamespace(
+        resolve_topic_name=lambda topic: '/' + topic.lstrip('/'), count_publishers=lambda _: 1,
+        get_publishers_info_by_topic=lambda _: [],
+    )  # fmt: skip
     monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
     monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: [SimpleNamespace(type='a/msg/B')] for name in names})
     monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __, ___: [ros_watch.Heard(name, []) for name in found])
