@@ -13,8 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import simplejpeg
 from e2e.processes import COMMANDS, Node, Processes, Publisher, until
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from shadowhound_data_logger.core.type_rules import RULES
 
 pytestmark = pytest.mark.long('robots of their own')
 ROUNDS = 40
@@ -120,7 +123,31 @@ class Robot:
         return json.loads(ran.stdout)
 
 
+CLOUD = {
+    'height': 1, 'width': 1, 'point_step': 12, 'row_step': 12, 'data': np.zeros(12, np.uint8),
+    'fields': [STORE.types['sensor_msgs/msg/PointField'](name, 4 * place, 7, 1) for place, name in enumerate('xyz')],
+}  # fmt: skip
 IMAGE = {'height': 4, 'width': 4, 'encoding': 'rgb8', 'step': 12, 'data': np.zeros(48, np.uint8)}
+
+
+FIELDS: Mapping[str, Mapping[str, Any]] = {
+    'sensor_msgs/msg/Image': IMAGE,
+    'sensor_msgs/msg/CompressedImage': {
+        'format': 'jpeg', 'data': np.frombuffer(simplejpeg.encode_jpeg(np.zeros((8, 8, 3), np.uint8)), np.uint8),
+    },
+    'sensor_msgs/msg/PointCloud2': CLOUD,
+}  # fmt: skip
+
+
+def test_every_type_that_has_a_rule(processes: Processes) -> None:
+    """Each message of it is stored or left out by the rate, and none is rejected."""
+    kinds = [kind for kind in RULES if find_spec(kind.partition('/')[0])]
+    assert len(kinds) > 50
+    topics = {f'/topic_{number}': Sent(kind, FIELDS.get(kind, {}), 8, f'topic_{number}') for number, kind in enumerate(kinds)}
+    robot = Robot(processes, topics, robot='all')
+    robot.finish()
+    stored = robot.ask(processes, 'query', 'SELECT DISTINCT sensor FROM objects', '--robot', 'all')
+    assert {row['sensor'] for row in stored} >= {each.sensor for each in topics.values()}
 
 
 def test_a_drone(processes: Processes, tmp_path: Path) -> None:
@@ -184,8 +211,6 @@ def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
     Messages of unitree_go need the package; without it the log says how to build it, and all else is stored.
     """
     has_package = find_spec('unitree_go') is not None
-    fields = [STORE.types['sensor_msgs/msg/PointField'](name, 4 * place, 7, 1) for place, name in enumerate('xyz')]
-    cloud = {'height': 1, 'width': 1, 'point_step': 12, 'row_step': 12, 'data': np.zeros(12, np.uint8), 'fields': fields}
     pose = {'header.frame_id': 'odom', 'pose.pose.orientation.w': 1.0}
 
     def of_package(sensor: str) -> str:
@@ -194,7 +219,7 @@ def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
     robot = Robot(
         processes,
         {
-            '/utlidar/cloud': Sent('sensor_msgs/msg/PointCloud2', cloud, 1, 'lidar'),
+            '/utlidar/cloud': Sent('sensor_msgs/msg/PointCloud2', CLOUD, 1, 'lidar'),
             '/utlidar/imu': Sent('sensor_msgs/msg/Imu', {}, 1, 'imu'),
             '/utlidar/robot_odom': Sent('nav_msgs/msg/Odometry', pose, 1, 'odom'),
             '/lowstate': Sent('unitree_go/msg/LowState', {'bms_state.soc': 77}, 1, of_package('lowstate')),
