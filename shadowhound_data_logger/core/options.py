@@ -338,14 +338,6 @@ DEFAULT_SENSORS: Final[dict[str, dict[str, Any]]] = {
         'batch_s': 10.0, 'priority': 3,
         'statistics': ('imu_state', 'bms_state.soc', 'bms_state.current', 'foot_force', 'power_v', 'power_a', 'temperature_ntc1'),
     },
-    'remote': {
-        'topics': ('wirelesscontroller',), 'types': ('unitree_go/msg/WirelessController',), 'rate_hz': 0.0, 'batch_s': 1.0,
-        'priority': 4,
-    },
-    'video': {
-        'topics': ('frontvideostream',), 'types': ('unitree_go/msg/Go2FrontVideoData',), 'format': 'tar', 'rate_hz': 0.0,
-        'batch_s': 1.0, 'priority': 6,
-    },
     'cmd_vel': {
         'enabled': False, 'topics': ('cmd_vel',), 'types': ('geometry_msgs/msg/Twist',), 'rate_hz': 0.0, 'batch_s': 1.0,
         'priority': 3,

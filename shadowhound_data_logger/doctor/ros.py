@@ -50,8 +50,6 @@ STREAMS: Final = {
     'go2_states': Stream(20.0, reliable=True),
     'joint_states': Stream(50.0, reliable=True),
     'lowstate': Stream(20.0, optional=True),
-    'wirelesscontroller': Stream(0.0, optional=True),
-    'frontvideostream': Stream(0.0, optional=True),
     'utlidar/voxel_map_compressed': Stream(10.0, optional=True),
 }
 """By the topic's name in the settings."""

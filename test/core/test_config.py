@@ -31,8 +31,7 @@ def test_nothing_has_to_be_set() -> None:
     assert settings.spool_path == settings.home / 'spool'
     assert (settings.store.endpoint_url, settings.store.directory) == (None, settings.home / 'store')
     assert [sensor.name for sensor in settings.sensors] == [
-        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'remote', 'video', 'cmd_vel',
-        'voxel_map',
+        'camera', 'camera_info', 'lidar', 'imu', 'odom', 'states', 'joints', 'lowstate', 'cmd_vel', 'voxel_map',
     ]  # fmt: skip
     assert (settings.spool.max_bytes, settings.spool.min_free_bytes) == (20 * GIBI, 2 * GIBI)
     assert settings.shutdown.drain_s == 3.0

@@ -224,9 +224,9 @@ def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
             '/utlidar/robot_odom': Sent('nav_msgs/msg/Odometry', pose, 1, 'odom'),
             '/lowstate': Sent('unitree_go/msg/LowState', {'bms_state.soc': 77}, 1, of_package('lowstate')),
             '/sportmodestate': Sent('unitree_go/msg/SportModeState', {'body_height': 0.3}, 1, of_package('states')),
-            '/wirelesscontroller': Sent('unitree_go/msg/WirelessController', {'lx': 0.5}, 1, of_package('remote')),
+            '/wirelesscontroller': Sent('unitree_go/msg/WirelessController', {'lx': 0.5}, 1, of_package('wirelesscontroller')),
             '/frontvideostream': Sent('unitree_go/msg/Go2FrontVideoData', {'video720p': np.arange(9, dtype=np.uint8)}, 1,
-                                      of_package('video')),
+                                      of_package('frontvideostream')),
         },
         robot='go2', cyclone=True,
     )  # fmt: skip

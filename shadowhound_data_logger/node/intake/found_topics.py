@@ -12,7 +12,7 @@ from rclpy.node import Node
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.options import AUTO, DEFAULT_SENSORS
-from shadowhound_data_logger.core.type_rules import NOT_LOGGED, is_of_go2, not_logged, sensor_for
+from shadowhound_data_logger.core.type_rules import NOT_LOGGED, RULES, is_of_go2, not_logged, sensor_for
 from shadowhound_data_logger.node.intake.consumers import is_plain_name
 from shadowhound_data_logger.ros.reader import endpoints
 
@@ -69,7 +69,7 @@ class FoundTopics:
         has_settled = now_s - self._since_s >= SETTLE_S
         if has_settled and not self._has_told:
             self._tell_of_robots(graph)
-        if self._is_go2 or not has_settled:
+        if not has_settled:
             return
         left_out = dict(self.not_logged)
         for topic in sorted(filter(self._is_own, graph.keys() - self._named - self._seen - NOT_LOGGED)):
@@ -78,6 +78,8 @@ class FoundTopics:
                 continue
             self._seen.add(topic)
             type_name = publishers[0].type
+            if self._is_go2 and not (is_of_go2(type_name) and type_name in RULES):
+                continue
             latched = all(each.transient_local for each in publishers)
             sensor = sensor_for(topic, type_name, sensors.keys(), is_latched=latched)
             why = self._why_not(topic, type_name, sensor, graph)
