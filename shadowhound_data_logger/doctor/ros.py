@@ -25,8 +25,6 @@ from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.ros.endpoints import alternatives, logged_type
 
 if TYPE_CHECKING:
-    from rclpy.node import Node
-
     from shadowhound_data_logger.doctor.ros_watch import Heard
 
 
@@ -69,7 +67,7 @@ TOO_SLOW, TOO_LOSSY = 0.5, 0.1
 ENOUGH: Final = 4
 """Messages that have to be expected within the window for a rate to mean something."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
-TF, CLOCK = '/tf', '/clock'
+TF: Final = '/tf'
 STALE_S: Final = 5.0
 """Age of a transform that is still one of now: localization is late, and clocks of two machines differ."""
 DRIVER: Final = 'go2_interfaces'
@@ -90,7 +88,6 @@ def check(context: Context) -> Iterator[Result]:
     if listener is not None:
         listener.enter(os.environ)  # before ROS is loaded, as the node does
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
-    from shadowhound_data_logger.ros.reader import endpoints  # noqa: PLC0415 - as above
 
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
     with _profiled(listener), ros_watch.node(namespace=context.namespace) as node:
@@ -99,11 +96,13 @@ def check(context: Context) -> Iterator[Result]:
         found = ros_watch.discover(node, names)
         pairs = [pair for sensor in sensors for pair in zip(sensor.topics, sensor.types, strict=False)]
         types = {resolved[topic]: logged_type(found[resolved[topic]], name) for topic, name in pairs}
-        found |= {topic: publishers for topic in (TF,) if (publishers := endpoints(node, topic))}
+        if publishers := ros_watch.publishers_of(node, TF):
+            found[TF] = publishers
         heard = {one.topic: one for one in ros_watch.listen(node, found, WINDOW_S, types)} if any(found.values()) else {}
         others = [] if heard else list(ros_watch.published(node))
-        yield from _clock(node)
+        waiting = ros_watch.waiting_for_clock(node)
     packages = {each.type.partition('/')[0] for publishers in found.values() for each in publishers}
+    yield from _clock(waiting)
     yield from _types(sensors, packages if heard else packages | {DRIVER})
     if not heard:
         yield from _nobody(context, names, listener, others)
@@ -117,16 +116,13 @@ def check(context: Context) -> Iterator[Result]:
             yield from _sensor(sensor, topics, context.rates_hz)
 
 
-def _clock(node: Node) -> Iterator[Result]:
+def _clock(waiting: Sequence[str]) -> Iterator[Result]:
     """Nodes that take their time from a simulator that does not run."""
-    if node.count_publishers(CLOCK):
-        return
-    names = {f'{each.node_namespace.rstrip("/")}/{each.node_name}' for each in node.get_subscriptions_info_by_topic(CLOCK)}
-    if names:
-        shown = sorted(map(printable, names))[:MAX_SHOWN]
+    if waiting:
+        shown = [printable(name) for name in waiting[:MAX_SHOWN]]
         yield warning(
             'ros.clock',
-            f'{", ".join(shown)} use sim time, and nothing publishes {CLOCK}',
+            f'{", ".join(shown)} use sim time, and nothing publishes /clock',
             'the time of these nodes is 0: their messages are dated by arrival',
             f'start the simulator, or: ros2 param set {shown[0]} use_sim_time false',
         )

@@ -135,6 +135,18 @@ def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float, types: M
     return heard
 
 
+def publishers_of(of: Node, topic: str) -> list[Endpoint]:
+    """As the graph knows them now."""
+    return endpoints(of, topic)
+
+
+def waiting_for_clock(of: Node) -> list[str]:
+    """Full names of the nodes that use sim time while nothing publishes it."""
+    if of.count_publishers('/clock'):
+        return []
+    return sorted({_name(each) for each in of.get_subscriptions_info_by_topic('/clock')})
+
+
 def _readers(of: Node, one: Heard) -> list[Reader]:
     """As the logger would listen; where two kinds of publishers need two subscriptions, the first is enough to count."""
     publishers = [each for each in one.publishers if each.type == one.type]

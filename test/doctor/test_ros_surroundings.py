@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from shadowhound_data_logger.doctor import ros, ros_environment
+from shadowhound_data_logger.doctor import ros, ros_environment, ros_watch
 from shadowhound_data_logger.doctor.ros_watch import Heard
 
 STORE = get_typestore(Stores.LATEST)
@@ -27,7 +27,7 @@ def test_sim_time_without_a_clock(publishers: int, nodes: list[str], findings: i
     """Nodes that listen to /clock while nothing publishes it are named, with what to do."""
     asked = [SimpleNamespace(node_namespace='/', node_name=name) for name in nodes]
     node: Any = SimpleNamespace(count_publishers=lambda _: publishers, get_subscriptions_info_by_topic=lambda _: asked)
-    found = list(ros._clock(node))
+    found = list(ros._clock(ros_watch.waiting_for_clock(node)))
     assert len(found) == findings
     assert all('/nav2, /rviz use sim time' in each.seen and 'ros2 param set /nav2' in each.remedy for each in found)
 
@@ -44,12 +44,13 @@ def tf(age_s: float) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ('received', 'newest', 'is_finding'),
-    [(50, tf(0.1), False), (50, tf(60.0), True), (0, b'', True), (50, b'', False)],
+    ('received', 'age_s', 'is_finding'),
+    [(50, 0.1, False), (50, 60.0, True), (0, None, True), (50, None, False)],
     ids=['moving', 'old stamps', 'silent', 'unreadable'],
 )
-def test_frames_that_do_not_move(received: int, newest: bytes, is_finding: bool) -> None:
+def test_frames_that_do_not_move(received: int, age_s: float | None, is_finding: bool) -> None:
     """A publisher that is silent, or repeats old transforms."""
+    newest = b'' if age_s is None else tf(age_s)
     one = Heard('/tf', [], TRANSFORMS, received=received, newest=newest, window_s=2.5)
     assert checks(ros._transforms(one)) == [('ros.tf', is_finding)]
 
