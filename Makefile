@@ -40,7 +40,7 @@ format: setup ## let ruff repair and format what it can
 demo: setup ## a simulated Go2, an embedded Tower and one patrol mission, a minute and a half; DEMO_ARGS=--keep keeps its live page
 	scripts/with-env python -m shadowhound_sim.demo $(DEMO_ARGS)
 
-bench: setup ## benchmarks against the baseline, as ratios, into docs/performance.md; BENCH_ARGS=--quick is shorter
+bench: setup ## benchmarks against the baseline, as ratios, into docs/evidence/benchmarks.md; BENCH_ARGS=--quick is shorter
 	scripts/with-env python bench/run.py $(BENCH_ARGS)
 
 docs: setup ## write docs/parameters.md and docs/commands.md from the code, and build the documentation site into build/site

@@ -1,6 +1,6 @@
-"""Writes what the benchmarks found into docs/performance.md: tables between its markers, and the pictures.
+"""Writes what the benchmarks found into docs/evidence/benchmarks.md: tables between its markers, and the pictures.
 
-``python bench/_page.py`` does so from docs/performance.json, without measuring. No figure of the page is typed by hand.
+``python bench/_page.py`` does so from docs/evidence/benchmarks.json, without measuring. No figure of the page is typed by hand.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Final
 import _pictures
 from _report import show, spread
 
-DOCS: Final = Path(__file__).resolve().parents[1] / 'docs'
+DOCS: Final = Path(__file__).resolve().parents[1] / 'docs' / 'evidence'
 _BLOCK: Final = re.compile(r'(<!-- bench (\w+) -->\n).*?(<!-- end \2 -->)', re.DOTALL)
 _MACHINE: Final = {
     'when': 'measured', 'processor': 'processor', 'cores': 'cores', 'memory': 'memory', 'kernel': 'kernel', 'python': 'Python',
@@ -27,7 +27,7 @@ Figures = Mapping[str, Any]
 
 def write(results: Figures, template: Path, output: Path) -> None:
     """The page and its pictures."""
-    (output / 'performance.md').write_text(filled(template.read_text(encoding='utf-8'), results), encoding='utf-8')
+    (output / 'benchmarks.md').write_text(filled(template.read_text(encoding='utf-8'), results), encoding='utf-8')
     _pictures.draw({name: found['figures'] for name, found in results['benches'].items()}, output / 'images')
 
 
@@ -327,4 +327,4 @@ _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
 }  # fmt: skip
 
 if __name__ == '__main__':
-    write(json.loads((DOCS / 'performance.json').read_text(encoding='utf-8')), DOCS / 'performance.md', DOCS)
+    write(json.loads((DOCS / 'benchmarks.json').read_text(encoding='utf-8')), DOCS / 'benchmarks.md', DOCS)

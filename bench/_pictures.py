@@ -1,4 +1,4 @@
-"""The pictures of docs/performance.md, drawn from the figures of the benchmarks alone."""
+"""The pictures of docs/evidence/benchmarks.md, drawn from the figures of the benchmarks alone."""
 
 from __future__ import annotations
 

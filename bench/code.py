@@ -1,4 +1,4 @@
-"""How much code there is, and how much of it a reader opens to follow something: the table of docs/architecture.md.
+"""How much code there is, and how much of it a reader opens to follow something: the tables of docs/evidence/development.md.
 
 ``python bench/code.py [CHECKOUT]`` counts the package of a checkout, this one by default. ``--trails`` also runs its node and its
 MissionDataLogger with a profiler, in an environment with ROS: a module is on a trail when one of its functions is called more

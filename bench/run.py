@@ -1,4 +1,4 @@
-"""``make bench``: all benchmarks one after the other, then docs/performance.md with what they found.
+"""``make bench``: all benchmarks one after the other, then docs/evidence/benchmarks.md with what they found.
 
 About half an hour; ``--quick`` takes three or so and leaves docs/ alone. Exit code 1 when a bar is missed, or a benchmark
 fails (then docs/ stays as it is, too). Nothing else should run on the machine meanwhile.
@@ -24,8 +24,8 @@ import _proc
 from _report import FOLDER, LEROBOT, show, spread
 
 HERE: Final = Path(__file__).resolve().parent
-DOCS: Final = HERE.parent / 'docs'
-RESULTS: Final = 'performance.json'
+DOCS: Final = HERE.parent / 'docs' / 'evidence'
+RESULTS: Final = 'benchmarks.json'
 DRAIN_BAR: Final = 0.9
 
 
@@ -188,8 +188,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output = options.output or (DOCS if whole else options.folder / 'page')
     output.mkdir(parents=True, exist_ok=True)
     (output / RESULTS).write_text(_page.dump(results), encoding='utf-8')
-    _page.write(results, DOCS / 'performance.md', output)
-    print(f'{table(results)}\n\n{results["took_s"] / 60:.1f} minutes; {output}/performance.md')
+    _page.write(results, DOCS / 'benchmarks.md', output)
+    print(f'{table(results)}\n\n{results["took_s"] / 60:.1f} minutes; {output}/benchmarks.md')
     return 0 if held and is_complete else 1
 
 

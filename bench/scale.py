@@ -25,7 +25,7 @@ PART_S: Final = 60
 LISTED: Final = 1000
 """Keys a LIST answers, in S3."""
 PUTS_A_CORE: Final = 190
-"""Objects of 50 KB confirmed a second, for each of two cores that robot and store shared (docs/performance.md: 377)."""
+"""Objects of 50 KB confirmed a second, for each of two cores that robot and store shared (docs/evidence/benchmarks.md: 377)."""
 INDEX_BYTES: Final = 16
 """Memory of a SeaweedFS volume server for an object (its README, "O(1) disk read")."""
 FILER_BYTES: Final = 1073
@@ -98,16 +98,16 @@ HEADS: Final = {
     'flow': (
         'robots',
         'network, while they work',
-        'objects a second',
-        'objects a day',
-        'bytes a day',
-        'bytes a year',
+        'objects per second',
+        'objects per day',
+        'bytes per day',
+        'bytes per year',
         'cores that take it',
     ),
     'catalog': (
         'robots',
-        'rows a day',
-        'row files a day',
+        'rows per day',
+        'row files per day',
         'their size',
         'requests for a day of all',
         'in tables',
@@ -119,7 +119,7 @@ HEADS: Final = {
         "filer's metadata",
         "volume servers' memory",
         'PUTs',
-        'a month of keeping',
+        'storage per month',
         'reading all once',
     ),
 }

@@ -1,4 +1,4 @@
-"""docs/performance.md is what bench/_page.py makes of docs/performance.json."""
+"""docs/evidence/benchmarks.md is what bench/_page.py makes of docs/evidence/benchmarks.json."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGE, FIGURES = ROOT / 'docs/performance.md', ROOT / 'docs/performance.json'
+PAGE, FIGURES = ROOT / 'docs/evidence/benchmarks.md', ROOT / 'docs/evidence/benchmarks.json'
 
 
 @pytest.fixture

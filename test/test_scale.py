@@ -55,7 +55,7 @@ def test_what_keeping_everything_takes(scale: Any) -> None:
     seconds, page = 7 * 8 * 3600, scale.PAGE.read_text(encoding='utf-8')
     rate = scale.PROFILES[2].bytes_s
     assert f'about {8e-6 * rate:.0f} Mbit/s' in page
-    assert f'{rate * seconds / 7e9:.0f} GB a day and {rate * seconds / 1e12:.1f} TB a week' in page
+    assert f'{rate * seconds / 7e9:.0f} GB per day and {rate * seconds / 1e12:.1f} TB per week' in page
     assert f'{800e9 * 7 / (rate * seconds):.0f}' == '6'
     assert '800 GB holds six days' in page
     assert f'{8 * PREVIEW_BYTES / 1e3:.0f} kbit/s and {PREVIEW_BYTES * seconds / 1e9:.0f} GB of that week' in page

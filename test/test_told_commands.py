@@ -27,7 +27,8 @@ SERVICES: Final = {
 
 def told(pattern: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str]]]:
     """Each match, with where it stands."""
-    files = [ROOT / 'README.md', *ROOT.glob('docs/**/*.md'), *ROOT.glob('launch_configs/*'), *ROOT.glob('tower/*')]
+    pages = [page for page in ROOT.glob('docs/**/*.md') if page.parent.name != 'evidence']  # records of what was run then
+    files = [ROOT / 'README.md', *pages, *ROOT.glob('launch_configs/*'), *ROOT.glob('tower/*')]
     for path in (*files, *ROOT.glob('shadowhound_data_logger/**/*.py')):
         if path.is_file():
             text = path.read_text(encoding='utf-8')

@@ -138,7 +138,7 @@ SECTIONS: Final = (
     ),
     Section(
         'Limit uploads',
-        'By bandwidth, or by a rule such as `lowstate:bms_state.soc > 30 and wifi.ssid == "lab"` '
+        'By bandwidth, or by a rule such as `battery_state:percentage > 0.3 and wifi.ssid == "lab"` '
         '([how](operation.md#upload-when-it-suits)).',
         ('upload.max_mbps', 'upload.when', 'events.when', 'keep.when'),
     ),
@@ -267,7 +267,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ('AWS_PROFILE', '`default`', 'The section of that file.'),
     ('HTTP_PROXY', '', 'The proxy for `http://` servers, as for `curl`; `HTTPS_PROXY` for `https://`. `ALL_PROXY` is ignored.'),
     ('NO_PROXY', '', 'Hosts without a proxy: names, ends of names, `host:port`, `*`; networks such as `10.0.0.0/8` are ignored.'),
-    ('AWS_CA_BUNDLE', "the system's", 'Certificate of your own authority, for the S3 server ([TLS](thor.md#tls)).'),
+    ('AWS_CA_BUNDLE', "the system's", 'Certificate of your authority, for the S3 server ([TLS](thor.md#tls)).'),
     ('REQUESTS_CA_BUNDLE', '', 'The same, for the S3 server and MLflow.'),
     (
         'MLFLOW_TRACKING_URI',
@@ -276,7 +276,7 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     ('MLFLOW_TRACKING_USERNAME', '', 'The user name for it; otherwise from `~/.mlflow/credentials`.'),
     ('MLFLOW_TRACKING_PASSWORD', '', 'The password.'),
-    ('MLFLOW_TRACKING_SERVER_CERT_PATH', '', 'Certificate of your own authority, for MLflow.'),
+    ('MLFLOW_TRACKING_SERVER_CERT_PATH', '', 'Certificate of your authority, for MLflow.'),
     ('MLFLOW_S3_ENDPOINT_URL', '`AWS_ENDPOINT_URL`', 'The S3 server of artifacts, if MLflow does not proxy them.'),
     ('ROS_DOMAIN_ID', '`0`', "That of the robot's driver."),
     ('RMW_IMPLEMENTATION', 'that of ROS', "The robot's middleware ([how](thor.md#4-middleware))."),

@@ -56,7 +56,7 @@ class SensorSettings:
     on_change: bool = _setting(False, 'Keep a message only when its content, apart from its stamp, differs from the last one.')
     batch_s: float = _setting(0.0, 'Seconds of messages in one object; 0 makes an object of each message.', low=0.0, high=3600.0)
     format: str = _setting('json', 'File format of an object; zip and tar hold several messages.', choices=FORMATS)
-    quality: int = _setting(85, 'JPEG quality where an image has to be encoded.', low=1, high=100, live=True)
+    quality: int = _setting(85, 'JPEG quality if an image must be encoded.', low=1, high=100, live=True)
     bucket: str = _setting('sensor-data', 'Bucket of its objects.')
     key: str = _setting('{robot}/{sensor}/{date}/{time}_{sensor}.{ext}', 'Key of an object; {date} and {time} are UTC.')
     dedup: bool = _setting(False, 'Store content that repeats, byte for byte, only once; the repeats stay in the catalog.')
@@ -93,7 +93,7 @@ class CaptureSettings:
 
     rmw: str = _setting(
         RMW_AUTO,
-        "RMW to listen with: the robot's own, fastrtps, or auto (fastrtps where that hears as much as Cyclone DDS).",
+        "RMW to listen with: the robot's own, fastrtps, or auto (fastrtps where that receives as much as Cyclone DDS).",
         choices=(RMW_AUTO, RMW_ROBOT, RMW_FASTRTPS),
     )
     topics: str = _setting(
@@ -135,12 +135,12 @@ class KeepSettings:
     )
     days: float = _setting(14.0, 'Days to keep them.', low=0.01, high=3650.0)
     thin_to_hz: float = _setting(
-        1.0, 'Once room runs short, old pictures and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
+        1.0, 'Once space runs short, old images and clouds are thinned to this rate before any are evicted; 0: never.', low=0.0,
         high=1000.0
     )  # fmt: skip
     missions: tuple[str, ...] = _setting(('',), 'Types of missions of which everything is uploaded always.')
     preview_s: float = _setting(
-        1.0, 'Seconds between two small pictures of a camera that are uploaded at once; 0 makes none.', low=0.0, high=3600.0
+        1.0, 'Seconds between two previews of a camera, which are uploaded immediately; 0 makes none.', low=0.0, high=3600.0
     )
     poll_s: float = _setting(10.0, 'Seconds between two looks at requests.', low=0.5, high=3600.0)
     when: str = _setting('', 'Upload requested objects only while this rule is true; empty: always.')
@@ -211,7 +211,7 @@ class MissionSettings:
     )
     frames: str = _setting(
         'camera|sensor_msgs/msg/CompressedImage|sensor_msgs/msg/Image',
-        'Sensor or message type whose pictures become frames of the run; alternatives separated by |; empty for none.',
+        'Sensor or message type with the images that become frames of the run; alternatives separated by |; empty for none.',
     )
     frame_every_s: float = _setting(5.0, 'Seconds between two of these frames.', low=0.0, high=1e6)
 
