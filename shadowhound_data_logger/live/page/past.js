@@ -9,6 +9,7 @@ export const past = signal(null); // null: now; else { robot, at, mission, shown
 export const range = signal(null); // what the timeline shows of the past: { robot, from, to }
 export const told = signal(null); // the timeline's answer
 export const problem = signal('');
+export const timelineProblem = signal('');
 export const busy = signal(false);
 export const playing = signal(false);
 export const speed = signal(1);
@@ -97,10 +98,11 @@ export function showBy(chosen) {
 }
 
 export function leave() {
+  opening += 1;
   batch(() => {
     past.value = range.value = told.value = selection.value = wanted = sought = null;
     playing.value = false;
-    problem.value = '';
+    problem.value = timelineProblem.value = '';
   });
 }
 
@@ -124,11 +126,11 @@ async function seek() {
       batch(() => {
         if (more.fit && !sought) range.value = { robot, from: found.from, to: found.to };
         told.value = { ...found, robot };
-        problem.value = '';
+        timelineProblem.value = '';
       });
       if (found.labels) setTimeout(() => { if (range.value && !sought) look(range.value.robot, range.value.from, range.value.to); }, 1000);
     } catch (error) {
-      if (!sought) problem.value = reason(error);
+      if (!sought) timelineProblem.value = reason(error);
     }
   }
 }
@@ -176,10 +178,14 @@ export async function openDay(robot, day) {
   go(robot, last || from + DAY_MS / 2);
 }
 
+const AGAIN_MS = 3000;
+let opening = 0;
 export async function openRobot(robot) {
+  const mine = (opening += 1);
   const chosen = await list(robot);
-  if (chosen === null) return;
-  if (days.value.length) await openDay(chosen, days.value[0]);
+  if (chosen === null) { // the process that reads the past may take long to start on a busy machine
+    setTimeout(() => { if (mine === opening) openRobot(robot); }, AGAIN_MS);
+  } else if (days.value.length) await openDay(chosen, days.value[0]);
   else problem.value = `nothing of ${chosen} is stored yet`;
 }
 

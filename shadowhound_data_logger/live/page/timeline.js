@@ -5,7 +5,7 @@ import { GapWords } from './gaps.js';
 import { Losses } from './losses.js';
 import {
   busy, clock as shownBy, days, go, leave, list, look, openDay, openRobot, pan, past, playing, problem as pastProblem, range, robots, selection, showBy, spanOf, speed,
-  timeline, told, zoom,
+  timeline, timelineProblem, told, zoom,
 } from './past.js';
 import { Pull } from './pull.js';
 import { clock, digits, meaning, moment, shade, span, volume } from './words.js';
@@ -267,7 +267,7 @@ export function Timeline({ session }) {
   }, []);
 
   const found = isPast ? told.value ?? today : today;
-  const problem = isPast ? pastProblem.value : failed;
+  const problem = isPast ? timelineProblem.value || pastProblem.value : failed;
   const robot = range.value?.robot ?? past.value?.robot ?? session.robot;
   const gaps = useMemo(() => named(found), [found]);
   const { now = 0 } = found ?? {};
