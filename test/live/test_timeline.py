@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -12,7 +14,8 @@ import pytest
 from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, add_part, folder_store
 from live.test_history import bag, patrol
-from live.test_page import CAUSES, CHROMIUM, FLAGS, HOSTILE, Served, fits, holds, opened, press
+from live.test_page import CAUSES, CHROMIUM, FLAGS, HOSTILE, IMU, Served, fits, holds, opened, press
+from spool.making import FakeClock, make, new_spool, put
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.options import UploadSettings
@@ -84,6 +87,7 @@ def shown(page: Page) -> tuple[int, int, int]:
 def at(page: Page, ms: float) -> tuple[float, float]:
     """Where a time is on the screen, on the last row of the timeline."""
     begin, end, _ = shown(page)
+    page.locator('svg[role=slider]').scroll_into_view_if_needed()
     box = page.locator('svg[role=slider]').bounding_box()
     assert box is not None
     return box['x'] + 150 + (ms - begin) / (end - begin) * (box['width'] - 158), box['y'] + box['height'] - 40
@@ -193,3 +197,73 @@ def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_
         page.keyboard.press(key)
     length = '(([from, to]) => to - from)((document.querySelector("[data-selected]")?.dataset.selected ?? "0 0").split(" "))'
     holds(page, f'{length} === 3000')
+
+
+@in_chromium
+def test_losses_are_shown_until_somebody_has_seen_them(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the last day, or since they were acknowledged, which this browser keeps; the row of the topic is no alarm any more."""
+    now_ms = time.time() * 1e3
+    columns = ['sink', 'topic', 'kind', 'cause', 'from', 'to', 'count', 'grade']
+    gaps = [['objects', '/imu', 'missed', 'restart', now_ms - 600_000, now_ms - 590_000, 12, 'exact'],
+            ['bags', '/imu', 'missed', 'restart', now_ms - 600_000, now_ms - 590_000, 12, 'exact']]  # fmt: skip
+    told = {'from': now_ms - 3.6e6, 'to': now_ms, 'now': now_ms, 'columns': columns, 'gaps': gaps, 'known': []}
+    row = {'topic': '/imu', 'type': IMU, 'sensor': 'imu', 'missed': 12, 'missed_estimated': None, 'unavailable': '', 'lost': 0,
+           'rate_hz': 50.0, 'age_s': 0.01, 'publishers': 1, 'may_be_silent': False, 'received': 99, 'stored': 99}  # fmt: skip
+    figures = {'robot': 'thor', 'state': 'running', 'age_s': 0.1, 'paused': False, 'queue': {}, 'findings': [], 'balanced': True,
+               'spool': {}, 'store': {}, 'objects': {}, 'bytes': {}, 'topics': [row]}  # fmt: skip
+    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
+    try:
+        monkeypatch.setattr(served.server._figures, 'now', lambda **_: figures)
+        monkeypatch.setattr(served.server._figures, 'gaps', lambda *_: told)
+        page = opened(browser, served.server.url)
+        holds(page, 'document.querySelector("[data-losses]")?.dataset.losses === "12"')
+        assert 'The node was not running' in page.locator('[data-losses]').inner_text()
+        lossy = 'document.querySelectorAll(\'td[data-topic="/imu"].lossy\').length'
+        holds(page, f'{lossy} === 1')
+        press(page.get_by_role('button', name='I have seen them'))
+        holds(page, 'document.querySelector("[data-losses]").dataset.losses === "0"')
+        holds(page, f'{lossy} === 0')
+        page.reload()
+        holds(page, 'document.querySelector("[data-losses]")?.dataset.losses === "0"')
+        assert page.wrong == []  # type: ignore[attr-defined]
+        page.close()
+    finally:
+        served.close()
+
+
+@in_chromium
+def test_the_live_view_begins_with_what_was_recorded(browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plots and path of the time before the page was opened, from the spool, though nothing comes now."""
+    monkeypatch.setenv('SHADOWHOUND_HOME', str(tmp_path))
+    spool = new_spool(tmp_path / 'spool', FakeClock())
+    spool.open()
+    now_ns = time.time_ns()
+    try:
+        for second in range(20):
+            at_ns = now_ns - (20 - second) * SECOND
+            vector, turn = {'x': 1.0, 'y': 2.0, 'z': 9.5}, {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
+            unknown = {f'{each}_covariance': [0.0] * 9 for each in ('orientation', 'angular_velocity', 'linear_acceleration')}
+            sample = {
+                'stamp_ns': at_ns,
+                'orientation': turn,
+                'angular_velocity': vector,
+                'linear_acceleration': vector,
+                **unknown,
+            }
+            metadata = {'received_start_ns': str(at_ns), 'received_end_ns': str(at_ns), 'pose': f'{second}.0 1.0 0.5 odom'}
+            body = json.dumps({'type': IMU, 'samples': [sample]}).encode()
+            put(spool, make(f'thor/imu/{utc(at_ns):%Y%m%d/%H%M%S}_imu.json', body, sensor='imu', topic='/imu', type=IMU,
+                            t_start_ns=at_ns, t_end_ns=at_ns, metadata=metadata))  # fmt: skip
+    finally:
+        spool.close()
+    served = Served(LiveSettings(spool=tmp_path / 'spool', robot='thor', tokens=tmp_path / 'live', port=0), monkeypatch)
+    try:
+        served.loop.call_soon_threadsafe(served.server.viewers.on_graph, {'/imu': (IMU, 1)})
+        page = opened(browser, served.server.url)
+        holds(page, 'window.shadowhound?.prefilled >= 2')
+        shown = '[...document.querySelectorAll("section[aria-label=Acceleration] .legend b")].map(one => one.textContent)[2]'
+        holds(page, f'{shown} === "9.5"')
+        assert page.wrong == []  # type: ignore[attr-defined]
+        page.close()
+    finally:
+        served.close()

@@ -2,6 +2,7 @@
 import { html, signal, useState } from './vendor/preact.js';
 import { Message, inspected, measured } from './message.js';
 import { total, topics } from './state.js';
+import { unseen } from './losses.js';
 import { digits, span, volume } from './words.js';
 
 const COLUMNS = [
@@ -16,8 +17,9 @@ const SEARCHED = 12; // more rows than these get a search box
 
 function state(row) {
   if (row.unavailable) return ['bad', row.unavailable];
-  if (row.lost) return ['bad', `${row.lost} messages were rejected or dropped`];
-  if (row.missed || row.missed_estimated) return ['watch', `${row.missed ?? row.missed_estimated} messages were missed`];
+  const isNew = unseen(row.topic) !== 0; // what somebody has seen, or what is a day old, is no alarm
+  if (row.lost && isNew) return ['bad', `${row.lost} messages were rejected or dropped`];
+  if ((row.missed || row.missed_estimated) && isNew) return ['watch', `${row.missed ?? row.missed_estimated} messages were missed`];
   if (row.stamps) return ['watch', row.stamps];
   if (row.publishers === 0) return ['none', MARKS.none[1]];
   if (!row.isLogged) return ['idle', MARKS.idle[1]];
@@ -80,7 +82,7 @@ export function TopicTable({ figures, now }) {
           <td><button type="button" class="topic" aria-expanded=${isOpen} data-inspect=${row.topic} title="Show the newest message" onClick=${() => { inspected.value = isOpen ? null : row.topic; }}><b>${row.topic}</b></button>
             <small>${row.publishers === 0 ? 'nobody publishes this · ' : row.isLogged ? `${row.sensor || '–'} · ` : 'not logged · '}<span title=${row.type}>${row.type.split('/').at(-1)}</span></small>
             ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps">${row.stamps}</small>`}</td>
-          ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`,
+          ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`,
         isOpen && html`<tr key=${`${row.topic}#`} class="inspected"><td></td><td colspan=${COLUMNS.length + 1}><${Message} key=${row.topic} topic=${row.topic} /></td></tr>`];
       })}</tbody></table></div>
     ${found.length > shown.length && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${found.length}</button>`}

@@ -418,7 +418,7 @@ export function Timeline({ session }) {
   }), [found, from, to, width, top, now]);
   const wait = (each) => `recorded ${clock(each[0])} to ${clock(each[1])}, ${each[2] === null ? 'not all of it is delivered yet' : `delivered until ${clock(each[2])}`}`;
 
-  return html`${isPast && (!session.has_live || robots.value.length > 1) && html`<${Fleet} chosen=${robot} />`}<div class="panel timeline">
+  return html`${isPast && robots.value.length > 1 && html`<${Fleet} chosen=${robot} names=${robots.value} />`}<div class="panel timeline">
     <div class="panel-head">
       <h3>${isPast ? 'Back in time' : minutes ? `The last ${span((to - from) / 1000)}` : 'Today'} <span class="unit">UTC</span></h3>
       ${isPast && html`${robots.value.length > 1 && html`<select aria-label="Robot" value=${robot} onChange=${(event) => openRobot(event.target.value)}>${robots.value.map((each) => html`<option>${each}</option>`)}</select>`}
@@ -491,5 +491,5 @@ export function Timeline({ session }) {
     ${gaps.length > 0 && html`<details><summary>All ${gaps.length} gaps as a table</summary><div class="scroll"><table class="gaps-table"><thead><tr><th>Topic</th><th>From</th><th class="n">For</th>
       <th class="n">Messages</th><th>What</th><th>Cause</th></tr></thead><tbody>${gaps.slice(-500).map((gap) => html`<tr><td>${gap.topic}</td><td><button type="button" class="link" onClick=${() => show(gap)}>${clock(gap.from)}</button></td>
       <td class="n">${span((gap.to - gap.from) / 1000)}</td><td class="n">${digits(gap.count)}</td><td>${gap.kind}</td><td>${gap.cause.replaceAll('_', ' ')}</td></tr>`)}</tbody></table></div></details>`}
-  </div>`;
+  </div>${isPast && !session.has_live && robots.value.length === 1 && html`<${Fleet} chosen=${robot} names=${robots.value} />`}`;
 }
