@@ -114,11 +114,13 @@ export async function spanOf(robot, from, to) {
   return (await ask('range', { robot, from: Math.round(from), to: Math.round(to), by: clock.value })).json();
 }
 
+const AGAIN_MS = 3000;
+const MOST_TRIES = 3;
 let sought = null; // the range that is asked for next: however fast somebody zooms, one question is open at a time
 let seeking = null;
 async function seek() {
   while (sought) {
-    const { robot, from, to, more } = sought;
+    const { robot, from, to, more, tries } = sought;
     sought = null;
     try {
       const found = await timeline(robot, from, to, more);
@@ -130,14 +132,17 @@ async function seek() {
       });
       if (found.labels) setTimeout(() => { if (range.value && !sought) look(range.value.robot, range.value.from, range.value.to); }, 1000);
     } catch (error) {
-      if (!sought) timelineProblem.value = reason(error);
+      if (sought) continue;
+      timelineProblem.value = reason(error);
+      const asked = range.value;
+      if (tries < MOST_TRIES) setTimeout(() => { if (range.value === asked && asked !== null) look(robot, from, to, more, tries + 1); }, AGAIN_MS);
     }
   }
 }
 
-export function look(robot, from, to, more = {}) {
+export function look(robot, from, to, more = {}, tries = 0) {
   range.value = { robot, from, to };
-  sought = { robot, from, to, more };
+  sought = { robot, from, to, more, tries };
   seeking ??= seek().finally(() => { seeking = null; });
   return seeking;
 }
@@ -178,7 +183,6 @@ export async function openDay(robot, day) {
   go(robot, last || from + DAY_MS / 2);
 }
 
-const AGAIN_MS = 3000;
 let opening = 0;
 export async function openRobot(robot) {
   const mine = (opening += 1);
