@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'shadowhound_data_logger'
-DONE = ('formats/**/*.py', 'missions/*.py', 'policies/*.py')
+DONE = ('bags/*.py', 'formats/**/*.py', 'missions/*.py', 'policies/*.py')
 """The modules of the package that have been rewritten. Add a folder when it is done."""
 IDIOMS = {
     r'\b(un)?told\b|\btells?\b|\bsaid\b': 'reported, recorded, contains, states',
@@ -26,7 +26,7 @@ IDIOMS = {
     r'\b(nobody|somebody|someone|anybody|anyone else|whoever)\b': 'name the role: the operator, a client, another process',
     r'\bshall\b': 'should, must',
     r'\bto effect\b': 'effectively exactly once',
-    r'\bas (it|they) (is|are|came|was|were)\b(?! in\b)': 'unchanged, verbatim, in arrival order',
+    r'\bas (it|they) (is|are|came|was|were)\b(?! (in|\w+ed)\b)': 'unchanged, verbatim, in arrival order',
     r'\bfor (good|ever)\b': 'permanently, indefinitely',
     r'\bby (itself|themselves)\b': 'automatically, on its own',
     r'\bof (its|their) own\b': 'its own X, a separate X',
@@ -35,26 +35,28 @@ IDIOMS = {
     r'\bgoes on\b|\bgo on\b': 'continues',
     r'\bbeside\b': 'next to, in addition to',
     r'\ball the same\b': 'anyway, nevertheless',
-    r'\bhad to be\b|\bhas to be\b|\bhave to be\b|\b(is|are) to be\b': 'must be',
-    r'\bof which\b|\bby which\b|\bfor whom\b|\bwith which\b': 'use a verb',
+    r'(?<!would )\b(has|have) to be\b|\b(is|are) to be\b': 'must be',
+    r'\bof which\b|\bby which\b|\bfor whom\b': 'use a verb',
     r'\bLife:': 'Lifecycle:',
     r'\b(catalogue|colour|grey|metre|journalled|behaviour|centre|neighbour)\w*': 'the American spelling',
     r'\b(a row|a line|one) a (row|line|message|point|pixel|second|day|format|object)\b': 'per',
     r'\bis not judged\b|\bknows nothing of\b|\bis known of\b': 'is not checked, does not depend on, is known about',
 }
 """A pattern -> what to write instead."""
+CODE = re.compile(r'``.*?``|`[^`\n]*`')
 FILES = sorted(path for pattern in DONE for path in PACKAGE.glob(pattern))
 
 
 def prose(path: Path) -> Iterator[tuple[int, str]]:
-    """(line, text) of each docstring and comment, without the code in backticks."""
+    """(line, text) of each docstring and comment, without code in backticks and, in a module's docstring, indented code."""
     source = path.read_text(encoding='utf-8')
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            yield node.lineno, re.sub(r'`[^`]*`', '', node.value.value)
+            text = re.sub(r'\n {4}[^\n]*', '\n', node.value.value) if not node.col_offset else node.value.value
+            yield node.lineno, CODE.sub('', text)
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
-            yield token.start[0], re.sub(r'`[^`]*`', '', token.string)
+            yield token.start[0], CODE.sub('', token.string)
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(PACKAGE)))

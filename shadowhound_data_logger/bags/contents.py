@@ -1,6 +1,6 @@
-"""The files of a bag as one sequence of messages, whatever their storage: MCAP in a folder or a store, SQLite and packed files.
+"""The files of a bag as one sequence of messages, for any storage: MCAP in a folder or a store, SQLite and packed files.
 
-Everything that reads a bag opens it here, so `info`, `cut`, `verify` and `upload` agree on what it holds: what its files hold.
+All code that reads bags opens them here, so `info`, `cut`, `verify` and `upload` agree: a bag contains what its files contain.
 ``metadata.yaml`` is a claim that is compared with them.
 """
 
@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
-from shadowhound_data_logger.bags.description import Description, of_files, of_manifest, of_metadata
+from shadowhound_data_logger.bags.description import Description, describe_files, describe_manifest, describe_metadata
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural_key
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
@@ -32,15 +32,15 @@ from shadowhound_data_logger.formats.mcap.rosbag2_metadata import qos_in_numbers
 from shadowhound_data_logger.formats.mcap.slice_info import Channel, SliceInfo
 
 THREADS: Final = 8
-"""Files that are opened at a time."""
+"""Number of files that are opened concurrently."""
 PIECE_BYTES: Final = 1 << 20
-MOST_RATIO: Final = 1000
-"""Of a file that is unpacked onto the disk, to what it is packed; half of the disk's free room is never exceeded."""
+MAX_RATIO: Final = 1000
+"""Maximum ratio of an unpacked file to the packed one. An unpacked file never takes more than half of the free disk space."""
 OWN_METADATA: Final = frozenset({'rosbag2', 'shadowhound_recording'})
-"""Metadata records that every writer makes for its own file."""
+"""Metadata records that describe the file itself, so they are not copied."""
 NOT_READ: Final = 'these figures are from metadata.yaml alone: the files cannot be read in the store; fetch the bag to check them'
 WAL_HEADER_BYTES: Final = 32
-"""Of SQLite's write-ahead log, without content."""
+"""Size of an empty write-ahead log of SQLite."""
 ZSTD_MAGIC: Final = b'\x28\xb5\x2f\xfd'
 _TABLES: Final = {'messages', 'topics', 'schema', 'metadata', 'message_definitions'}
 _LATEST_NS: Final = 1 << 63
@@ -51,23 +51,23 @@ class BagFile(Protocol):
 
     @property
     def profile(self) -> str:
-        """The profile of its messages, as in the header of MCAP. Raises BagDamaged, as do the others."""
+        """The profile of its messages, as in the header of MCAP. All members raise BagDamaged."""
 
     @property
     def info(self) -> SliceInfo: ...
 
     @property
     def extras(self) -> int:
-        """Attachments and metadata records, which are not messages."""
+        """The number of attachments and metadata records."""
 
     def check(self) -> SliceInfo:
-        """The same as ``info``, after the checks that the storage itself offers."""
+        """Returns ``info`` after running the checks that the storage offers."""
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]: ...
 
 
 class McapFile:
-    """An MCAP file on the disk or in a store, opened when something of it is needed, by its summary first."""
+    """An MCAP file on the disk or in a store; opened on first use, summary first."""
 
     def __init__(self, source: Ranged) -> None:
         self._source = source
@@ -96,9 +96,9 @@ class McapFile:
 
 
 class SqliteFile:
-    """A file of rosbag2's SQLite storage, of any version. It has one time for each message, that of its arrival, used for both.
+    """A file of rosbag2's SQLite storage, of any version. Its messages have only an arrival time, which is used for both times.
 
-    Its tables are checked before anything is read from them: a view would be a program of whoever wrote the file.
+    Its tables are checked before they are read: a view would execute code that the file's author chose.
     """
 
     profile = ROS2
@@ -112,10 +112,10 @@ class SqliteFile:
         for suffix in ('-wal', '-journal'):
             rest = self._path.with_name(self._path.name + suffix)
             if rest.exists() and rest.stat().st_size > WAL_HEADER_BYTES:
-                text = f'{self._path} was not closed: {rest.name} has messages that are not in it'
+                text = f'{self._path} was not closed: {rest.name} may have messages that are not in it'
                 raise BagDamaged(text, path=str(self._path))
         check_tables(self._path)
-        with self._opened() as database:
+        with self._open_database() as database:
             columns = {str(name) for _, name, *_ in database.execute('PRAGMA table_info(topics)')}
             wanted = [name if name in columns else "''" for name in ('offered_qos_profiles', 'type_description_hash')]
             topics = database.execute(f'SELECT id, name, type, serialization_format, {", ".join(wanted)} FROM topics').fetchall()  # noqa: S608 - of the two above
@@ -128,7 +128,7 @@ class SqliteFile:
     @cached_property
     def info(self) -> SliceInfo:
         channels = self._channels
-        with self._opened() as database:
+        with self._open_database() as database:
             query = 'SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id'
             rows = database.execute(query).fetchall()
             for number, _, *times in rows:
@@ -146,7 +146,7 @@ class SqliteFile:
 
     def check(self) -> SliceInfo:
         check_tables(self._path)
-        with self._opened() as database:
+        with self._open_database() as database:
             answer = database.execute('PRAGMA quick_check(1)').fetchone()[0]
             if answer != 'ok':
                 raise ValueError(str(answer))
@@ -160,14 +160,14 @@ class SqliteFile:
             'ORDER BY timestamp, id'
         )
         first, last = max(wanted.start_ns, 0), min(wanted.end_ns, _LATEST_NS) - 1
-        with self._opened() as database:
+        with self._open_database() as database:
             for number, log_ns, data in database.execute(query, (first, last, *chosen)):
                 if not isinstance(data, bytes):
                     raise TypeError('a message has no content')
                 yield RecordedMessage(chosen[number], _time(log_ns), log_ns, 0, data)
 
     @contextmanager
-    def _opened(self) -> Iterator[sqlite3.Connection]:
+    def _open_database(self) -> Iterator[sqlite3.Connection]:
         try:
             with closing(sqlite3.connect(f'{self._path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
                 yield database
@@ -176,7 +176,7 @@ class SqliteFile:
 
 
 class PackedFile:
-    """A file that rosbag2 compressed as a whole. It is unpacked into a temporary folder each time it is needed."""
+    """A file that rosbag2 compressed as a whole. It is unpacked into a temporary folder on each use."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -212,11 +212,11 @@ class PackedFile:
         with tempfile.TemporaryDirectory(prefix='shadowhound-bag-') as folder:
             whole = Path(folder, self._path.stem)
             _unpack(self._path, whole)
-            yield opened(LocalFile(whole))
+            yield open_bag_file(LocalFile(whole))
 
 
-def opened(source: Ranged) -> BagFile:
-    """By the name of the file; SQLite and packed files are read from the disk."""
+def open_bag_file(source: Ranged) -> BagFile:
+    """The reader for a file, selected by its name; SQLite and packed files must be on the disk."""
     if isinstance(source, LocalFile) and source.name.endswith(PACKED):
         return PackedFile(source.path)
     if isinstance(source, LocalFile) and source.name.endswith(SQLITE):
@@ -243,7 +243,7 @@ class BagReader:
         self._damaged: dict[str, BagDamaged] = {}
         for name, source in sources.items():
             try:
-                self._parts[name] = opened(source)
+                self._parts[name] = open_bag_file(source)
             except BagDamaged as error:
                 self._damaged[name] = error
         self._infos: dict[str, SliceInfo] = {}
@@ -255,15 +255,15 @@ class BagReader:
         return {name: reason(error, self._names[name]) for name, error in self._damaged.items()}
 
     def describe(self) -> Description:
-        """By all files, or by the manifest if it knows all of them. Raises BagDamaged if none can be read."""
+        """The contents from all files, or from the manifest if it lists all of them. Raises BagDamaged if none is readable."""
         is_recorded = self._recorded.keys() >= {*self._parts, *self._damaged}
         if self.claimed is not None and self._manifest is not None and is_recorded:
-            return of_manifest(self._manifest, self._parts, self.claimed)
+            return describe_manifest(self._manifest, self._parts, self.claimed)
         infos = self.infos()
-        return of_files(infos, self.damaged, self.claimed)
+        return describe_files(infos, self.damaged, self.claimed)
 
     def infos(self) -> Mapping[str, SliceInfo]:
-        """What each file holds, of those that can be read. Raises BagDamaged if none can."""
+        """The contents of each readable file. Raises BagDamaged if none is readable."""
         self._open(list(self._parts))
         if not self._infos:
             self.check()
@@ -275,7 +275,7 @@ class BagReader:
             raise error
 
     def profile(self) -> str:
-        """Of the first file that can be read."""
+        """The profile of the first readable file."""
         for name, part in self._parts.items():
             if name not in self._damaged:
                 try:
@@ -285,20 +285,20 @@ class BagReader:
         return ROS2
 
     def extras(self) -> int:
-        """Attachments and metadata records in the files that were opened."""
+        """The number of attachments and metadata records in the files that were opened."""
         return sum(self._parts[name].extras for name in self._infos)
 
     def messages(self, wanted: MessageFilter) -> Iterator[RecordedMessage]:
-        """In the order of the files, and within each in its order; SQLite by time."""
+        """The messages in the order of the files, and within each file in file order (SQLite: by time)."""
         names = [name for name in self._parts if self._may_have(name, wanted)]
         self._open(names)
         for name in names:
             if name in self._infos:
                 for message in self._parts[name].messages(wanted):
-                    yield self._plain(message, name)
+                    yield self._decompressed(message, name)
 
     def latched_since(self, before_ns: int) -> int:
-        """From when on everything that is latched at a time can be read: the start of the file of that time, if it repeats it."""
+        """Read from this time on to find all messages latched at ``before_ns``: the start of its file, if that repeats them."""
         for name in reversed(list(self._parts)):
             if name not in self._recorded:
                 self._open([name])
@@ -308,7 +308,7 @@ class BagReader:
         return 0
 
     def _open(self, names: Sequence[str]) -> None:
-        """Several at a time."""
+        """Open files concurrently."""
 
         def one(name: str) -> None:
             try:
@@ -326,8 +326,8 @@ class BagReader:
             return True
         return known.messages > 0 and known.t_start_ns < wanted.end_ns and known.t_end_ns >= wanted.start_ns
 
-    def _plain(self, message: RecordedMessage, name: str) -> RecordedMessage:
-        """Without rosbag2's compression of each message: no CDR begins as zstd does."""
+    def _decompressed(self, message: RecordedMessage, name: str) -> RecordedMessage:
+        """The message without rosbag2's per-message compression. CDR never starts with the magic bytes of zstd."""
         is_packed = message.channel.message_encoding == CDR and message.cdr.startswith(ZSTD_MAGIC)
         if not (is_packed or self._is_packed):
             return message
@@ -337,17 +337,17 @@ class BagReader:
             raise BagDamaged(f'a message in {name} cannot be unpacked: {error}', path=name) from error
 
 
-def described(
+def describe_bag(
     sources: Mapping[str, Ranged], claimed: Description | None, manifest: Manifest | None, *, scans: bool = True
 ) -> Description | None:
-    """The contents of a bag with files in a store; None if there is nothing to read.
+    """The contents of a bag whose files may be in a store; None if there is nothing to read.
 
-    By the manifest if it knows all of them. Otherwise, SQLite and packed files in a store would have to be downloaded: of a bag
-    with those, it is what the metadata claims. The same is true without ``scans`` of MCAP files whose summary is not enough.
+    Uses the manifest if it lists all files. Otherwise, SQLite and packed files in a store would have to be downloaded, so for
+    such a bag it returns what the metadata claims. Without ``scans``, so it does if the summary of an MCAP file is insufficient.
     """
     names = slices_of(sorted(sources, key=natural_key), claimed)
     if claimed is not None and manifest is not None and {each.file for each in manifest.slices}.issuperset(names):
-        return of_manifest(manifest, sources, claimed)
+        return describe_manifest(manifest, sources, claimed)
     if any(not name.endswith(MCAP) and not isinstance(sources[name], LocalFile) for name in names):
         return claimed and replace(claimed, remarks=(NOT_READ,))
     if claimed is not None and not scans and not all(_has_summary(sources[name]) for name in names):
@@ -371,27 +371,29 @@ class FolderBag:
 
     path: Path
     files: Mapping[str, Path]
-    """All, by their path in the folder."""
+    """All files by their path in the folder."""
     manifest: Manifest | None
     reader: BagReader
 
 
 def open_folder(path: Path, meter: Meter | None = None) -> FolderBag:
-    """Raises BagError where there is no bag, BagDamaged for a manifest or metadata that is invalid."""
+    """Open a bag on the disk. Raises BagError if there is none, BagDamaged if its manifest or metadata is invalid."""
     files = files_of(path)
-    claimed = of_metadata(read_whole(LocalFile(files[METADATA])), str(files[METADATA]), files) if METADATA in files else None
+    claimed = (
+        describe_metadata(read_whole(LocalFile(files[METADATA])), str(files[METADATA]), files) if METADATA in files else None
+    )
     manifest = None
     if MANIFEST in files:
         manifest = Manifest.from_json(read_whole(LocalFile(files[MANIFEST])), str(files[MANIFEST]))
     names = slices_of(list(files), claimed)
     if not names and claimed is None:
-        raise no_bag(path)
+        raise not_a_bag(path)
     sources = {name: LocalFile(files[name], meter) for name in names}
     return FolderBag(path, files, manifest, BagReader(sources, claimed))
 
 
 def files_of(path: Path) -> dict[str, Path]:
-    """Those in a folder by their path in it, in the order of their numbers; or the file itself. Raises BagError."""
+    """The files in a folder by their path in it, in natural order; or the file itself. Raises BagError."""
     if path.is_file():
         return {path.name: path}
     if not path.is_dir():
@@ -401,9 +403,9 @@ def files_of(path: Path) -> dict[str, Path]:
 
 
 def slices_of(names: Sequence[str], claimed: Description | None) -> list[str]:
-    """The files with messages: all in the folder itself, and those in folders below it that the metadata names.
+    """The files with messages: all in the folder itself, and those in subfolders that the metadata names.
 
-    If a file exists twice, packed and unpacked, it is the one that the metadata names.
+    If a file exists both packed and unpacked, the one that the metadata names is used.
     """
     named = {part.name for part in claimed.parts} if claimed is not None else set()
     found = [name for name in names if name in named or (name.endswith(SLICES) and '/' not in name)]
@@ -418,28 +420,28 @@ def reason(error: BagDamaged, name: str) -> str:
     return text.strip() if text != error.what else f'is damaged: {error.what}'.replace(f' of {name}', '')
 
 
-def no_bag(path: Path) -> BagError:
-    """Where there is nothing to read."""
+def not_a_bag(path: Path) -> BagError:
+    """The error for a path without a bag."""
     return BagError(
-        f'{path} holds no bag: neither {METADATA} nor a finished file of messages ({", ".join(SLICES)}) is in it',
+        f'{path} is not a bag: it has neither {METADATA} nor a finished file of messages ({", ".join(SLICES)})',
         remedy='name the folder that `ros2 bag record -o` made', path=str(path),
     )  # fmt: skip
 
 
 def _channel(fields: Sequence[Any], known: Mapping[str, tuple[str, str]]) -> Channel:
-    """A file without definitions (before Iron) gets those that are known here."""
+    """The channel of a topic. For a file without definitions (before Iron), uses the definitions on this machine."""
     topic, kind, message_encoding, qos, type_hash = fields
     encoding, definition = known.get(kind, ('', ''))
     if not all(isinstance(text, str) for text in (*fields, encoding, definition)):
         raise TypeError('the name, type or definition of a topic is not text')
-    if not definition or encoding not in {'ros2msg', 'ros2idl'}:  # rosbag2 has the encoding "unknown" as well
+    if not definition or encoding not in {'ros2msg', 'ros2idl'}:  # rosbag2 also writes the encoding "unknown"
         encoding, definition, found = describe(kind)
         type_hash = type_hash or found
     return Channel(topic, kind, encoding, definition, type_hash, qos_in_numbers(qos), message_encoding)
 
 
 def check_tables(path: Path) -> None:
-    """Raises BagDamaged for a SQLite file in which a table is a program, or has a row that is larger than any message."""
+    """Raises BagDamaged for a SQLite file in which reading a table would execute code, or a row exceeds the message limit."""
     try:
         with closing(sqlite3.connect(f'{path.absolute().as_uri()}?mode=ro&immutable=1', uri=True)) as database:
             why = check_schema(database) or _too_large(database)
@@ -450,7 +452,7 @@ def check_tables(path: Path) -> None:
 
 
 def check_schema(database: sqlite3.Connection) -> str:
-    """Why the tables are not to be read: one is a program of whoever wrote the file. Empty if they are."""
+    """Why the tables must not be read, because reading one would execute code from the file; empty if they are safe."""
     kinds = database.execute('SELECT type, name, sql FROM sqlite_master').fetchmany(1000)
     found = {name for kind, name, made in kinds if kind == 'table' and not str(made).upper().startswith('CREATE VIRTUAL')}
     if not {'messages', 'topics'} <= found or any(kind == 'view' for kind, _, _ in kinds):
@@ -473,16 +475,16 @@ def _too_large(database: sqlite3.Connection) -> str:
 
 
 def _time(value: object) -> int:
-    """SQLite keeps any value in any column."""
+    """Checks a timestamp, because SQLite allows any value in any column."""
     if type(value) is not int or not 0 <= value < _LATEST_NS:
         raise TypeError(f'a message has the time {value!r:.80}')
     return value
 
 
 def _unpack(path: Path, whole: Path) -> None:
-    """Raises BagDamaged for what is not zstd, or unpacks to more than it may."""
+    """Raises BagDamaged if the file is not zstd or exceeds the limits when unpacked."""
     try:
-        most = min(path.stat().st_size * MOST_RATIO, shutil.disk_usage(whole.parent).free // 2)
+        most = min(path.stat().st_size * MAX_RATIO, shutil.disk_usage(whole.parent).free // 2)
         with path.open('rb') as raw, ZstdFile(raw, 'rb') as packed, whole.open('wb') as out:
             _copy(packed, out, most)
     except (ZstdError, OSError, EOFError, ValueError) as error:

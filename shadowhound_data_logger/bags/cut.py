@@ -1,13 +1,13 @@
-"""A piece of a bag as a new bag: a span of time and some of the topics, message by message as they were recorded.
+"""Copies a time span and some topics of a bag into a new bag, message by message.
 
-Nothing is decoded: messages, their encoding, both times, the sequence number, the schema and the metadata of the channel are
-copied unchanged, and so is the profile of the file. QoS in words is converted into numbers, which Humble reads, and rosbag2's
-compression outside the storage into that of MCAP. Attachments and metadata records are counted, but not copied.
+Messages are not decoded: their content, encoding, both times, sequence number, the schema and metadata of the channel, and the
+profile of the file are copied unchanged. QoS policy names are converted to numbers, which Humble can read, and rosbag2's
+compression outside the storage to that of MCAP. Attachments and metadata records are counted, but not copied.
 
-If the clock of the bag was not set, the times are copied as well, and metadata.yaml has the clock of the bag.
+If the clock of the bag was not set, the times are copied unchanged too, and metadata.yaml has the clock of the bag.
 
-Of an MCAP slice in a store only the summary and the chunks that are needed are read. What is not plain MCAP (SQLite, or
-compressed outside the storage) is downloaded first.
+From an MCAP slice in a store, only the summary and the necessary chunks are read. Other files (SQLite, or compressed outside the
+storage) are downloaded first.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Final
 
 from shadowhound_data_logger.bags.contents import BagReader, open_folder
-from shadowhound_data_logger.bags.description import BagPart, Description, is_latched, of_metadata, profiles
-from shadowhound_data_logger.bags.fetch import fetch, on_disk
+from shadowhound_data_logger.bags.description import BagPart, Description, describe_metadata, is_latched, profiles
+from shadowhound_data_logger.bags.fetch import disk_errors, fetch
 from shadowhound_data_logger.bags.latched import MAX_LATCHED_BYTES, MAX_PER_TOPIC, Latched
 from shadowhound_data_logger.bags.naming import BUCKET, MCAP, METADATA
 from shadowhound_data_logger.bags.queue import MessageBatch
@@ -44,31 +44,31 @@ from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.base import ObjectStore
 
 UNFINISHED: Final = '.part'
-COMES: Final = 'it may not have arrived yet: shadowhound-data bag list'
-ANY_END: Final = 1 << 64
-"""After every time that MCAP has."""
+MAY_ARRIVE: Final = 'it may not have arrived yet: shadowhound-data bag list'
+END_OF_TIME: Final = 1 << 64
+"""Later than any time in MCAP."""
 ACCUMULATED: Final = frozenset({'tf2_msgs/msg/TFMessage'})
-"""Types of which a subscriber needs all latched messages, not only the last: each transform is in one of them."""
+"""Types for which a subscriber needs all latched messages, not only the last one: each has different transforms."""
 SOURCE: Final = 'source'
-"""Of what has to be downloaded whole."""
+"""Subfolder for files that must be downloaded completely."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What to cut out. Times as ``times.moment_in_bag`` takes them: from ``start``, before ``end``; empty for the bag's own."""
+    """What to copy. Times as in ``times.moment_in_bag``: from ``start``, before ``end``; empty means start or end of the bag."""
 
     start: str = ''
     end: str = ''
     topics: Sequence[str] = ()
     regex: str = ''
-    """A topic that it is found in is taken as well; without both, all are."""
+    """Topics that match are copied too; without ``topics`` and ``regex``, all are."""
     spans: tuple[tuple[int, int], ...] | None = None
-    """Only of these times, in ns since 1970: from the first to before the second, in their order, none meets the next."""
+    """Copy only these half-open time spans, in ns since 1970; they are sorted and do not touch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What a cut copied, and how much it read."""
+    """The result of a cut."""
 
     folder: Path
     messages: int
@@ -76,33 +76,33 @@ class Cut:
     bytes: int
     t_start_ns: int
     t_end_ns: int
-    """Of the messages in it."""
+    """Log times of the first and the last message."""
     read_bytes: int
     read_requests: int
     bag_bytes: int
     absent: tuple[str, ...] = ()
-    """Topics that were requested and that the bag does not have."""
+    """Requested topics that the bag does not have."""
     missing: tuple[str, ...] = ()
-    """Slices with something of that time that are not there."""
+    """Missing slices that overlap the time span."""
     damaged: Mapping[str, str] = field(default_factory=dict)
-    """Slices that could not be read, and why: none of their messages was copied."""
+    """Unreadable slices, and why: none of their messages was copied."""
     extras: int = 0
-    """Attachments and metadata records in the slices that were read, which are not copied."""
+    """The number of attachments and metadata records in the slices that were read; they are not copied."""
     remarks: tuple[str, ...] = ()
-    """Where metadata.yaml contradicts the files."""
+    """Contradictions between metadata.yaml and the files."""
     latched: int = 0
-    """Of the messages, those from before the start that were latched then."""
+    """The number of messages from before the start that were latched at the start."""
 
 
 def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) -> Cut:
-    """Into the new folder ``out``. Raises BagError, BagDamaged, SettingError, StoreError."""
+    """Cut a bag in a store into the new folder ``out``. Raises BagError, BagDamaged, SettingError, StoreError."""
     if bag.is_archive:
         raise BagError(
             f'{bag.name} is an archive, which can only be read as a whole', remedy='fetch it, unpack it and cut the folder'
         )
     meter = Meter()
     file = bag.file(METADATA)
-    claimed = of_metadata(document(store, file), file.key, {each.name for each in bag.files}) if file else None
+    claimed = describe_metadata(document(store, file), file.key, {each.name for each in bag.files}) if file else None
     with _new_folder(out) as folder:
         if all(each.name.endswith(MCAP) for each in bag.slices):
             sources = {each.name: StoredFile(store, BUCKET, each.key, each.size, meter) for each in bag.slices}
@@ -114,9 +114,9 @@ def cut_remote(store: ObjectStore, bag: RemoteBag, out: Path, choice: Choice) ->
 
 
 def cut_folder(path: Path, out: Path, choice: Choice) -> Cut:
-    """Of a bag on the disk, or of one of its files. Raises BagError, BagDamaged, SettingError."""
+    """Cut a bag on the disk, or one of its files. Raises BagError, BagDamaged, SettingError."""
     if path.resolve() in out.absolute().resolve().parents:
-        raise BagError(f'{out} is within the bag that is cut', remedy='choose a folder next to it')
+        raise BagError(f'{out} is inside the bag', remedy='choose a folder outside the bag')
     meter = Meter()
     bag = open_folder(path, meter)
     size = sum(each.stat().st_size for each in bag.files.values())
@@ -136,7 +136,7 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
         raise _nothing(bag, choice, absent, start_ns, start_ns)
     if end_ns <= start_ns:
         raise SettingError('--end', choice.end, f'a time after --start, which is {iso(start_ns)}')
-    least, most = start_ns if choice.start else 0, end_ns if choice.end else ANY_END  # the bag's own times may be incomplete
+    least, most = start_ns if choice.start else 0, end_ns if choice.end else END_OF_TIME  # the bag's own times may be incomplete
     latched = _LatchedBefore(reader, {topic.name for topic in bag.topics if is_latched(topic.qos)} & chosen)
     writer = SliceWriter(folder / f'{out.name}_0.mcap', mode=0o666, profile=reader.profile())
     try:
@@ -153,7 +153,7 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
     missing = tuple(part.name for part in bag.parts if part.name in bag.absent and _overlaps(part, start_ns, end_ns))
     if not info.messages:
         if missing:
-            raise BagError(f'what was recorded then is in {", ".join(missing)}, which is not there', remedy=COMES)
+            raise BagError(f'the messages of this time are in {", ".join(missing)}, which is missing', remedy=MAY_ARRIVE)
         reader.check()
         raise _nothing(bag, choice, absent, start_ns, end_ns)
     (folder / METADATA).write_bytes(metadata_yaml([info], ros_distro='', custom_data=bag.clock or clock))
@@ -165,10 +165,9 @@ def _cut(reader: BagReader, folder: Path, out: Path, choice: Choice, meter: Mete
 
 
 class _LatchedBefore:
-    """The latched messages with which a piece begins, so that it can be played on its own.
+    """The latched messages at the start of a cut, so that it can be played on its own.
 
-    They are on channels of their own, as those with which the slices of a bag begin; what a slice repeats in the middle of the
-    piece is not copied again. New for each cut.
+    They have separate channels, as at the start of a bag's slices. Repetitions at the start of later slices are not copied again.
     """
 
     def __init__(self, reader: BagReader, topics: set[str]) -> None:
@@ -178,7 +177,7 @@ class _LatchedBefore:
         self.count = 0
 
     def before(self, start_ns: int) -> list[RecordedMessage]:
-        """In the order of the bag, with the log time ``start_ns`` and their own publish time."""
+        """The messages latched at ``start_ns``, in bag order, with the log time ``start_ns`` and their own publish time."""
         if not self._topics:
             return []
         latched, channels, repeats = Latched(MAX_LATCHED_BYTES), dict[tuple[str, str], Channel](), Counter[str]()
@@ -198,7 +197,7 @@ class _LatchedBefore:
         return found
 
     def is_new(self, message: RecordedMessage) -> bool:
-        """Whether a message is not the repetition of one that is in the piece."""
+        """Whether a message is not a repetition of one in the cut."""
         channel = message.channel
         if not channel.repeated and channel.topic not in self._topics:
             return True
@@ -211,7 +210,7 @@ class _LatchedBefore:
 def _span(bag: Description) -> tuple[int, int]:
     """Log times of the first and the last message. Raises BagError."""
     if bag.t_start_ns is None or bag.t_end_ns is None:
-        raise BagError('the bag has no messages', remedy='shadowhound-data bag info shows what it has')
+        raise BagError('the bag has no messages', remedy='shadowhound-data bag info shows its contents')
     return bag.t_start_ns, bag.t_end_ns
 
 
@@ -222,9 +221,9 @@ def _overlaps(part: BagPart, start_ns: int, end_ns: int) -> bool:
 
 
 def _topics(choice: Choice, topics: set[str]) -> tuple[set[str], tuple[str, ...]]:
-    """The topics to copy, and those that the bag does not have. Raises SettingError for an invalid regular expression.
+    """The topics to copy, and requested topics that the bag does not have. Raises SettingError for an invalid regex.
 
-    A slash at the beginning or end of a name need not be given: recorders other than rosbag2 have topics without one.
+    A leading or trailing slash of a name is optional: other recorders have topics without one.
     """
     try:
         pattern = re.compile(choice.regex) if choice.regex else None
@@ -240,28 +239,30 @@ def _topics(choice: Choice, topics: set[str]) -> tuple[set[str], tuple[str, ...]
 
 
 def _nothing(bag: Description, choice: Choice, absent: Sequence[str], start_ns: int, end_ns: int) -> BagError:
-    """Says which topics there are, or which times."""
+    """The error for a cut without messages; names the bag's topics or times."""
     topics = sorted({topic.name for topic in bag.topics})
     first_ns, last_ns = _span(bag)
     for name in absent:
         near = get_close_matches(name, topics, cutoff=0.6)
-        return BagError(f'the bag has no topic {name}', remedy=f'is it {near[0]}?' if near else f'it has {", ".join(topics)}')
+        return BagError(
+            f'the bag has no topic {name}', remedy=f'did you mean {near[0]}?' if near else f'it has {", ".join(topics)}'
+        )
     if choice.regex and not any(re.search(choice.regex, topic) for topic in topics):
         return BagError(f'no topic of the bag matches {choice.regex}', remedy=f'it has {", ".join(topics)}')
-    text = f'nothing of that was recorded between {iso(start_ns)} and {iso(end_ns)}'
+    text = f'no such message was recorded between {iso(start_ns)} and {iso(end_ns)}'
     if end_ns <= start_ns:
         text = f'nothing was recorded from {iso(start_ns)} on'
-    return BagError(text, remedy=f'the bag goes from {iso(first_ns)} to {iso(last_ns)}')
+    return BagError(text, remedy=f'the bag is from {iso(first_ns)} to {iso(last_ns)}')
 
 
 @contextmanager
 def _new_folder(out: Path) -> Iterator[Path]:
-    """A folder that becomes ``out`` when all went well, and is gone otherwise."""
+    """A folder that is renamed to ``out`` on success and deleted otherwise."""
     if out.exists():
-        raise BagError(f'{out} is there already', remedy='choose a new folder')
+        raise BagError(f'{out} already exists', remedy='choose a new folder')
     check_name(out.name, 'the new bag', MAX_BAG_BYTES)
     part = out.with_name(out.name + UNFINISHED)
-    with on_disk(out):
+    with disk_errors(out):
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         try:

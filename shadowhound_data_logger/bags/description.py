@@ -1,6 +1,6 @@
-"""What a bag holds: its topics, times and files, as its files have it; metadata.yaml is what its writer claimed of them.
+"""The contents of a bag: its topics, times and files, according to its files, or as metadata.yaml claims.
 
-rosbag2 has written wrong totals: of a split bag, Galactic recorded the start and duration of the last file, Humble of the first.
+rosbag2 has written wrong totals: for a split bag, Galactic recorded start and duration of the last file, Humble of the first.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from shadowhound_data_logger.core.untrusted import check_size, from_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo, count_by_channel
 
 MAX_QOS_BYTES: Final = 64 << 10
-"""Of one topic's profiles: some 200 publishers."""
+"""Maximum size of one topic's profiles: some 200 publishers."""
 MAX_BOOT_ID: Final = 100
-"""Letters."""
+"""Maximum length."""
 _INFINITE_S: Final = 9_000_000_000
 _LATEST_NS: Final = 1 << 64
 
@@ -36,7 +36,7 @@ class DescribedTopic:
     messages: int | None
     """As in ``Description``."""
     qos: Sequence[Mapping[str, Any]]
-    """The offered QoS profiles, as rosbag2 keeps them; empty where they are not known."""
+    """The offered QoS profiles, as rosbag2 stores them; empty if unknown."""
     type_hash: str
 
 
@@ -57,19 +57,19 @@ class Description:
     storage: str
     """``mcap`` or ``sqlite3``."""
     compression: str
-    """Of files or messages, as rosbag2 does it outside the storage: ``zstd file``; empty without."""
+    """rosbag2's compression outside the storage, such as ``zstd file``; empty if none."""
     distro: str
     topics: tuple[DescribedTopic, ...]
     parts: tuple[BagPart, ...]
     messages: int | None
-    """Of the files that could be read; None if no file could."""
+    """The number in the readable files; None if no file is readable."""
     t_start_ns: int | None
     t_end_ns: int | None
     """As in ``BagPart``."""
     clock: Mapping[str, str] = field(default_factory=dict)
-    """Where the clock was not set: how its times are known, by the words of ``metadata_words.py``. Else empty."""
+    """If the clock was not set: how its times are known, with the keys of ``metadata_words.py``. Otherwise empty."""
     absent: tuple[str, ...] = ()
-    """Files that the metadata names and that are not there."""
+    """Files that the metadata names but that do not exist."""
     damaged: Mapping[str, str] = field(default_factory=dict)
     """Files that cannot be read, and why."""
     remarks: tuple[str, ...] = ()
@@ -82,10 +82,10 @@ class Description:
         return max(self.t_end_ns - self.t_start_ns, 0) / 1e9
 
 
-def of_metadata(content: bytes, name: str, there: Container[str] = ()) -> Description:
-    """What a metadata.yaml of any version of rosbag2 claims. Raises BagDamaged for one that is invalid.
+def describe_metadata(content: bytes, name: str, there: Container[str] = ()) -> Description:
+    """What a metadata.yaml of any version of rosbag2 claims. Raises BagDamaged if it is invalid.
 
-    Paths in it may be absolute or have folders in front (``bag/bag_0.db3``, Foxy): a file is known by its path if it is
+    Paths in it may be absolute or include folders (``bag/bag_0.db3``, Foxy): a file is identified by its path if it is in
     ``there``, otherwise by its name.
     """
     try:
@@ -94,10 +94,10 @@ def of_metadata(content: bytes, name: str, there: Container[str] = ()) -> Descri
         raise BagDamaged(f'{name} is not metadata of a rosbag2 bag: {type(error).__name__} {error}', path=name) from error
 
 
-def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed: Description | None) -> Description:
-    """From what the files hold, by name, and what the metadata claims of the bag as a whole.
+def describe_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed: Description | None) -> Description:
+    """The contents according to the files, by name, with the metadata's claims about the bag.
 
-    Files that are absent or damaged are not count_by_channel.
+    Absent and damaged files are not counted.
     """
     topics: dict[tuple[str, str], DescribedTopic] = {}
     for channel, count in count_by_channel(each for one in infos.values() for each in one.channels.items()).items():
@@ -106,7 +106,7 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
         topics[name] = replace(
             known, messages=(known.messages or 0) + count, qos=(*known.qos, *(each for each in qos if each not in known.qos))
         )
-    for topic in claimed.topics if claimed is not None else ():  # one without messages, or QoS of a file that has none
+    for topic in claimed.topics if claimed is not None else ():  # adds topics without messages, and QoS missing in the files
         there = topics.setdefault((topic.name, topic.type), replace(topic, messages=0 if infos else None))
         topics[topic.name, topic.type] = there if there.qos else replace(there, qos=topic.qos)
     filled = [one for one in infos.values() if one.messages]
@@ -127,8 +127,8 @@ def of_files(infos: Mapping[str, SliceInfo], damaged: Mapping[str, str], claimed
     return whole if absent or damaged else replace(whole, remarks=tuple(_contradictions(whole, claimed)))
 
 
-def of_manifest(manifest: Manifest, there: Container[str], claimed: Description) -> Description:
-    """From what the manifest recorded of the files, also of those that are not ``there``."""
+def describe_manifest(manifest: Manifest, there: Container[str], claimed: Description) -> Description:
+    """The contents according to the manifest, including files that are not ``there``."""
     counts = {(topic.topic, topic.type): topic.messages for topic in manifest.topics}
     known = {(topic.name, topic.type): topic for topic in claimed.topics}
     topics = [known.get(name, DescribedTopic(*name, 0, (), '')) for name in dict.fromkeys((*known, *counts))]
@@ -150,7 +150,7 @@ def _part_of(name: str, info: SliceInfo | SliceEntry) -> BagPart:
 
 
 def _contradictions(found: Description, claimed: Description) -> Iterator[str]:
-    """The differences between what the metadata claims and what the files hold, for a bag with all its files."""
+    """The differences between the metadata's claims and the files, for a bag with all its files."""
     names = {part.name for part in claimed.parts}
     unnamed = [part.name for part in found.parts if part.name not in names]
     if unnamed:
@@ -178,12 +178,12 @@ def _span(bag: Description) -> str:
 
 
 def _iso_ns(time_ns: int) -> str:
-    """To the nanosecond: bags of tests last for less than a microsecond."""
+    """With nanoseconds, because bags of tests are shorter than a microsecond."""
     return f'{iso(time_ns)[:-1]}{time_ns % 1000:03d}Z'
 
 
 def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
-    """Offered QoS profiles: rosbag2 keeps them as a list, before its version 9 as the YAML of one."""
+    """Offered QoS profiles, which rosbag2 stores as a list or, before version 9, as the YAML of a list."""
     if isinstance(qos, str):
         try:
             check_size(len(qos), MAX_QOS_BYTES)
@@ -194,20 +194,20 @@ def profiles(qos: object) -> Sequence[Mapping[str, Any]]:
 
 
 def is_latched(qos: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a publisher with one of these profiles keeps messages for later subscribers, and for good."""
+    """Whether a publisher with one of these profiles keeps messages for late subscribers indefinitely."""
     return any(profile.get('durability') in {1, 'transient_local'} and _is_infinite(profile.get('lifespan')) for profile in qos)
 
 
 def _is_infinite(lifespan: object) -> bool:
-    """0 and rmw's infinity both mean that none is set."""
+    """Both 0 and rmw's infinity mean unset."""
     seconds = lifespan.get('sec') if isinstance(lifespan, Mapping) else 0
     return not isinstance(seconds, int) or not 0 < seconds < _INFINITE_S
 
 
 def _described(found: Mapping[str, Any], there: Container[str]) -> Description:
-    """Every version of the format; a field that is missing is unknown."""
-    messages = _whole(found, 'message_count')
-    told = {_text(each['path']): each for each in found.get('files') or ()}
+    """Reads every version of the format; missing fields are unknown."""
+    messages = _integer(found, 'message_count')
+    files = {_text(each['path']): each for each in found.get('files') or ()}
     paths = [_text(path) for path in found.get('relative_file_paths') or ()]
     compression = ' '.join(_text(found.get(name) or '') for name in ('compression_format', 'compression_mode')).strip()
     start, end = _times(found, messages)
@@ -216,20 +216,20 @@ def _described(found: Mapping[str, Any], there: Container[str]) -> Description:
         compression='' if compression.lower() == 'none' else compression.lower(),
         topics=tuple(_topics(found.get('topics_with_message_count') or ())),
         messages=messages, t_start_ns=start, t_end_ns=end, clock=clock_state(found.get('custom_data')),
-        parts=tuple(_part(path if path in there else PurePosixPath(path).name, told.get(path, {})) for path in paths),
+        parts=tuple(_part(path if path in there else PurePosixPath(path).name, files.get(path, {})) for path in paths),
     )  # fmt: skip
 
 
-def _times(told: Mapping[str, Any], messages: int | None) -> tuple[int | None, int | None]:
-    start = _whole(told.get('starting_time') or {}, 'nanoseconds_since_epoch')
-    length = _whole(told.get('duration') or {}, 'nanoseconds')
+def _times(fields: Mapping[str, Any], messages: int | None) -> tuple[int | None, int | None]:
+    start = _integer(fields.get('starting_time') or {}, 'nanoseconds_since_epoch')
+    length = _integer(fields.get('duration') or {}, 'nanoseconds')
     if not messages or start is None or length is None:
         return None, None
     return start, start + length
 
 
 def clock_state(custom: object) -> dict[str, str]:
-    """As ``Description.clock``, from a bag's custom data or a slice's metadata; what is not as we write it says nothing."""
+    """``Description.clock`` from a bag's custom data or a slice's metadata; ignores data that we did not write."""
     if not isinstance(custom, Mapping):
         return {}
     known, boot_id, offset_ns = (custom.get(word) for word in (words.CLOCK, words.BOOT_ID, words.CLOCK_OFFSET_NS))
@@ -245,24 +245,24 @@ def clock_state(custom: object) -> dict[str, str]:
 
 def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:
     for each in found:
-        told = each['topic_metadata']
+        topic = each['topic_metadata']
         yield DescribedTopic(
-            _text(told['name']), _text(told['type']), _whole(each, 'message_count'), profiles(told.get('offered_qos_profiles')),
-            _text(told.get('type_description_hash') or ''),
+            _text(topic['name']), _text(topic['type']), _integer(each, 'message_count'),
+            profiles(topic.get('offered_qos_profiles')), _text(topic.get('type_description_hash') or ''),
         )  # fmt: skip
 
 
-def _part(path: str, told: Mapping[str, Any]) -> BagPart:
-    messages = _whole(told, 'message_count')
-    return BagPart(path, messages, *_times(told, messages))
+def _part(path: str, fields: Mapping[str, Any]) -> BagPart:
+    messages = _integer(fields, 'message_count')
+    return BagPart(path, messages, *_times(fields, messages))
 
 
-def _whole(told: Mapping[str, Any], name: str) -> int | None:
-    found = told.get(name)
+def _integer(fields: Mapping[str, Any], name: str) -> int | None:
+    found = fields.get(name)
     if isinstance(found, str) and found.isdecimal() and len(found) <= 20:
         found = int(found)
     if found is not None and (type(found) is not int or not 0 <= found < _LATEST_NS):
-        raise ValueError(f'{name} is not a whole number of 0 ... 2^64')
+        raise ValueError(f'{name} is not an integer from 0 to 2^64')
     return found
 
 

@@ -1,6 +1,6 @@
-"""Fetches a bag from the store into a folder: several files at a time, each verified and named only once it is whole.
+"""Downloads a bag from the store into a folder: several files at a time; each gets its name when it is complete and verified.
 
-What is there already and right is not asked for again; a file that a kill cut off goes on where it ended.
+Files that exist and are correct are not downloaded again; an interrupted download is resumed.
 """
 
 from __future__ import annotations
@@ -32,38 +32,39 @@ FETCH_THREADS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class FetchedBag:
-    """What a fetch brought."""
+    """The result of a fetch."""
 
     folder: Path
     files: int
     bytes: int
-    """Of all files of the bag."""
+    """Total size of the bag's files."""
     downloaded: int
-    """Bytes that came over the network."""
+    """Bytes that were downloaded."""
     is_complete: bool
-    """Whether the manifest was there and all that it promises; else the bag is growing, or foreign."""
+    """Whether the store has the manifest and all files in it; otherwise the bag is growing, or foreign."""
     unverified: tuple[str, ...]
-    """Files of a foreign writer, of which no checksum is known."""
+    """Files of a foreign writer, whose checksums are unknown."""
     missing: tuple[str, ...] = ()
-    """Slices that the manifest promises and that are not in the store."""
+    """Slices in the manifest that are not in the store."""
 
 
 def fetch(
     store: ObjectStore, bag: RemoteBag, to: Path, *, threads: int = FETCH_THREADS, progress: ProgressListener | None = None
 ) -> FetchedBag:
-    """Raises BagError, BagDamaged for what does not arrive as it was sent, StoreError, OSError; what is whole by then stays."""
-    with on_disk(to):
+    """Raises BagError, BagDamaged for files that differ from the recorded ones, StoreError, OSError; keeps complete files."""
+    with disk_errors(to):
         return _fetch(store, bag, to, threads, progress or ProgressListener())
 
 
 @contextmanager
-def on_disk(folder: Path) -> Iterator[None]:
-    """What the disk refuses is a BagError."""
+def disk_errors(folder: Path) -> Iterator[None]:
+    """Converts OSError to BagError."""
     try:
         yield
     except OSError as error:
         where = error.filename or folder
-        raise BagError(f'{where} cannot be used: {error.strerror}', remedy='is there space, and may you write there?') from error
+        remedy = 'check the free space and the permissions'
+        raise BagError(f'{where} cannot be used: {error.strerror}', remedy=remedy) from error
 
 
 def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, progress: ProgressListener) -> FetchedBag:
@@ -74,15 +75,15 @@ def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, progress:
     manifest = None
     if (file := bag.file(MANIFEST)) is not None:
         check_document(file.key, file.size)
-        _have(store, file, folder, None, meter, progress)
+        _ensure_file(store, file, folder, None, meter, progress)
         manifest = Manifest.from_json(read_whole(LocalFile(folder / MANIFEST)), file.key)
     others = [file for file in bag.files if file.name != MANIFEST]
     promised = {each.file: each.sha256 for each in manifest.slices} if manifest else {}
 
     def one(file: RemoteFile) -> str:
-        return _have(store, file, folder, promised.get(file.name), meter, progress)
+        return _ensure_file(store, file, folder, promised.get(file.name), meter, progress)
 
-    checksums = dict(zip((file.name for file in others), _side_by_side(one, others, threads), strict=True))
+    checksums = dict(zip((file.name for file in others), _in_parallel(one, others, threads), strict=True))
     missing = tuple(missing_of(bag, manifest)) if manifest is not None else ()
     if not bag.is_archive and (missing or not bag.file(METADATA)):
         _describe(folder, bag, clock_of(store, bag))
@@ -93,8 +94,8 @@ def _fetch(store: ObjectStore, bag: RemoteBag, to: Path, threads: int, progress:
     )  # fmt: skip
 
 
-def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile], threads: int) -> Iterable[str]:
-    """In the order of the files; after a failure no other file is begun."""
+def _in_parallel(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile], threads: int) -> Iterable[str]:
+    """The results in the order of the files; no further file is started after a failure."""
     pool = ThreadPoolExecutor(threads, 'bag-fetch')
     try:
         yield from [each.result() for each in [pool.submit(one, file) for file in files]]
@@ -102,10 +103,10 @@ def _side_by_side(one: Callable[[RemoteFile], str], files: Sequence[RemoteFile],
         pool.shutdown(cancel_futures=True)
 
 
-def _have(
+def _ensure_file(
     store: ObjectStore, file: RemoteFile, folder: Path, promised: str | None, got: Meter, progress: ProgressListener
 ) -> str:
-    """Make it be there; returns the SHA-256 that it was checked against, empty where none is known."""
+    """Download a file unless it exists; returns the SHA-256 that it was verified with, '' if unknown."""
     path = path_below(folder, file.name)
     sha256 = promised or _recorded(store, file)
     if path.is_file() and path.stat().st_size == file.size and (not sha256 or fingerprint(path)[1] == sha256):
@@ -117,12 +118,12 @@ def _have(
         got.add(max(count, 0))
         progress.have(count)
 
-    with _alone(path) as resumed:
+    with _exclusive(path) as resumed:
         progress.have(resumed)
         info = download(store, ObjectInfo(BUCKET, file.key, file.size, None), path, tell=tell).info
     if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()
-        raise BagDamaged(f'{file.key} is not in the store what was recorded: its SHA-256 is not {promised}',
+        raise BagDamaged(f'{file.key} in the store is not the recorded file: its SHA-256 is not {promised}',
                          remedy='shadowhound-data bag verify checks all files', path=file.key)  # fmt: skip
     return sha256
 
@@ -133,21 +134,21 @@ def _recorded(store: ObjectStore, file: RemoteFile) -> str:
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[int]:
-    """The bytes that are there already, of which no other process writes more meanwhile. Raises BagError when one does."""
+def _exclusive(path: Path) -> Iterator[int]:
+    """Lock an unfinished download; yields its size. Raises BagError if another process has the lock."""
     with path.with_name(path.name + UNFINISHED).open('ab') as part:
         if not lock(part, wait=False):
-            raise BagError(f'another process fetches {path} already', path=str(path))
+            raise BagError(f'another process is already fetching {path}', path=str(path))
         yield os.fstat(part.fileno()).st_size
 
 
 def _describe(folder: Path, bag: RemoteBag, clock: Mapping[str, str]) -> None:
-    """Of a bag that is not all there, so that players open what is; the real one replaces it with the rest."""
+    """Write metadata.yaml for an incomplete bag, so that players can open it; a later fetch replaces it with the original."""
     sources = {file.name: LocalFile(folder / file.name) for file in bag.slices if file.name.endswith(MCAP)}
     try:
         infos = list(BagReader(sources, None).infos().values())
     except BagDamaged:
-        return  # none can be read, which verify shows
+        return  # no file is readable, which verify reports
     if infos:
         with replacing(folder / METADATA) as file:
             file.write(metadata_yaml(infos, ros_distro='', custom_data=clock))

@@ -1,4 +1,4 @@
-"""Everything about one bag except its messages: from a few short reads, also where its slices are in a store."""
+"""Everything about one bag except its messages, from a few short reads, even if its slices are in a store."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from shadowhound_data_logger.bags.contents import described, open_folder
-from shadowhound_data_logger.bags.description import Description, clock_state, of_metadata
+from shadowhound_data_logger.bags.contents import describe_bag, open_folder
+from shadowhound_data_logger.bags.description import Description, clock_state, describe_metadata
 from shadowhound_data_logger.bags.local import UnsentFile, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, natural_key
@@ -28,20 +28,20 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 @dataclass(frozen=True, slots=True)
 class BagInfo:
-    """A bag, described."""
+    """The description of a bag."""
 
     robot: str
-    """Empty of a folder."""
+    """Empty for a bag in a folder."""
     bag: str
     state: str
     description: Description
     files: Mapping[str, tuple[int, str]]
-    """Name -> bytes, and where it is."""
+    """Name -> size in bytes, and location."""
     manifest: Manifest | None
     missing: Sequence[str]
-    """Slices that the manifest or the metadata names and that are nowhere."""
+    """Slices that the manifest or the metadata names but that do not exist."""
     read_bytes: int
-    """So many were enough."""
+    """Bytes that were read."""
 
     @property
     def bytes(self) -> int:
@@ -49,7 +49,7 @@ class BagInfo:
 
 
 def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
-    """Of a bag in the store or still on this robot. Raises BagError, BagDamaged, StoreError, SpoolError."""
+    """Describe a bag in the store or still on this robot. Raises BagError, BagDamaged, StoreError, SpoolError."""
     waiting = {file.name: file for file in local_files(home, robot).values() if file.bag == name}
     try:
         bag = find_bag(store, robot, name)
@@ -58,7 +58,7 @@ def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
             raise
         bag = RemoteBag(robot, name, ())
     if bag.is_archive:
-        raise BagError(f'{name} is an archive of {bag.size} bytes; what is in it shows when it is unpacked',
+        raise BagError(f'{name} is an archive of {bag.size} bytes, which must be unpacked to see its contents',
                        remedy=f'shadowhound-data bag fetch {name} --to .')  # fmt: skip
     meter = Meter()
     sources: dict[str, Ranged] = {
@@ -71,17 +71,18 @@ def info_of(store: ObjectStore, robot: str, name: str, home: Path) -> BagInfo:
     file = sources.get(MANIFEST)
     manifest = Manifest.from_json(read_whole(file), file.name) if file is not None else None
     file = sources.get(METADATA)
-    claimed = of_metadata(read_whole(file), file.name, sources) if file is not None else None
-    description = described(sources, claimed, manifest)
+    claimed = describe_metadata(read_whole(file), file.name, sources) if file is not None else None
+    description = describe_bag(sources, claimed, manifest)
     if description is None:
-        raise BagError(f'{name} has neither {METADATA} nor a finished MCAP slice', remedy='is it a bag, or only starting?')
+        remedy = 'check that it is a bag; if its recording has just started, try again later'
+        raise BagError(f'{name} has neither {METADATA} nor a finished MCAP slice', remedy=remedy)
     if claimed is None:
         description = replace(description, clock=clock_state(tags))
     return _info(robot, name, where, manifest, description, meter, tags)
 
 
 def info_folder(path: Path) -> BagInfo:
-    """Of a bag on the disk, or of one of its files. Raises BagError, BagDamaged."""
+    """Describe a bag on the disk, or one of its files. Raises BagError, BagDamaged."""
     meter = Meter()
     bag = open_folder(path, meter)
     where = {name: (each.stat().st_size, 'folder') for name, each in bag.files.items()}
@@ -98,9 +99,9 @@ def _info(robot: str, name: str, where: Mapping[str, tuple[int, str]], manifest:
 
 
 def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
-    """What was written beside one slice: enough to tell whose it is, and by which clock its times are."""
+    """The object metadata of one slice, which identifies the writer of the bag and the clock of its times."""
     for file in waiting.values():
         return file.metadata or {words.BAG: bag.name}
-    is_told = bag.file(MANIFEST) and bag.file(METADATA)
-    held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not is_told else None
+    is_described = bag.file(MANIFEST) and bag.file(METADATA)
+    held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not is_described else None
     return held.metadata if held else {}

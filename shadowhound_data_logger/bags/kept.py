@@ -1,6 +1,6 @@
-"""A range of time out of slices that the robot keeps, as a small bag of its own: what a request for a few seconds sends.
+"""Cuts a time range out of slices that the robot keeps into a small separate bag, which answers a request for a few seconds.
 
-The bag's name is of what is in it, so that the same range is cut and sent once, whoever asks.
+The bag's name is derived from its content, so the same range is cut and sent only once, even for several requests.
 """
 
 from __future__ import annotations
@@ -28,40 +28,40 @@ from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.spool.request_table import KeptSlice
 
 CUTTING: Final = 'cutting'
-"""The folder of what is being cut, by robot, in SHADOWHOUND_HOME."""
+"""Folder for cuts in progress, by robot, in SHADOWHOUND_HOME."""
 
 
 def sweep(home: Path, robot: str) -> None:
-    """Remove what a process of this robot was cutting when it died."""
+    """Remove unfinished cuts of a process of this robot that crashed."""
     shutil.rmtree(home / CUTTING / robot, ignore_errors=True)
 
 
 class KeptCut:
     """A cut out of kept slices of one bag.
 
-    New; ``work`` once; nothing of it is left on the disk but what ``work`` returned, which the spool takes over.
+    Lifecycle: new; ``work`` once. The only files that remain are those of the objects it returned, which the spool takes over.
     """
 
     def __init__(self, home: Path, slices: Sequence[KeptSlice], since_ns: int, until_ns: int, priority: int) -> None:
-        """From ``since_ns``, before ``until_ns``, Unix nanoseconds. ``slices`` are of one bag, one at least."""
+        """From ``since_ns``, before ``until_ns``, Unix nanoseconds. ``slices`` has at least one slice; all are of one bag."""
         self.slices = sorted(slices, key=lambda each: natural_key(each.key))
         self._span = since_ns, until_ns
         self._priority = priority
         self.robot, _, self._of, _ = slices[0].key.split('/')
-        said = '\n'.join((*(each.sha256 for each in self.slices), str(since_ns), str(until_ns)))
-        mark = f'_cut_{hashlib.sha256(said.encode()).hexdigest()[:8]}'
+        content = '\n'.join((*(each.sha256 for each in self.slices), str(since_ns), str(until_ns)))
+        mark = f'_cut_{hashlib.sha256(content.encode()).hexdigest()[:8]}'
         self.bag = f'{self._of[: MAX_BAG_BYTES - len(mark)]}{mark}'
         self._folder = home / CUTTING / self.robot / self.bag
 
     @property
     def places(self) -> list[tuple[str, str]]:
-        """(bucket, key) of the objects that it becomes."""
+        """(bucket, key) of its objects."""
         return [(BUCKET, key_of(self.robot, self.bag, file)) for file in (slice_file(self.bag, 0), METADATA, MANIFEST)]
 
     def work(self) -> Generator[None, None, list[DataObject]]:
-        """Cut, and yield after each chunk; at last the objects, none where nothing was recorded then.
+        """Cut, and yield after each chunk; returns the objects, or none if the range has no messages.
 
-        Raises BagDamaged for a slice that cannot be read, OSError.
+        Raises BagDamaged for an unreadable slice, OSError.
         """
         shutil.rmtree(self._folder, ignore_errors=True)
         self._folder.mkdir(mode=0o700, parents=True)
@@ -80,11 +80,11 @@ class KeptCut:
         return self._objects(info)
 
     def clear(self) -> None:
-        """Remove what it wrote."""
+        """Delete its files."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _copy(self, each: KeptSlice, writer: SliceWriter) -> Generator[None, None, None]:
-        """A chunk at a time: several would be read ahead."""
+        """Copy one chunk at a time, because ``read_messages`` would read several ahead."""
         source = LocalFile(each.path)
         index = read_summary(source)
         if index is None or index.chunks is None:
@@ -96,10 +96,10 @@ class KeptCut:
             yield
 
     def _objects(self, info: SliceInfo) -> list[DataObject]:
-        said = self.slices[0].metadata
-        marks = {name: said[name] for name in (words.ROBOT, words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if name in said}
-        marks |= {words.BAG: self.bag, words.CUT_OF: self._of}
-        mission = MissionOf(said.get(words.MISSION_TYPE, ''), said.get(words.MISSION_ID), said.get(words.RUN_ID))
+        source = self.slices[0].metadata
+        copied = (words.ROBOT, words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE)
+        marks = {name: source[name] for name in copied if name in source} | {words.BAG: self.bag, words.CUT_OF: self._of}
+        mission = MissionOf(source.get(words.MISSION_TYPE, ''), source.get(words.MISSION_ID), source.get(words.RUN_ID))
         manifest = Manifest(
             bag=self.bag, robot=self.robot, mission=mission if mission.mission_id or mission.run_id else None, state=COMPLETE,
             missing=(), topics=topics_of([info]), slices=(SliceEntry.of(info, self.places[0][1]),),

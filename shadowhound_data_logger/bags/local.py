@@ -1,4 +1,4 @@
-"""Files of bags that are still on the robot: in its spool, waiting for the store, or in the folder of what is being recorded."""
+"""Files of bags that are still on the robot: in its spool, or in the folders of current recordings."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 
 RECORDS: Final = 'records'
-"""In SHADOWHOUND_HOME: what is being recorded by hand (``bag record``); the node's bags lie in naming.BAGS."""
+"""Folder in SHADOWHOUND_HOME for recordings of ``bag record``; the node's recordings are in naming.BAGS."""
 SPOOL: Final = 'spool'
 QUARANTINE: Final = 'quarantine'
-"""Refused by the store for good."""
+"""Permanently rejected by the store."""
 RECORDING: Final = 'recording'
 
 
@@ -45,7 +45,7 @@ class UnsentFile:
 
 
 def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
-    """By bag and name; what lies in the spool and in the recording folder is in the spool. Raises SpoolError."""
+    """The files by bag and name; a file in both the spool and the recording folder counts as spooled. Raises SpoolError."""
     found = {(file.bag, file.name): file for folder in (BAGS, RECORDS) for file in _recording(home / folder / robot)}
     try:
         found |= {(file.bag, file.name): file for file in _spooled(home / 'spool', robot)}
@@ -54,8 +54,8 @@ def local_files(home: Path, robot: str) -> dict[tuple[str, str], UnsentFile]:
     return found
 
 
-def given_up(home: Path, robot: str) -> Counter[str]:
-    """Bag -> files that the full spool gave up, as far as it remembers; some manifests know of them. Raises SpoolError."""
+def evicted_files(home: Path, robot: str) -> Counter[str]:
+    """Bag -> number of files that the full spool evicted, according to its index. Raises SpoolError."""
     try:
         return Counter(bag for bag, _, _ in _rows(home / 'spool', robot, State.EVICTED))
     except sqlite3.Error as error:
@@ -68,7 +68,7 @@ def _recording(folder: Path) -> Iterator[UnsentFile]:
             try:
                 yield UnsentFile(path.parent.name, path.name, RECORDING, path.stat().st_size, path=path)
             except FileNotFoundError:
-                continue  # closed or spooled meanwhile
+                continue  # it was closed or spooled in between
 
 
 def _spooled(spool: Path, robot: str) -> Iterator[UnsentFile]:

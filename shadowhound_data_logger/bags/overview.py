@@ -1,4 +1,4 @@
-"""One line of facts a bag, put together from the store, the spool and the folder of what is being recorded."""
+"""A row of facts for each bag, from the store, the spool and the folders of current recordings."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.contents import NOT_READ, described
-from shadowhound_data_logger.bags.description import of_metadata
-from shadowhound_data_logger.bags.local import UnsentFile, given_up, local_files
+from shadowhound_data_logger.bags.contents import NOT_READ, describe_bag
+from shadowhound_data_logger.bags.description import describe_metadata
+from shadowhound_data_logger.bags.local import UnsentFile, evicted_files, local_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA
 from shadowhound_data_logger.bags.remote import (
@@ -37,7 +37,7 @@ STORE: Final = 'store'
 
 @dataclass(frozen=True, slots=True)
 class BagRow:
-    """A bag at a glance; None for what is not known without opening its slices."""
+    """The facts about a bag; None if they are unknown without opening its slices."""
 
     robot: str
     bag: str
@@ -49,11 +49,11 @@ class BagRow:
     t_start_ns: int | None
     t_end_ns: int | None
     where: Mapping[str, int]
-    """Place -> files of the bag there: ``store``, ``spool``, ``recording``, ``quarantine``."""
+    """Location (``store``, ``spool``, ``recording``, ``quarantine``) -> number of the bag's files there."""
     finding: str
-    """What is wrong with it; empty when nothing is."""
+    """What is wrong with the bag; empty if nothing is."""
     remark: str
-    """Where its metadata.yaml contradicts its files; empty when it does not."""
+    """Contradictions between its metadata.yaml and its files; empty if there are none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,24 +67,24 @@ class _Facts:
 
 
 def bag_overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
-    """All bags of a robot that began at ``since_ns`` or later, the newest last. Raises StoreError, SpoolError."""
+    """All bags of a robot that started at ``since_ns`` or later, newest last. Raises StoreError, SpoolError."""
     remote = {bag.name: bag for bag in find_bags(store, robot)}
     local: dict[str, list[UnsentFile]] = {}
     for file in local_files(home, robot).values():
         local.setdefault(file.bag, []).append(file)
-    lost = given_up(home, robot)
-    names = [name for name in sorted({*remote, *local}) if (named_ns(name) or since_ns) >= since_ns - SECOND]
+    lost = evicted_files(home, robot)
+    names = [name for name in sorted({*remote, *local}) if (time_in_name(name) or since_ns) >= since_ns - SECOND]
 
     def row(name: str) -> BagRow:
         return _row(store, remote.get(name) or RemoteBag(robot, name, ()), local.get(name, []), lost[name])
 
     with ThreadPoolExecutor(THREADS, 'bag-list') as pool:
         rows = [each for each in pool.map(row, names) if each.t_start_ns is None or each.t_start_ns >= since_ns]
-    return sorted(rows, key=lambda each: (each.t_start_ns or named_ns(each.bag) or 0, each.bag))
+    return sorted(rows, key=lambda each: (each.t_start_ns or time_in_name(each.bag) or 0, each.bag))
 
 
-def named_ns(bag: str) -> int | None:
-    """The time in the name of a bag, ``..._YYYYMMDD_HHMMSS``; None where there is none."""
+def time_in_name(bag: str) -> int | None:
+    """The time in the name of a bag, ``..._YYYYMMDD_HHMMSS``, in ns; None if it has none."""
     stamp = '_'.join(bag.removesuffix(ARCHIVE).split('_')[-2:])
     try:
         when = datetime.strptime(stamp, '%Y%m%d_%H%M%S').replace(tzinfo=timezone.utc)
@@ -93,10 +93,10 @@ def named_ns(bag: str) -> int | None:
     return int(when.timestamp()) * SECOND
 
 
-def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], given_up: int) -> BagRow:
-    kept = [file for file in local if bag.file(file.name) is None]  # delivered already: the spool is about to let go of it
+def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], evicted_files: int) -> BagRow:
+    kept = [file for file in local if bag.file(file.name) is None]  # the spool is about to delete files that were delivered
     files = RemoteBag(bag.robot, bag.name, (*bag.files, *(RemoteFile(file.name, '', file.size) for file in kept)))
-    finding = '; '.join(f'{file.name} is refused by the store' for file in kept if file.where == 'quarantine')
+    finding = '; '.join(f'{file.name} was rejected by the store' for file in kept if file.where == 'quarantine')
     manifest, tags, facts = None, {}, _Facts()
     try:
         manifest = _manifest(store, bag, kept)
@@ -108,8 +108,8 @@ def _row(store: ObjectStore, bag: RemoteBag, local: list[UnsentFile], given_up: 
         finding = str(error)
     state = state_of(files, manifest, next(iter(tags.values()), {}))
     if manifest is not None and (missing := missing_of(files, manifest)):
-        why = f'; {given_up} were given up by the full spool of this machine' if given_up else ' yet'
-        finding = finding or f'{len(missing)} of {len(manifest.slices)} slices are not here{why}'
+        why = f'; the full spool of this machine evicted {evicted_files}' if evicted_files else ' yet'
+        finding = finding or f'{len(missing)} of {len(manifest.slices)} slices are not available{why}'
     places: dict[str, int] = {STORE: len(bag.files)} if bag.files else {}
     for file in kept:
         places[file.where] = places.get(file.where, 0) + 1
@@ -124,12 +124,12 @@ def _manifest(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -
             try:
                 return Manifest.from_json(file.path.read_bytes(), str(file.path))
             except OSError:
-                continue  # on its way out of the spool
+                continue  # the spool has just delivered it
     return read_manifest(store, bag)
 
 
 def _tags(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -> dict[str, Mapping[str, str]]:
-    """What was written beside each slice, by its name; of a foreign bag nothing is, so one of its slices is asked for."""
+    """The object metadata of each slice, by its name. A foreign bag has none, so only one of its slices is looked up."""
     found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
     for file in bag.slices:
         held = store.head(BUCKET, file.key)
@@ -149,20 +149,20 @@ def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: 
         return _span(messages, len(topics), [(each.t_start_ns + step_ns, each.t_end_ns + step_ns) for each in filled])
     if file := bag.file(METADATA):
         sources = {each.name: StoredFile(store, BUCKET, each.key, each.size) for each in bag.files}
-        found = described(sources, of_metadata(document(store, file), file.key, sources), None, scans=False)
+        found = describe_bag(sources, describe_metadata(document(store, file), file.key, sources), None, scans=False)
         if found is not None:
-            wrong = [f'{name} is not there' for name in found.absent]
+            wrong = [f'{name} is missing' for name in found.absent]
             wrong += [f'{name} {why}' for name, why in found.damaged.items()]
             return _Facts(found.messages, len({topic.name for topic in found.topics}), found.t_start_ns, found.t_end_ns,
                           '; '.join(wrong), '; '.join(each for each in found.remarks if each != NOT_READ))  # fmt: skip
     try:
-        told_of = [tuple(int(tag[word]) for word in (words.MESSAGES, words.T_START_NS, words.T_END_NS)) for tag in tags]
+        numbers = [tuple(int(tag[word]) for word in (words.MESSAGES, words.T_START_NS, words.T_END_NS)) for tag in tags]
     except (KeyError, ValueError):
         return _Facts()
-    if not all(0 <= value < 1 << 64 for each in told_of for value in each):
+    if not all(0 <= value < 1 << 64 for each in numbers for value in each):
         return _Facts()
-    spans = [(start_ns, end_ns) for messages, start_ns, end_ns in told_of if messages]
-    return _span(sum(messages for messages, _, _ in told_of), None, spans) if told_of else _Facts()
+    spans = [(start_ns, end_ns) for messages, start_ns, end_ns in numbers if messages]
+    return _span(sum(messages for messages, _, _ in numbers), None, spans) if numbers else _Facts()
 
 
 def _span(messages: int, topics: int | None, spans: list[tuple[int, int]]) -> _Facts:

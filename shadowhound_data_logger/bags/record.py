@@ -1,10 +1,10 @@
-"""Records a bag for some time and delivers it to the store: ``record_and_upload_rosbag``.
+"""Records a bag for some time and uploads it to the store: ``record_and_upload_rosbag``.
 
     from shadowhound_data_logger.bags import record_and_upload_rosbag
     record_and_upload_rosbag('patrol', 60)
 
-It leaves the robot slice by slice while it records, and what Tower cannot take now waits in the spool. A process of its own
-does it (``node/recording/bag_process.py``), so neither rclpy nor its signals get into the caller's.
+The bag is uploaded slice by slice during the recording; if Tower is unreachable, slices wait in the spool. A separate process
+records (``node/recording/bag_process.py``), so neither rclpy nor its signal handlers run in the caller's process.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from shadowhound_data_logger.core.errors import BagError
 
 PROGRAM: Final = 'shadowhound_data_logger.node.recording.bag_process'
 DEADLINE_S: Final = 60.0
-"""For the rest of it after the recording; most of a bag is delivered by then."""
+"""Maximum time to deliver the rest after the recording; most of a bag has been delivered by then."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A bag that is complete, in the store or in the spool."""
+    """A complete bag, in the store or in the spool."""
 
     robot: str
     bag: str
@@ -37,11 +37,11 @@ class Recorded:
     topics: Mapping[str, int]
     """Topic -> messages."""
     dropped: int
-    """Messages that this machine was too slow to write, or had no disk for."""
+    """Messages that were not written, because the machine was too slow or the disk was full."""
     delivered: bool
-    """Whether the store has all of it. Otherwise the spool has the rest and delivers it later."""
+    """Whether the store has all of it; otherwise the spool delivers the rest later."""
     last_error: str
-    """Why it is not delivered, if that is known."""
+    """Why it was not delivered, if known."""
 
     @property
     def where(self) -> str:
@@ -68,24 +68,24 @@ def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
 
 def record(name: str, duration_s: float, *, topics: Sequence[str] = (), regex: str = '', robot: str = 'thor',
            deadline_s: float = DEADLINE_S) -> Recorded:  # fmt: skip
-    """As above, of these topics and those in which ``regex`` is found. SIGINT ends it early. Raises BagError."""
+    """Like ``record_and_upload_rosbag``, for these topics and those that match ``regex``. SIGINT ends it. Raises BagError."""
     command = [sys.executable, '-m', PROGRAM, f'--duration={duration_s}', f'--deadline={deadline_s}', f'--robot={robot}']
     command += [f'--topic={topic}' for topic in topics] + ([f'--regex={regex}'] if regex else []) + ['--', name]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
             output, _ = process.communicate()
-        except KeyboardInterrupt:  # a terminal tells the child as well; else it is told here, and ends the bag
+        except KeyboardInterrupt:  # a terminal also interrupts the child; otherwise do it here, so that it ends the bag
             process.send_signal(signal.SIGINT)
             output, _ = process.communicate()
-    said = _last_line(output, process.returncode)
-    if 'error' in said:
-        raise BagError(said['error'])
-    return Recorded(**said)
+    result = _last_line(output, process.returncode)
+    if 'error' in result:
+        raise BagError(result['error'])
+    return Recorded(**result)
 
 
 def _last_line(output: bytes, code: int) -> dict[str, Any]:
     try:
         return dict(json.loads(output.splitlines()[-1]))
     except (IndexError, ValueError) as error:
-        remedy = 'is ROS sourced? its output is above'
-        raise BagError(f'the recorder ended with exit code {code} and without a word', remedy=remedy) from error
+        remedy = 'see its output above; check that ROS is sourced'
+        raise BagError(f'the recorder exited with code {code} and without a result', remedy=remedy) from error

@@ -1,7 +1,7 @@
-"""Bags in a store: which there are, which files each has, and how complete each is.
+"""Bags in a store: their files, and whether they are complete.
 
-A bag is a folder ``<robot>/rosbags/<bag>/`` of slices; its ``manifest.json`` is written last, so one without is still growing. An
-archive ``<robot>/rosbags/<bag>.tar.gz`` is a bag of that name as well, of which nothing is known but its size.
+A bag is a folder ``<robot>/rosbags/<bag>/`` of slices; its ``manifest.json`` is written last, so a bag without one is still
+growing. An archive ``<robot>/rosbags/<bag>.tar.gz`` is also a bag, but only its size is known.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 ARCHIVE: Final = '.tar.gz'
 GROWING: Final = 'growing'
 FOREIGN: Final = 'foreign'
-"""Not uploaded by this package: nothing says what should be in it."""
+"""Not uploaded by this package: the expected contents are unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class RemoteFile:
     """One object of a bag."""
 
     name: str
-    """In the bag's folder."""
+    """Path in the bag's folder."""
     key: str
     size: int
 
@@ -41,12 +41,12 @@ class RemoteFile:
 
 @dataclass(frozen=True, slots=True)
 class RemoteBag:
-    """A bag as the listing of its store tells it."""
+    """A bag according to a listing of its store."""
 
     robot: str
     name: str
     files: tuple[RemoteFile, ...]
-    """In the order of their numbers."""
+    """In natural order."""
 
     @property
     def is_archive(self) -> bool:
@@ -77,7 +77,7 @@ def find_bags(store: ObjectStore, robot: str) -> list[RemoteBag]:
 
 
 def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
-    """One of them. Raises UnknownBag naming similar ones where there is none, StoreError."""
+    """One bag. Raises UnknownBag, which names similar bags, and StoreError."""
     prefix = prefix_of(robot, bag)
     if bag.endswith(ARCHIVE):
         held = store.head(BUCKET, prefix[:-1])
@@ -93,30 +93,30 @@ def find_bag(store: ObjectStore, robot: str, bag: str) -> RemoteBag:
 
 
 def read_manifest(store: ObjectStore, bag: RemoteBag) -> Manifest | None:
-    """None when there is none. Raises BagDamaged for one that says nothing, StoreError."""
+    """The manifest, or None. Raises BagDamaged if it is invalid, StoreError."""
     file = bag.file(MANIFEST)
     return Manifest.from_json(document(store, file), file.key) if file else None
 
 
 def document(store: ObjectStore, file: RemoteFile) -> bytes:
-    """A manifest or a metadata.yaml. Raises BagDamaged for one that is larger than any, StoreError."""
+    """The content of a manifest or metadata.yaml. Raises BagDamaged if it is too large for one, StoreError."""
     return read_whole(StoredFile(store, BUCKET, file.key, file.size))
 
 
 def clock_of(store: ObjectStore, bag: RemoteBag) -> dict[str, str]:
-    """As ``Description.clock``, from the metadata of the first slice, where there is no metadata.yaml. Raises StoreError."""
+    """``Description.clock`` from the object metadata of the first slice, for a bag without metadata.yaml. Raises StoreError."""
     held = store.head(BUCKET, bag.slices[0].key) if bag.slices else None
     return clock_state(held.metadata) if held is not None else {}
 
 
 def missing_of(bag: RemoteBag, manifest: Manifest) -> list[str]:
-    """The slices that the manifest promises and the bag does not have."""
+    """Slices in the manifest that the bag does not have."""
     there = {file.name for file in bag.files}
     return [entry.file for entry in manifest.slices if entry.file not in there]
 
 
 def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[str, str]) -> str:
-    """The state; ``slice_metadata`` is that of any of its slices, where there is no manifest."""
+    """The state; ``slice_metadata`` is the object metadata of any slice, needed only without a manifest."""
     if manifest is not None:
         return GROWING if missing_of(bag, manifest) else manifest.state
     return GROWING if words.BAG in slice_metadata and not bag.file(METADATA) else FOREIGN

@@ -1,8 +1,8 @@
-"""Repairs a bag, ours or another recorder's: a folder or one file. Intact files are copied, damaged ones rewritten.
+"""Repairs a bag by any recorder: a folder or one file. Intact files are copied, damaged ones rewritten.
 
-MCAP is repaired by ``formats/mcap/repair.py``; of SQLite every row that can be read is kept; ``metadata.yaml`` is rebuilt from
-the files if it is missing, invalid or contradicts them; a manifest is updated and lists what is missing. Files that rosbag2
-compressed as a whole are copied if they are intact, and otherwise reported.
+``formats/mcap/repair.py`` repairs MCAP; from SQLite, every readable row is kept; ``metadata.yaml`` is rebuilt from the files if
+it is missing, invalid or contradicts them; a manifest is updated and lists the losses. Files that rosbag2 compressed as a whole
+are copied if they are intact, and otherwise reported.
 
 The result gets its name when it is complete and on the disk. In place, each file is replaced by a rename once all are repaired:
 an interruption leaves every file either old or new.
@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.contents import SqliteFile, files_of, no_bag, opened, slices_of
-from shadowhound_data_logger.bags.description import Description, of_files, of_metadata
-from shadowhound_data_logger.bags.fetch import on_disk
+from shadowhound_data_logger.bags.contents import SqliteFile, files_of, not_a_bag, open_bag_file, slices_of
+from shadowhound_data_logger.bags.description import Description, describe_files, describe_metadata
+from shadowhound_data_logger.bags.fetch import disk_errors
 from shadowhound_data_logger.bags.manifest import RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SQLITE, natural_key
-from shadowhound_data_logger.bags.sqlite_repair import LEFT, salvage_tables
+from shadowhound_data_logger.bags.sqlite_repair import LEFTOVERS, copy_readable_rows
 from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.core.progress import ProgressListener
@@ -37,19 +37,19 @@ from shadowhound_data_logger.formats.mcap.writer import OPEN_SUFFIX
 REPAIRED: Final = '_repaired'
 """Appended to the name of the bag or file, unless another output is requested."""
 UNFINISHED: Final = '.repair'
-"""Ends the names of files and folders that are being written."""
-NOTHING: Final = 'nothing of it can be repaired'
+"""Suffix of files and folders that are being written."""
+NOTHING: Final = 'it cannot be repaired: no message in it is readable'
 CHANGED: Final = 'the files that it describes have changed'
 SILENT: Final = ProgressListener()
 
 
 @dataclass(frozen=True, slots=True)
 class FileRepair:
-    """One file of messages."""
+    """The result for one file of messages."""
 
     name: str
     bytes: int
-    """Of the damaged file."""
+    """Size of the damaged file."""
     messages: int | None
     """In the repaired file; None if it cannot be read."""
     losses: tuple[Loss, ...] = ()
@@ -58,11 +58,11 @@ class FileRepair:
     lost_messages: int | None = 0
     """None if unknown."""
     unverified: int = 0
-    """Messages of chunks whose checksum does not match: kept if they were requested, otherwise lost."""
+    """Messages of chunks with a wrong checksum: kept if they were requested, otherwise lost."""
     is_cut: bool = False
-    """Whether its end is missing, so that it is unknown whether more followed."""
+    """Whether its end is missing, so that more messages may have followed."""
     failed: str = ''
-    """Why it cannot be repaired; it is not in the result, or unchanged in place."""
+    """Why it cannot be repaired. Such a file is not in the result; in place, it is unchanged."""
 
     @property
     def is_damaged(self) -> bool:
@@ -71,7 +71,7 @@ class FileRepair:
 
 @dataclass(frozen=True, slots=True)
 class BagRepair:
-    """What was found, and where the result is. ``out`` is None if nothing had to be repaired."""
+    """The result of a repair; ``out`` is None if nothing had to be repaired."""
 
     path: Path
     out: Path | None
@@ -79,7 +79,7 @@ class BagRepair:
     metadata: tuple[str, ...] = ()
     """Why metadata.yaml was rebuilt; empty if it is correct, or if one file was repaired."""
     absent: tuple[str, ...] = ()
-    """Files that the metadata names and that are not there."""
+    """Files that the metadata names but that do not exist."""
 
     @property
     def is_damaged(self) -> bool:
@@ -95,36 +95,36 @@ class _Found:
     out_name: str
     report: FileRepair
     info: SliceInfo | None = None
-    """What it holds, repaired or not."""
+    """The contents, repaired or not."""
     new: Path | None = None
     """The repaired file."""
     look: tuple[int, int] = (0, 0)
-    """Size and time of the last change when it was examined."""
+    """Size and modification time when it was examined."""
 
 
 def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False, unverified: bool = False,
                progress: ProgressListener = SILENT) -> BagRepair:  # fmt: skip
-    """Raises BagError for a path without a bag and an output that exists, BagDamaged for a file of which nothing can be read."""
+    """Raises BagError if the path is not a bag or the output exists, BagDamaged if nothing can be read."""
     if path.is_file():
         return _repair_file(path, output, in_place=in_place, unverified=unverified, progress=progress)
     if output is not None and path.resolve() in (output.absolute().resolve(), *output.absolute().resolve().parents):
-        raise BagError(f'{output} is within the bag that is repaired', remedy='choose a folder next to it')
+        raise BagError(f'{output} is inside the bag', remedy='choose a folder outside the bag')
     out = path if in_place else output or path.with_name(f'{path.resolve().name}{REPAIRED}')
     if not in_place and out.exists():
-        raise _taken(out)
+        raise _name_taken(out)
     files = {name: each for name, each in files_of(path).items() if not name.endswith(UNFINISHED)}
     claimed, raw, remarks = _metadata(files)
     open_slices = [name for name in files if name.endswith(MCAP + OPEN_SUFFIX) and name.removesuffix(OPEN_SUFFIX) not in files]
     names = sorted({*slices_of(list(files), claimed), *open_slices}, key=natural_key)
     if not names:
-        raise no_bag(path)
+        raise not_a_bag(path)
     progress.begin(sum(files[name].stat().st_size for name in names))
     found = [_examine(name, files[name], progress) for name in names]
     infos = {each.out_name: each.info for each in found if each.info is not None}
     absent: tuple[str, ...] = ()
     if claimed is not None:
-        described = of_files(infos, {each.out_name: '' for each in found if each.info is None}, claimed)
-        absent, remarks = described.absent, (*remarks, *described.remarks)
+        description = describe_files(infos, {each.out_name: '' for each in found if each.info is None}, claimed)
+        absent, remarks = description.absent, (*remarks, *description.remarks)
     if all(each.report.failed for each in found):
         raise BagDamaged(found[0].report.failed, remedy=NOTHING, path=str(path))
     result = BagRepair(path, None, tuple(each.report for each in found), remarks, absent)
@@ -137,10 +137,10 @@ def repair_bag(path: Path, output: Path | None = None, *, in_place: bool = False
                 each.new = folder / (each.name + UNFINISHED if in_place else each.out_name)
                 each.new.parent.mkdir(parents=True, exist_ok=True)
                 _repair(each, progress, unverified=unverified)
-                each.report = _with_claim(each.report, claimed)
+                each.report = _with_claimed_count(each.report, claimed)
         _check_unchanged(found)
         if not in_place:
-            _copy_others(files, {METADATA, MANIFEST, *(name for each in found for name in _replaced(each))}, folder)
+            _copy_intact(files, {METADATA, MANIFEST, *(name for each in found for name in _replaced(each))}, folder)
         _describe(folder, raw, files, found)
     return replace(result, out=out, files=tuple(each.report for each in found), metadata=remarks or (CHANGED,))
 
@@ -152,28 +152,28 @@ def _repair_file(path: Path, output: Path | None, *, in_place: bool, unverified:
         raise BagDamaged(found.report.failed, remedy=NOTHING, path=str(path))
     if not found.report.is_damaged:
         return BagRepair(path, None, (found.report,))
-    out = path.with_name(found.out_name) if in_place else output or _beside(path.with_name(found.out_name))
+    out = path.with_name(found.out_name) if in_place else output or _repaired_name(path.with_name(found.out_name))
     if out.exists() and not (in_place and out == path):
-        raise _taken(out)
-    with on_disk(out):
+        raise _name_taken(out)
+    with disk_errors(out):
         found.new = out.with_name(out.name + UNFINISHED)
         found.new.unlink(missing_ok=True)
         _repair(found, progress, unverified=unverified)
         _check_unchanged([found])
         os.replace(found.new, out)
         if in_place:
-            _remove_left(found)
+            _remove_leftovers(found)
         if in_place and out != path:
             path.unlink()
         sync(out.absolute().parent)
     return BagRepair(path, out, (found.report,))
 
 
-def _taken(out: Path) -> BagError:
-    return BagError(f'{out} exists already', remedy='remove it, or choose another --to')
+def _name_taken(out: Path) -> BagError:
+    return BagError(f'{out} already exists', remedy='remove it, or choose another --to')
 
 
-def _beside(path: Path) -> Path:
+def _repaired_name(path: Path) -> Path:
     return path.with_name(f'{path.stem}{REPAIRED}{path.suffix}')
 
 
@@ -181,12 +181,12 @@ def _beside(path: Path) -> Path:
 
 
 def _examine(name: str, path: Path, progress: ProgressListener) -> _Found:
-    """What is wrong with a file, without writing anything."""
+    """Find the damage in a file, without writing anything."""
     look = _look(path)
     size, is_open = look[0], name.endswith(OPEN_SUFFIX)
     if name.endswith((SQLITE, PACKED)):
         try:
-            info = opened(LocalFile(path)).check()
+            info = open_bag_file(LocalFile(path)).check()
             report = FileRepair(name, size, info.messages)
         except BagDamaged as error:
             is_packed = name.endswith(PACKED)
@@ -209,13 +209,13 @@ def _look(path: Path) -> tuple[int, int]:
 
 
 def _check_unchanged(found: Sequence[_Found]) -> None:
-    """Raises BagError for a file that a recorder still writes."""
+    """Raises BagError if a file changed since it was examined, because a recorder still writes it."""
     for each in found:
         if _look(each.path) != each.look:
             for other in found:
                 if other.new is not None:
                     other.new.unlink(missing_ok=True)
-            raise BagError(f'{each.path} changed while it was repaired', remedy='repair it when its recorder has stopped')
+            raise BagError(f'{each.path} changed during the repair', remedy='stop its recorder first')
 
 
 def _repair(found: _Found, progress: ProgressListener, *, unverified: bool) -> None:
@@ -224,7 +224,7 @@ def _repair(found: _Found, progress: ProgressListener, *, unverified: bool) -> N
     mode = found.path.stat().st_mode & 0o777
     found.new.unlink(missing_ok=True)
     if found.name.endswith(SQLITE):
-        lost = salvage_tables(found.path, found.new)
+        lost = copy_readable_rows(found.path, found.new)
         found.new.chmod(mode)
         found.info = SqliteFile(found.new).info
         losses = (Loss(0, 0, lost, None, None, None),) if lost else ()
@@ -234,8 +234,8 @@ def _repair(found: _Found, progress: ProgressListener, *, unverified: bool) -> N
     found.info, found.report = result.info, _report(found.name, result)
 
 
-def _with_claim(report: FileRepair, claimed: Description | None) -> FileRepair:
-    """How many messages are lost by what metadata.yaml claims, if the file itself does not tell."""
+def _with_claimed_count(report: FileRepair, claimed: Description | None) -> FileRepair:
+    """Add the number of lost messages according to metadata.yaml, if the file itself does not have it."""
     known = next((part.messages for part in claimed.parts if part.name == report.name), None) if claimed is not None else None
     if known is None or report.messages is None or known < report.messages or not (report.is_cut or report.lost_messages is None):
         return report
@@ -248,17 +248,17 @@ def _report(name: str, found: McapRepair, *more: str) -> FileRepair:
 
 
 def _replaced(found: _Found) -> Sequence[str]:
-    """Names of the files that a repaired one stands for."""
-    return [found.name, *(found.name + suffix for suffix in LEFT)] if found.report.is_damaged else []
+    """Names of the files that the repaired file replaces."""
+    return [found.name, *(found.name + suffix for suffix in LEFTOVERS)] if found.report.is_damaged else []
 
 
-def _remove_left(found: _Found) -> None:
-    """What a database that was not closed had next to it is in the repaired one."""
-    for suffix in LEFT if found.name.endswith(SQLITE) else ():
+def _remove_leftovers(found: _Found) -> None:
+    """Delete the logs of a database that was not closed; the repaired one has their content."""
+    for suffix in LEFTOVERS if found.name.endswith(SQLITE) else ():
         found.path.with_name(found.path.name + suffix).unlink(missing_ok=True)
 
 
-def _copy_others(files: Mapping[str, Path], skipped: Container[str], folder: Path) -> None:
+def _copy_intact(files: Mapping[str, Path], skipped: Container[str], folder: Path) -> None:
     for name, source in files.items():
         if name not in skipped:
             _copy(source, folder / name)
@@ -273,8 +273,8 @@ def _copy(source: Path, target: Path) -> None:
 
 @contextmanager
 def _writing(out: Path, *, in_place: bool) -> Iterator[Path]:
-    """The folder to write into; a new one gets its name at the end, in place the repaired files do."""
-    with on_disk(out):
+    """The folder to write into. A new folder is renamed at the end; in place, each repaired file is."""
+    with disk_errors(out):
         if in_place:
             yield out
             return
@@ -291,16 +291,16 @@ def _writing(out: Path, *, in_place: bool) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-# -- what describes the bag ----------------------------------------------------------------------------------------------------
+# -- metadata and manifest -----------------------------------------------------------------------------------------------------
 
 
 def _metadata(files: Mapping[str, Path]) -> tuple[Description | None, Mapping[str, Any], tuple[str, ...]]:
-    """What a metadata.yaml claims, its fields, and why it must be rebuilt."""
+    """The claims of metadata.yaml, its fields, and why it must be rebuilt."""
     if METADATA not in files:
         return None, {}, ('it is missing',)
     try:
         content = read_whole(LocalFile(files[METADATA]))
-        claimed = of_metadata(content, METADATA, files)
+        claimed = describe_metadata(content, METADATA, files)
         return claimed, from_yaml(content.decode())['rosbag2_bagfile_information'], ()
     except BagDamaged as error:
         return None, {}, (error.what,)
@@ -309,7 +309,7 @@ def _metadata(files: Mapping[str, Path]) -> tuple[Description | None, Mapping[st
 def _describe(folder: Path, raw: Mapping[str, Any], files: Mapping[str, Path], found: Sequence[_Found]) -> None:
     """Write manifest.json and metadata.yaml of the result.
 
-    In place, the files get their names in between: after an interruption, a damaged file or the metadata shows what is left.
+    In place, the files are renamed between the two: after an interruption, another repair finds what remains to be done.
     """
     infos = {each.out_name: each.info for each in found if each.info is not None}
     if MANIFEST in files:
@@ -320,28 +320,28 @@ def _describe(folder: Path, raw: Mapping[str, Any], files: Mapping[str, Path], f
     for each in found:
         if each.new is not None and each.new.name.endswith(UNFINISHED):
             os.replace(each.new, folder / each.out_name)
-            _remove_left(each)
+            _remove_leftovers(each)
             if each.name != each.out_name:
                 each.path.unlink()
     sync(folder)
     slices = [replace(info, path=Path(name)) for name, info in sorted(infos.items(), key=lambda each: natural_key(each[0]))]
     custom = raw.get('custom_data')
-    said = bagfile_information(
+    information = bagfile_information(
         slices, ros_distro=str(raw.get('ros_distro') or ''),
         custom_data={str(key): str(value) for key, value in custom.items()} if isinstance(custom, Mapping) else None,
     )  # fmt: skip
-    said |= {'relative_file_paths': list(infos)}
+    information |= {'relative_file_paths': list(infos)}
     if slices and all(name.endswith((SQLITE, SQLITE + PACKED)) for name in infos):
-        said['storage_identifier'] = 'sqlite3'
-    said |= {name: str(raw.get(name) or '') for name in ('compression_format', 'compression_mode')}
-    content = to_yaml({'rosbag2_bagfile_information': said}).encode()
+        information['storage_identifier'] = 'sqlite3'
+    information |= {name: str(raw.get(name) or '') for name in ('compression_format', 'compression_mode')}
+    content = to_yaml({'rosbag2_bagfile_information': information}).encode()
     with replacing(folder / METADATA, is_synced=True) as file:
         file.write(content)
     sync(folder)
 
 
 def _manifest(manifest: Manifest, found: Sequence[_Found]) -> Manifest:
-    """With the repaired slices as they are now, and what they lost."""
+    """The manifest, updated with the repaired slices and their losses."""
     repaired = {each.out_name: each for each in found if each.report.is_damaged}
     slices, missing = [], list(manifest.missing)
     for entry in manifest.slices:

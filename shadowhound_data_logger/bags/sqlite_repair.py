@@ -1,7 +1,7 @@
-"""Copies the rows of a damaged file of rosbag2's SQLite storage that can still be read into a new one.
+"""Copies the readable rows of a damaged file of rosbag2's SQLite storage into a new file.
 
-Rows that a recorder had committed but that are still in its write-ahead log (``-wal``, next to the file) are included, and a
-transaction that it had not committed is rolled back (``-journal``).
+Committed rows that are still in the write-ahead log (``-wal``, next to the file) are included, and an uncommitted transaction is
+rolled back (``-journal``).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ TABLES: Final = ('schema', 'metadata', 'topics', 'message_definitions', 'message
 _TYPES: Final = frozenset({'INTEGER', 'TEXT', 'BLOB'})
 _LAST: Final = 1 << 62
 _LOGS: Final = ('-wal', '-journal')
-LEFT: Final = (*_LOGS, '-shm')
-"""What the names of files end with that are left of a database which was not closed; they belong to that file alone."""
+LEFTOVERS: Final = (*_LOGS, '-shm')
+"""Suffixes of the files that remain next to a database that was not closed; they belong to that database only."""
 LOST: Final = 'rows that cannot be read'
 
 
-def salvage_tables(source: Path, target: Path) -> str:
-    """Make ``target``, which must not exist; what was lost in words, or empty. Raises BagDamaged if nothing can be read."""
+def copy_readable_rows(source: Path, target: Path) -> str:
+    """Create ``target``, which must not exist; returns a description of the losses, or ''. Raises BagDamaged if unreadable."""
     with tempfile.TemporaryDirectory(prefix='.shadowhound-', dir=target.parent) as folder:
         copy = Path(folder, 'source.db3')
         shutil.copyfile(source, copy)
@@ -48,9 +48,9 @@ def salvage_tables(source: Path, target: Path) -> str:
 
 
 def _fit(path: Path) -> None:
-    """SQLite opens no file that is shorter than its header says: have the header say how many complete pages there are.
+    """Set the page count in the header to the number of complete pages: SQLite does not open a file that is shorter.
 
-    Then a row with a page that is missing cannot be read, instead of being read as zeros.
+    Rows on missing pages then fail to read, instead of being read as zeros.
     """
     with path.open('r+b') as file:
         head = file.read(32)
@@ -64,7 +64,7 @@ def _fit(path: Path) -> None:
 
 
 def _copy(database: sqlite3.Connection, new: sqlite3.Connection) -> bool:
-    """Whether something was lost."""
+    """Copy the tables; returns whether rows were lost."""
     if why := check_schema(database):
         raise ValueError(why)
     there = {str(name) for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -88,7 +88,7 @@ def _copy(database: sqlite3.Connection, new: sqlite3.Connection) -> bool:
 
 
 class _Rows:
-    """The rows of a table, by their number; those that cannot be read are skipped."""
+    """The rows of a table in the order of their rowid; unreadable rows are skipped."""
 
     def __init__(self, database: sqlite3.Connection, table: str, columns: list[str]) -> None:
         names = ', '.join(f'"{name}"' for name in columns)
@@ -113,7 +113,7 @@ class _Rows:
                 return
 
     def _skip(self, last: int) -> int:
-        """The number after which there is a row again that can be read."""
+        """The rowid after which the next readable row is."""
         step = 1
         while not self._is_readable(last + step):
             step *= 2
@@ -126,7 +126,7 @@ class _Rows:
         return high
 
     def _is_readable(self, number: int) -> bool:
-        """Whether the first row after this number can be read."""
+        """Whether the first row after this rowid is readable."""
         try:
             return self._database.execute(f'{self._query} LIMIT 1', (number,)).fetchone() is not None
         except sqlite3.DatabaseError:

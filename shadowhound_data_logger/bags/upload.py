@@ -1,4 +1,4 @@
-"""Uploads a finished bag from a folder to the store: through the spool, where it is safe until delivered, or past it."""
+"""Uploads a finished bag from a folder to the store, either through the spool, where it is safe until delivered, or directly."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.bags.fetch import on_disk
+from shadowhound_data_logger.bags.fetch import disk_errors
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
-from shadowhound_data_logger.bags.upload_plan import Outgoing, UploadPlan, archive_of, finished, plan_of
+from shadowhound_data_logger.bags.upload_plan import PlannedFile, UploadPlan, archive_of, plan_of, read_finished
 from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.config import Settings
@@ -33,9 +33,9 @@ from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.verify import compare
 
 SENDING: Final = 'sending'
-"""The folder of bags on their way into the spool, in SHADOWHOUND_HOME."""
+"""Folder for files that are created for an upload, in SHADOWHOUND_HOME."""
 PRIORITY: Final = 8
-"""As slices that the node records: after all that is smaller."""
+"""The same as for slices that the node records: after smaller objects."""
 FACTS_PRIORITY: Final = 4
 SMALL_BYTES: Final = 1 << 20
 POLL_S: Final = 0.2
@@ -46,7 +46,7 @@ CAP_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Uploaded:
-    """How much of a bag was delivered."""
+    """The result of an upload."""
 
     robot: str
     bag: str
@@ -55,7 +55,7 @@ class Uploaded:
     delivered: int
     """Files that the store confirmed; the others wait in the spool."""
     last_error: str
-    """Why they do, where that is known."""
+    """Why they wait, if known."""
 
     @property
     def is_delivered(self) -> bool:
@@ -63,10 +63,10 @@ class Uploaded:
 
 
 @contextmanager
-def planned(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[UploadPlan]:
-    """The bag as objects; what had to be made for it is gone afterwards. Raises BagError, BagDamaged, NameRefused."""
-    found = finished(folder)  # before a folder is made for it
-    with on_disk(home):
+def plan_upload(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool) -> Iterator[UploadPlan]:
+    """The plan for a bag; its temporary files are deleted afterwards. Raises BagError, BagDamaged, NameRefused."""
+    found = read_finished(folder)  # raises before a folder is created
+    with disk_errors(home):
         (home / SENDING).mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f'{bag[:64]}-', dir=home / SENDING))
         try:
@@ -78,7 +78,7 @@ def planned(folder: Path, robot: str, bag: str, home: Path, *, is_archive: bool)
 
 
 def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, progress: ProgressListener | None = None) -> Uploaded:
-    """Without the spool: returns when the store confirmed all of it. Raises BagError, StoreError."""
+    """Upload without the spool; returns when the store has confirmed all files. Raises BagError, StoreError."""
     progress = progress or ProgressListener()
     progress.begin(plan.size)
     end_s = time.monotonic() + deadline_s
@@ -90,19 +90,19 @@ def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, progr
         try:
             steadily(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
         except ForeignObject as error:
-            raise _taken(plan.bag, str(error.data.get('key'))) from error
+            raise _name_taken(plan.bag, str(error.data.get('key'))) from error
         progress.have(file.size)
 
     with ThreadPoolExecutor(THREADS, 'bag-upload') as pool:
         list(pool.map(put, range(len(plan.files) - 1)))
-    put(len(plan.files) - 1)  # the manifest says that all the others are there
+    put(len(plan.files) - 1)  # the manifest is last, because it states that all other files exist
     return Uploaded(plan.robot, plan.bag, len(plan.files), plan.size, len(plan.files), '')
 
 
 def spool_upload(plan: UploadPlan, spool: Spool) -> None:
-    """Make it durable in the spool; what is or was there already is left out. The bag's own files stay.
+    """Add the files to the spool, except those that it has or had; the bag's own files are not deleted.
 
-    Raises BagError where there is no room or another bag has the name, SpoolError.
+    Raises BagError if there is no room or another bag has the name, SpoolError.
     """
     objects: list[DataObject] = []
     placed: list[SpooledObject] = []
@@ -120,13 +120,13 @@ def spool_upload(plan: UploadPlan, spool: Spool) -> None:
         except sqlite3.Error as error:
             raise spool.unwritable(error) from error
     if len(placed) < len(objects):
-        remedy = 'raise spool.max_bytes, or send it with --direct, past the spool'
+        remedy = 'raise spool.max_bytes, or use --direct to upload it without the spool'
         raise BagError(f'the spool {spool.root} has no room for {plan.bag}: {plan.size} bytes', remedy=remedy)
 
 
 @contextmanager
-def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
-    """Raises SpoolError."""
+def open_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
+    """The open spool of this robot. Raises SpoolError."""
     spool = Spool(settings.spool_path, limits(settings.spool_path, settings.spool), clock, settings.robot)
     spool.open()
     with closing(spool):
@@ -136,7 +136,7 @@ def opened_spool(settings: Settings, clock: Clock) -> Iterator[Spool]:
 def deliver(
     settings: Settings, spool: Spool, plan: UploadPlan, *, deadline_s: float, progress: ProgressListener | None = None
 ) -> Uploaded:
-    """Wait until the store has it, delivering where no node does. Raises BagError for what the store refuses, SettingError."""
+    """Wait until the store has all files; deliver them if no node does. Raises BagError for rejected files, SettingError."""
     progress = progress or ProgressListener()
     progress.begin(plan.size)
     with delivering(spool, settings, CLOSE_S) as (uploader, _):
@@ -162,19 +162,19 @@ def _wait(spool: Spool, plan: UploadPlan, uploader: Uploader, end_s: float, prog
 
 
 def _is_done(row: sqlite3.Row | None, bag: str) -> bool:
-    """Whether it was delivered, as also what the index has forgotten. Raises BagError where it never will be."""
+    """Whether an object was delivered; the index forgets old delivered ones. Raises BagError if it never will be."""
     if row is None or row['state'] in {State.DELIVERED.value, State.DEDUPLICATED.value}:
         return True
     if row['reason'] == 'foreign':
-        raise _taken(bag, row['key'])
+        raise _name_taken(bag, row['key'])
     if row['state'] in {State.EVICTED.value, State.QUARANTINED.value}:
         text = f'{row["key"]} is {row["state"]} ({row["reason"]}), so the spool does not deliver it'
-        raise BagError(text, remedy='send it with --direct, past the spool', key=row['key'])
+        raise BagError(text, remedy='use --direct to upload it without the spool', key=row['key'])
     return False
 
 
 def _rows(spool: Spool, plan: UploadPlan) -> dict[str, sqlite3.Row]:
-    """What the spool's index says of its keys."""
+    """The rows of the plan's keys in the spool's index."""
     index = Index(spool.root / 'index.db', read_only=True)
     index.open()
     with closing(index):
@@ -185,10 +185,10 @@ def _check_names(spool: Spool, plan: UploadPlan) -> None:
     rows = _rows(spool, plan)
     for file in plan.files:
         if file.key in rows and rows[file.key]['sha256'] != file.sha256:
-            raise _taken(plan.bag, file.key)
+            raise _name_taken(plan.bag, file.key)
 
 
-def _object(file: Outgoing, path: Path) -> DataObject:
+def _object(file: PlannedFile, path: Path) -> DataObject:
     is_slice = file.name != MANIFEST and words.MESSAGES in file.metadata
     return DataObject(
         bucket=BUCKET, key=file.key, body=FileBody(path, file.size, file.sha256), content_type=file.content_type,
@@ -198,9 +198,9 @@ def _object(file: Outgoing, path: Path) -> DataObject:
 
 
 def _link_or_copy(source: Path, target: Path) -> None:
-    """A second name where that works, so that the spool takes a large file without reading it.
+    """Hard-link a large file if possible, so that the spool takes it over without reading it.
 
-    A small one is copied: `ros2 bag reindex`, say, writes metadata.yaml anew in its place.
+    Small files are copied, because programs such as `ros2 bag reindex` overwrite metadata.yaml in place.
     """
     if source.stat().st_size > SMALL_BYTES:
         with suppress(OSError):
@@ -209,13 +209,13 @@ def _link_or_copy(source: Path, target: Path) -> None:
     shutil.copyfile(source, target)
 
 
-def _taken(bag: str, key: str) -> BagError:
-    remedy = f'is it another bag? then send it under another name: --bag-name {bag}_b'
-    return BagError(f'{key} is there already with other content', remedy=remedy, key=key)
+def _name_taken(bag: str, key: str) -> BagError:
+    remedy = f'if it is another bag, upload it under another name: --bag-name {bag}_b'
+    return BagError(f'{key} already exists with other content', remedy=remedy, key=key)
 
 
 def _sweep(sending: Path) -> None:
-    """Remove what a process left that was killed: nobody holds its lock."""
+    """Delete temporary files of processes that were killed: their locks are free."""
     for path in sending.glob('*/lock'):
         with flock(path, wait=False) as is_mine:
             if is_mine:

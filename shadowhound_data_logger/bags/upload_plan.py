@@ -1,6 +1,6 @@
-"""A finished bag in a folder as the objects that it becomes: its files as they are and a manifest, or one archive.
+"""Plans the objects of a finished bag in a folder: its unchanged files and a manifest, or one archive.
 
-SQLite or MCAP, split or compressed: whatever has rosbag2's metadata.yaml. A bag that is still being written is refused.
+Accepts every bag with rosbag2's metadata.yaml: SQLite or MCAP, split or compressed. Rejects a bag that is still being written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import IO, Final, cast
 
-from shadowhound_data_logger.bags.contents import files_of, no_bag, open_folder
+from shadowhound_data_logger.bags.contents import files_of, not_a_bag, open_folder
 from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, Manifest, Missing, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, UNSAFE, prefix_of
@@ -30,12 +30,12 @@ from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 CONTENT_TYPES: Final = {'.yaml': 'application/yaml', '.json': 'application/json', '.gz': 'application/gzip'}
 _NUMBER: Final = re.compile(r'_(\d+)\.', re.ASCII)
 _UNFINISHED: Final = ('-wal', '-journal', '.open', '.part', '.tmp')
-"""What the names of files end with that somebody is still writing."""
+"""Suffixes of files that are still being written."""
 
 
 @dataclass(frozen=True, slots=True)
-class Outgoing:
-    """One file and the object that it becomes."""
+class PlannedFile:
+    """One file and its object."""
 
     name: str
     key: str
@@ -53,18 +53,18 @@ class Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class UploadPlan:
-    """A bag on its way; the manifest is the last of its files."""
+    """The files of a bag to upload; the manifest is the last one."""
 
     robot: str
     bag: str
     folder: Path
-    files: tuple[Outgoing, ...]
+    files: tuple[PlannedFile, ...]
     remarks: tuple[str, ...] = ()
-    """Where metadata.yaml contradicts the files; the manifest has what these hold."""
+    """Contradictions between metadata.yaml and the files; the manifest describes the files."""
     damaged: Mapping[str, str] = field(default_factory=dict)
-    """Files that are uploaded although they cannot be read, and why."""
+    """Unreadable files, which are uploaded anyway, and why."""
     renamed: Mapping[str, str] = field(default_factory=dict)
-    """Files whose name cannot be part of a key, and the name that they have in the store, also in its metadata.yaml."""
+    """Files whose names are invalid in a key -> their names in the store and in its metadata.yaml."""
 
     @property
     def size(self) -> int:
@@ -78,11 +78,11 @@ class FinishedBag:
     folder: Path
     description: Description
     infos: Mapping[str, SliceInfo]
-    """What its files hold, of those that can be read."""
+    """The contents of its readable files."""
 
 
-def finished(folder: Path) -> FinishedBag:
-    """Reads all summaries. Raises BagError saying why it is not a finished bag, BagDamaged where no file can be read."""
+def read_finished(folder: Path) -> FinishedBag:
+    """Read all summaries. Raises BagError if it is not a finished bag, BagDamaged if no file is readable."""
     if not folder.is_dir():
         remedy = 'name the folder that `ros2 bag record -o` made'
         raise BagError(f'{folder} is not a folder', remedy=remedy, path=str(folder))
@@ -92,26 +92,26 @@ def finished(folder: Path) -> FinishedBag:
         raise BagError(f'{folder} is not a finished bag: it has no {METADATA}', remedy=remedy, path=str(folder))
     for name, path in names.items():
         if name.endswith(_UNFINISHED) and path.stat().st_size:
-            remedy = 'is it still being recorded?'
-            raise BagError(f'{folder} is not finished: {name} is there', remedy=remedy, path=str(folder))
+            remedy = 'wait until its recorder has stopped'
+            raise BagError(f'{folder} is not finished: it has {name}', remedy=remedy, path=str(folder))
     inside = folder.resolve()
     for path in folder.rglob('*'):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
-            remedy = 'put the file itself there'
-            raise BagError(f'{path} is a link out of the bag', remedy=remedy, path=str(path))
+            remedy = 'replace the link with the file'
+            raise BagError(f'{path} is a link to a file outside the bag', remedy=remedy, path=str(path))
     reader = open_folder(folder).reader
-    described = reader.describe()
-    if not described.parts:
-        raise no_bag(folder)
-    if described.absent:
-        text = f'{folder} is not complete: {", ".join(described.absent)}, which {METADATA} names, is missing'
-        raise BagError(text, path=str(folder), remedy=f'put it there, or take its name out of {METADATA}')
-    return FinishedBag(folder, described, reader.infos())
+    description = reader.describe()
+    if not description.parts:
+        raise not_a_bag(folder)
+    if description.absent:
+        text = f'{folder} is not complete: {", ".join(description.absent)}, which {METADATA} names, is missing'
+        raise BagError(text, path=str(folder), remedy=f'add it, or remove its name from {METADATA}')
+    return FinishedBag(folder, description, reader.infos())
 
 
 def plan_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
-    """Its files as they are; the manifest is made in the folder ``work``. Raises BagError, BagDamaged, NameRefused, OSError."""
-    folder, described = found.folder, found.description
+    """A plan with the unchanged files; writes the manifest to ``work``. Raises BagError, BagDamaged, NameRefused, OSError."""
+    folder, description = found.folder, found.description
     check_name(bag, 'the bag', MAX_BAG_BYTES)
     paths = {name: path for name, path in files_of(folder).items() if name != MANIFEST}
     names = _stored_names(list(paths))
@@ -120,18 +120,19 @@ def plan_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
         paths[METADATA] = _renamed_metadata(paths[METADATA], renamed, work)
     infos = {names[name]: info for name, info in found.infos.items()}
     files = [
-        _marked(_outgoing(path, names[name], robot, bag), infos.get(names[name]), robot, bag) for name, path in paths.items()
+        _with_metadata(_outgoing(path, names[name], robot, bag), infos.get(names[name]), robot, bag)
+        for name, path in paths.items()
     ]
     manifest = _manifest(files, replace(found, infos=infos), robot, bag)
     made = work / MANIFEST
     made.write_bytes(manifest.to_json())
-    start_ns, end_ns = _kept(described.t_start_ns), _kept(described.t_end_ns)
+    start_ns, end_ns = _index_time(description.t_start_ns), _index_time(description.t_end_ns)
     files.append(replace(_outgoing(made, MANIFEST, robot, bag), t_start_ns=start_ns, t_end_ns=end_ns))
-    return UploadPlan(robot, bag, folder, tuple(files), described.remarks, described.damaged, renamed)
+    return UploadPlan(robot, bag, folder, tuple(files), description.remarks, description.damaged, renamed)
 
 
-def _safe(name: str) -> str:
-    """The nearest name that can be part of a key; of a long name, the middle is removed."""
+def _safe_name(name: str) -> str:
+    """A name that is valid in a key, changed as little as possible; the middle of a long name is removed."""
     if is_segment(name):
         return name
     found = UNSAFE.sub('_', name)
@@ -140,8 +141,8 @@ def _safe(name: str) -> str:
 
 
 def _stored_names(names: Sequence[str]) -> dict[str, str]:
-    """Each file's own name, or the nearest one that can be part of a key and that no other file of the bag has."""
-    stored = {name: '/'.join(map(_safe, name.split('/'))) for name in names}
+    """The name of each file in the store: its own, or a similar one that is valid in a key and unique in the bag."""
+    stored = {name: '/'.join(map(_safe_name, name.split('/'))) for name in names}
     taken = {name for name in names if stored[name] == name} | {MANIFEST}
     for name in names:
         if stored[name] != name:
@@ -151,9 +152,9 @@ def _stored_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _renamed_metadata(path: Path, renamed: Mapping[str, str], work: Path) -> Path:
-    """A metadata.yaml that names the files as they are in the store, made in ``work``."""
-    told = from_yaml(path.read_text(encoding='utf-8'))
-    bag = told['rosbag2_bagfile_information']
+    """A metadata.yaml with the names of the files in the store, written to ``work``."""
+    document = from_yaml(path.read_text(encoding='utf-8'))
+    bag = document['rosbag2_bagfile_information']
 
     def stored(name: str) -> str:
         return renamed.get(name) or renamed.get(PurePosixPath(name).name) or name
@@ -161,13 +162,13 @@ def _renamed_metadata(path: Path, renamed: Mapping[str, str], work: Path) -> Pat
     bag['relative_file_paths'] = [stored(each) for each in bag['relative_file_paths']]
     bag['files'] = [{**each, 'path': stored(each['path'])} for each in bag.get('files') or ()]
     made = work / METADATA
-    made.write_text(to_yaml(told), encoding='utf-8')
+    made.write_text(to_yaml(document), encoding='utf-8')
     return made
 
 
 def archive_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPlan:
-    """One ``<bag>.tar.gz`` with the bag's folder in it, made in ``work``; the same bag gives the same bytes."""
-    folder, described = found.folder, found.description
+    """A plan with one ``<bag>.tar.gz`` of the bag's folder, written to ``work``; the same bag gives the same bytes."""
+    folder, description = found.folder, found.description
     name = f'{check_name(bag, "the bag", MAX_BAG_BYTES)}{ARCHIVE}'
     path = work / name
     with (
@@ -176,43 +177,45 @@ def archive_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPl
         tarfile.open(fileobj=cast('IO[bytes]', packed), mode='w') as archive,
     ):
         for file in sorted(each for each in folder.rglob('*') if each.is_file()):
-            archive.add(file, f'{bag}/{file.relative_to(folder)}', recursive=False, filter=_nobodys)
+            archive.add(file, f'{bag}/{file.relative_to(folder)}', recursive=False, filter=_anonymous)
     key = check_key(f'{prefix_of(robot)}{name}')
-    metadata = {words.ROBOT: robot, words.BAG: bag, words.MESSAGES: str(described.messages)}
-    item = Outgoing(name, key, path, *fingerprint(path), metadata, _kept(described.t_start_ns), _kept(described.t_end_ns))
-    return UploadPlan(robot, bag, folder, (item,), described.remarks, described.damaged)
+    metadata = {words.ROBOT: robot, words.BAG: bag, words.MESSAGES: str(description.messages)}
+    item = PlannedFile(
+        name, key, path, *fingerprint(path), metadata, _index_time(description.t_start_ns), _index_time(description.t_end_ns)
+    )
+    return UploadPlan(robot, bag, folder, (item,), description.remarks, description.damaged)
 
 
-def _nobodys(member: tarfile.TarInfo) -> tarfile.TarInfo:
+def _anonymous(member: tarfile.TarInfo) -> tarfile.TarInfo:
     member.uid = member.gid = 0
     member.uname = member.gname = ''
     return member
 
 
-def _outgoing(path: Path, name: str, robot: str, bag: str) -> Outgoing:
+def _outgoing(path: Path, name: str, robot: str, bag: str) -> PlannedFile:
     key = check_key(f'{prefix_of(robot, bag)}{name}')
-    return Outgoing(name, key, path, *fingerprint(path), {words.ROBOT: robot, words.BAG: bag})
+    return PlannedFile(name, key, path, *fingerprint(path), {words.ROBOT: robot, words.BAG: bag})
 
 
-def _marked(file: Outgoing, info: SliceInfo | None, robot: str, bag: str) -> Outgoing:
-    """With what is shown of a slice without opening it."""
+def _with_metadata(file: PlannedFile, info: SliceInfo | None, robot: str, bag: str) -> PlannedFile:
+    """The file with the object metadata that describes a slice."""
     if info is None:
         return file
     number = _NUMBER.search(file.name)
-    told = {words.MESSAGES: info.messages, words.T_START_NS: info.t_start_ns, words.T_END_NS: info.t_end_ns}
-    told |= {words.SLICE: int(number[1])} if number else {}
-    metadata = {words.ROBOT: robot, words.BAG: bag, **{name: str(value) for name, value in told.items()}}
-    return replace(file, metadata=metadata, t_start_ns=_kept(info.t_start_ns), t_end_ns=_kept(info.t_end_ns))
+    facts = {words.MESSAGES: info.messages, words.T_START_NS: info.t_start_ns, words.T_END_NS: info.t_end_ns}
+    facts |= {words.SLICE: int(number[1])} if number else {}
+    metadata = {words.ROBOT: robot, words.BAG: bag, **{name: str(value) for name, value in facts.items()}}
+    return replace(file, metadata=metadata, t_start_ns=_index_time(info.t_start_ns), t_end_ns=_index_time(info.t_end_ns))
 
 
-def _kept(time_ns: int | None) -> int:
-    """For the index of the spool, which has 63 bits for a time: 0 for a time that does not fit or is unknown."""
+def _index_time(time_ns: int | None) -> int:
+    """The time for the spool's index, which stores 63 bits; 0 if it does not fit or is unknown."""
     return time_ns if time_ns is not None and time_ns < 1 << 63 else 0
 
 
-def _manifest(files: list[Outgoing], found: FinishedBag, robot: str, bag: str) -> Manifest:
-    """By what the files hold; what the bag's own manifest has of the mission and of gaps is kept."""
-    earlier = _earlier(found.folder / MANIFEST)
+def _manifest(files: list[PlannedFile], found: FinishedBag, robot: str, bag: str) -> Manifest:
+    """A manifest of the files; mission and gaps are copied from the bag's own manifest."""
+    earlier = _read_own_manifest(found.folder / MANIFEST)
     topics = tuple(RecordedTopic(topic.name, topic.type, topic.messages or 0) for topic in found.description.topics)
     entries = tuple(
         replace(SliceEntry.of(info, file.key), file=file.name, bytes=file.size, sha256=file.sha256)
@@ -225,7 +228,7 @@ def _manifest(files: list[Outgoing], found: FinishedBag, robot: str, bag: str) -
                    state=GAPS if damaged and earlier.state == COMPLETE else earlier.state)  # fmt: skip
 
 
-def _earlier(path: Path) -> Manifest | None:
+def _read_own_manifest(path: Path) -> Manifest | None:
     try:
         return Manifest.from_json(path.read_bytes(), str(path))
     except (FileNotFoundError, BagDamaged):

@@ -65,10 +65,12 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool)
     with progress('read', of='bytes') as bar:
         if isinstance(bag, Path):
             with in_folder():
-                found = verify_folder(bag, deep=deep, told=bar.have)
+                found = verify_folder(bag, deep=deep, on_progress=bar.have)
         else:
             with in_store_hint(bag), the_store(STORE_THREADS) as store:
-                found = verify_remote(store, find_bag(store, the_robot(robot, in_store=True), bag), deep=deep, told=bar.have)
+                found = verify_remote(
+                    store, find_bag(store, the_robot(robot, in_store=True), bag), deep=deep, on_progress=bar.have
+                )
     if as_json:
         checks = [{'name': each.name, 'finding': each.finding, 'checked': each.checked} for each in found.checks]
         facts = {'bag': found.bag, 'state': found.state, 'checks': checks, 'read_bytes': found.read_bytes,

@@ -10,7 +10,7 @@ from typing import Any
 import click
 from rich.text import Text
 
-from shadowhound_data_logger.bags.cut import COMES, Choice, Cut, cut_folder, cut_remote
+from shadowhound_data_logger.bags.cut import MAY_ARRIVE, Choice, Cut, cut_folder, cut_remote
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.cli.bag import (
@@ -153,5 +153,7 @@ def _told_cut(found: Cut, *, is_remote: bool) -> Iterator[str | Text]:
     if found.absent:
         yield plain(f'The bag has no topic {", ".join(found.absent)}.', 'yellow')
     if found.missing:
-        yield plain(f'Not all of that time: {", ".join(found.missing)} is not there{f"; {COMES}" if is_remote else ""}', 'yellow')
+        yield plain(
+            f'Not all of that time: {", ".join(found.missing)} is not there{f"; {MAY_ARRIVE}" if is_remote else ""}', 'yellow'
+        )
     yield from remark_lines(found.remarks)

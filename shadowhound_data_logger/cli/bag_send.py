@@ -12,7 +12,7 @@ import click
 
 from shadowhound_data_logger.bags.naming import safe_bag
 from shadowhound_data_logger.bags.record import DEADLINE_S, record
-from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, open_spool, plan_upload, spool_upload, upload_now
 from shadowhound_data_logger.bags.watch import Watch, WatchStep
 from shadowhound_data_logger.cli.bag import REPAIR, STORE_THREADS, in_folder, remark_lines, robot_option
 from shadowhound_data_logger.cli.common import (
@@ -70,14 +70,14 @@ def bag_upload(
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
     with (
         in_folder(),
-        planned(folder, robot, bag_name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
+        plan_upload(folder, robot, bag_name or safe_bag(folder.name), the_home(), is_archive=tar_gz) as sent,
         progress('sent', of='bytes') as bar,
     ):
         if direct:
             with the_store(STORE_THREADS) as store:
                 found = upload_now(store, sent, deadline_s=timeout, progress=bar)
         else:
-            with opened_spool(settings, clock) as spool:
+            with open_spool(settings, clock) as spool:
                 spool_upload(sent, spool)
                 found = deliver(settings, spool, sent, deadline_s=timeout, progress=bar)
     if as_json:
@@ -108,14 +108,14 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_
     """
     settings = Settings.load({'robot': the_robot(robot)}, os.environ)
     watching = Watch(folder.absolute(), settings, SystemClock.of_this_machine(), settle_s=settle, is_removing=remove)
-    with watching.alone():
+    with watching.exclusive():
         try:
             while True:
                 _tell(watching.round(), as_json)
                 time.sleep(settle if once else LOOK_S)
                 if once:
                     _tell(watching.round(), as_json)
-                    return exit_code(finding=watching.is_owing())
+                    return exit_code(finding=watching.has_undelivered())
         except KeyboardInterrupt:
             return ExitCode.FINE
 

@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import natural_key
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
-from shadowhound_data_logger.bags.upload import planned, upload_now
+from shadowhound_data_logger.bags.upload import plan_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -52,7 +52,7 @@ def store(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> DirectorySt
     """With that bag, uploaded."""
     home = tmp_path_factory.mktemp('home')
     found = DirectoryStore(home / 'store')
-    with planned(folder, 'thor', BAG, home, is_archive=False) as sent:
+    with plan_upload(folder, 'thor', BAG, home, is_archive=False) as sent:
         assert upload_now(found, sent, deadline_s=60).is_delivered
         assert not sent.remarks
         assert not sent.damaged

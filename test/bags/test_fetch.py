@@ -121,7 +121,7 @@ def test_what_the_store_lost_is_said_and_not_kept(store: Counting, tmp_path: Pat
     key = f'thor/rosbags/{NAME}/{NAME}_1.mcap'
     store._objects.pop((BUCKET, key))
     store.put(put_item(other, key, NAME, 1))
-    with pytest.raises(BagDamaged, match='not in the store what was recorded'):
+    with pytest.raises(BagDamaged, match='in the store is not the recorded file'):
         fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here')
     assert not (tmp_path / 'here' / NAME / f'{NAME}_1.mcap').exists()
 
@@ -175,7 +175,7 @@ def test_two_at_a_time_do_not_mix(store: Counting, tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     with (folder / f'{NAME}_0.mcap.part').open('ab') as part:
         fcntl.flock(part, fcntl.LOCK_EX)
-        with pytest.raises(BagError, match='another process fetches'):
+        with pytest.raises(BagError, match='another process is already fetching'):
             fetch(store, find_bag(store, 'thor', NAME), tmp_path / 'here')
 
 

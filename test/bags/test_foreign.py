@@ -18,7 +18,7 @@ from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import safe_bag
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
-from shadowhound_data_logger.bags.upload import planned, upload_now
+from shadowhound_data_logger.bags.upload import plan_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_folder, verify_remote
 from shadowhound_data_logger.cli.bag import bag
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
@@ -131,7 +131,7 @@ def test_the_files_count_not_the_totals_of_a_split_bag(tmp_path: Path, start: in
     assert remark.startswith('metadata.yaml claims the time 2025-10-18T12:00:')
     assert found.remarks == verify_folder(folder).remarks == cut.remarks
     store = DirectoryStore(tmp_path / 'store')
-    with planned(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+    with plan_upload(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
         upload_now(store, sent, deadline_s=60)
     described = info_of(store, 'thor', 'b', tmp_path / 'home').description
     assert (described.messages, described.t_start_ns, described.t_end_ns, described.remarks) == (30, T0, T0 + 29 * S, cut.remarks)
@@ -151,7 +151,7 @@ def test_names_that_cannot_be_part_of_a_key(tmp_path: Path) -> None:
     metadata_yaml(folder, relative_file_paths=['my_b_g_0.mcap', 'my bäg_0.mcap'], message_count=20, version=4, files=None)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     store = DirectoryStore(tmp_path / 'store')
-    with planned(folder, 'thor', safe_bag(folder.name), tmp_path / 'home', is_archive=False) as sent:
+    with plan_upload(folder, 'thor', safe_bag(folder.name), tmp_path / 'home', is_archive=False) as sent:
         assert sent.bag == 'my_b_g'
         assert sent.renamed['field notes.txt'] == 'field_notes.txt'
         assert sent.renamed['my bäg_0.mcap'] == 'my_b_g_0_1.mcap'
@@ -185,7 +185,7 @@ def test_a_torn_file_of_a_split_bag(tmp_path: Path) -> None:
     assert (cut.messages, list(cut.damaged)) == (20, ['b_1.mcap'])
     assert [check.name for check in verify_folder(folder, deep=True).findings] == ['b_1.mcap']
     store = DirectoryStore(tmp_path / 'store')
-    with planned(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+    with plan_upload(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
         assert list(sent.damaged) == ['b_1.mcap']
         upload_now(store, sent, deadline_s=60)
     remote = find_bag(store, 'thor', 'b')
@@ -237,7 +237,7 @@ def test_times_of_64_bits(tmp_path: Path) -> None:
     cut_folder(tmp_path / 'piece', tmp_path / 'again', Choice())
     assert read(tmp_path / 'again' / 'again_0.mcap') == read(folder / 'b_0.mcap')
     store = DirectoryStore(tmp_path / 'store')
-    with planned(tmp_path / 'again', 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+    with plan_upload(tmp_path / 'again', 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
         upload_now(store, sent, deadline_s=60)
     fetched = fetch(store, find_bag(store, 'thor', 'b'), tmp_path / 'fetched').folder
     for found in (info_of(store, 'thor', 'b', tmp_path / 'home'), info_folder(fetched)):

@@ -186,4 +186,4 @@ def test_slices_that_are_given_up_after_the_end_are_told_on_the_robot(tmp_path: 
         it.spool.commit([more])
         (row,) = bag_overview(MemoryStore(), ROBOT, it.home)
         assert row.state == 'growing'
-        assert row.finding == '1 of 1 slices are not here; 1 were given up by the full spool of this machine'
+        assert row.finding == '1 of 1 slices are not available; the full spool of this machine evicted 1'

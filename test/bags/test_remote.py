@@ -11,7 +11,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET
-from shadowhound_data_logger.bags.overview import BagRow, bag_overview, named_ns
+from shadowhound_data_logger.bags.overview import BagRow, bag_overview, time_in_name
 from shadowhound_data_logger.bags.remote import find_bag, find_bags, natural_key
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import BagError
@@ -53,7 +53,7 @@ def test_a_manifest_before_its_slices_is_no_complete_bag(tmp_path: Path) -> None
     write_ours(tmp_path / NAME)
     stored(store, tmp_path / NAME, without='_1.mcap')
     found = row(store, tmp_path / 'home')
-    assert (found.state, found.finding) == ('growing', '1 of 3 slices are not here yet')
+    assert (found.state, found.finding) == ('growing', '1 of 3 slices are not available yet')
     assert info_of(store, 'thor', NAME, tmp_path / 'home').missing == [f'{NAME}_1.mcap']
 
 
@@ -114,5 +114,5 @@ def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
 
 def test_the_time_in_a_name() -> None:
     """Of our recordings alone, packed or not."""
-    assert named_ns('patrol_20251018_120000') == named_ns('patrol_20251018_120000.tar.gz') == T0
-    assert named_ns('rosbag2_2025_10_18-12_00_00') is None
+    assert time_in_name('patrol_20251018_120000') == time_in_name('patrol_20251018_120000.tar.gz') == T0
+    assert time_in_name('rosbag2_2025_10_18-12_00_00') is None

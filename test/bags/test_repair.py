@@ -75,7 +75,7 @@ def test_torn_slices_of_a_bag_of_ours(ours: Path, tmp_path: Path) -> None:
     assert count(out) == first.messages + 1100
     with Reader(out) as reader:
         assert reader.message_count == first.messages + 1100
-    with pytest.raises(BagError, match='exists already'):
+    with pytest.raises(BagError, match='already exists'):
         repair_bag(ours)
 
 
@@ -199,7 +199,7 @@ def test_what_is_no_bag_at_all(tmp_path: Path) -> None:
             repair_bag(path)
     (tmp_path / 'bag').mkdir()
     shutil.copy(tmp_path / 'noise.mcap', tmp_path / 'bag' / 'bag_0.mcap')
-    with pytest.raises(BagError, match='within the bag'):
+    with pytest.raises(BagError, match='inside the bag'):
         repair_bag(tmp_path / 'bag', tmp_path / 'bag' / 'inner')
     assert sorted(path.name for path in tmp_path.iterdir()) == ['bag', 'empty', 'noise.mcap']
 

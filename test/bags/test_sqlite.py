@@ -18,8 +18,8 @@ from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.overview import bag_overview
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest
-from shadowhound_data_logger.bags.upload import planned, upload_now
-from shadowhound_data_logger.bags.upload_plan import finished
+from shadowhound_data_logger.bags.upload import plan_upload, upload_now
+from shadowhound_data_logger.bags.upload_plan import read_finished
 from shadowhound_data_logger.bags.verify import verify_folder
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
@@ -146,7 +146,7 @@ def test_a_split_bag_by_its_files(tmp_path: Path) -> None:
     metadata(folder, [f'b_{part}.db3' for part in range(3)], 4, duration={'nanoseconds': 2 * 10**9})
     assert cut_folder(folder, tmp_path / 'piece', Choice()).messages == 9
     store = DirectoryStore(tmp_path / 'store')
-    with planned(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
+    with plan_upload(folder, 'thor', 'b', tmp_path / 'home', is_archive=False) as sent:
         (remark,) = sent.remarks
         assert remark.startswith('metadata.yaml claims the time')
         upload_now(store, sent, deadline_s=60)
@@ -245,5 +245,5 @@ def test_a_field_that_metadata_lacks(tmp_path: Path, field: str) -> None:
 def test_metadata_of_nothing(tmp_path: Path) -> None:
     """Is no bag that could be uploaded."""
     (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {}')
-    with pytest.raises(BagError, match='holds no bag'):
-        finished(tmp_path)
+    with pytest.raises(BagError, match='is not a bag'):
+        read_finished(tmp_path)

@@ -17,7 +17,7 @@ from shadowhound_tower.embedded import Tower
 
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.remote import find_bag, find_bags
-from shadowhound_data_logger.bags.upload import Uploaded, deliver, opened_spool, planned, spool_upload, upload_now
+from shadowhound_data_logger.bags.upload import Uploaded, deliver, open_spool, plan_upload, spool_upload, upload_now
 from shadowhound_data_logger.bags.verify import verify_remote
 from shadowhound_data_logger.bags.watch import MARKS, Watch
 from shadowhound_data_logger.core.clock import SystemClock
@@ -48,8 +48,8 @@ def store(settings: Settings) -> DirectoryStore:
 def send(settings: Settings, folder: Path, *, is_archive: bool = False, deadline_s: float = DEADLINE_S) -> Uploaded:
     """Through the spool."""
     with (
-        planned(folder, 'thor', folder.name, settings.home, is_archive=is_archive) as sent,
-        opened_spool(settings, CLOCK) as spool,
+        plan_upload(folder, 'thor', folder.name, settings.home, is_archive=is_archive) as sent,
+        open_spool(settings, CLOCK) as spool,
     ):
         spool_upload(sent, spool)
         return deliver(settings, spool, sent, deadline_s=deadline_s)
@@ -93,7 +93,7 @@ def test_another_bag_of_that_name_is_refused(settings: Settings, store: Director
     write_ours(tmp_path / 'other' / NAME, slices=1, each=10)
     if is_now:
         with (
-            planned(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
+            plan_upload(tmp_path / 'other' / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
             pytest.raises(BagError, match='--bag-name'),
         ):
             upload_now(store, sent, deadline_s=DEADLINE_S)
@@ -125,7 +125,7 @@ def test_an_away_tower_is_no_failure(tmp_path: Path, seaweed: Tower) -> None:
     assert '127.0.0.1:9' in found.last_error
     back = Settings.load({'robot': 'thor', 'spool.min_free_bytes': 0},
                          {'SHADOWHOUND_HOME': str(tmp_path / 'home'), **seaweed.environment()})  # fmt: skip
-    with planned(tmp_path / NAME, 'thor', NAME, back.home, is_archive=False) as sent, opened_spool(back, CLOCK) as spool:
+    with plan_upload(tmp_path / NAME, 'thor', NAME, back.home, is_archive=False) as sent, open_spool(back, CLOCK) as spool:
         shutil.rmtree(tmp_path / NAME)
         assert deliver(back, spool, sent, deadline_s=DEADLINE_S).is_delivered
     with closing(open_store(back.store, back.upload)) as store:
@@ -167,8 +167,8 @@ def test_a_bag_that_is_changed_after_it_was_spooled(settings: Settings, store: D
     write_ours(tmp_path / NAME, slices=2, each=1500)
     before = contents(tmp_path / NAME)
     with (
-        planned(tmp_path / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
-        opened_spool(settings, CLOCK) as spool,
+        plan_upload(tmp_path / NAME, 'thor', NAME, settings.home, is_archive=False) as sent,
+        open_spool(settings, CLOCK) as spool,
     ):
         spool_upload(sent, spool)
         for name in ('metadata.yaml', f'{NAME}_0.mcap'):
@@ -189,7 +189,7 @@ def test_a_link_out_of_the_bag_is_refused(settings: Settings, tmp_path: Path, is
     write_ours(tmp_path / NAME, slices=1)
     (tmp_path / 'secret').write_text('secret')
     (tmp_path / NAME / 'notes.txt').symlink_to(tmp_path / 'secret')
-    with pytest.raises(BagError, match='is a link out'):
+    with pytest.raises(BagError, match='is a link to a file outside'):
         send(settings, tmp_path / NAME, is_archive=is_archive)
 
 
@@ -252,7 +252,7 @@ def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: P
     (folder / 'empty').mkdir()
     watching = watch(settings, folder, Hand())
     assert steps(watching) == []
-    assert not watching.is_owing()
+    assert not watching.has_undelivered()
     long_ago = time.time() - 700
     for path in (folder / NAME).iterdir():
         os.utime(path, (long_ago, long_ago))
@@ -260,10 +260,10 @@ def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: P
     assert (step.bag, step.what) == (NAME, 'refused')
     assert 'no metadata.yaml, and nothing in it has changed for 10 min' in step.reason
     assert steps(watching) == []
-    assert watching.is_owing()
+    assert watching.has_undelivered()
     (folder / NAME / f'{NAME}_3.mcap').write_bytes(b'more')
     assert steps(watching) == []
-    assert not watching.is_owing()
+    assert not watching.has_undelivered()
     assert not settings.home.exists()
 
 
@@ -294,7 +294,7 @@ def test_one_bad_bag_costs_itself_alone(settings: Settings, store: DirectoryStor
     hand.now = 10.0
     assert steps(watching) == [('bad', 'refused'), ('good', 'spooled'), ('good', 'stored')]
     assert steps(watching) == []
-    assert watching.is_owing()
+    assert watching.has_undelivered()
 
 
 @pytest.mark.parametrize(
@@ -310,5 +310,9 @@ def test_a_damaged_list_of_sent_bags_is_an_error(settings: Settings, tmp_path: P
 def test_two_do_not_watch_one_folder(settings: Settings, tmp_path: Path) -> None:
     """The second is told of the first."""
     watching = watch(settings, tmp_path, Hand())
-    with watching.alone(), pytest.raises(BagError, match='another process watches'), watch(settings, tmp_path, Hand()).alone():
+    with (
+        watching.exclusive(),
+        pytest.raises(BagError, match='another process watches'),
+        watch(settings, tmp_path, Hand()).exclusive(),
+    ):
         pass

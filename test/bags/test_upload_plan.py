@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, write_ours
 
-from shadowhound_data_logger.bags.upload_plan import finished
+from shadowhound_data_logger.bags.upload_plan import read_finished
 from shadowhound_data_logger.core.errors import BagDamaged
 
 BOMB = b'a: &a [x, x]\n' + b''.join(
@@ -26,7 +26,7 @@ def test_a_metadata_that_is_none_is_refused(tmp_path: Path, content: bytes) -> N
     write_ours(tmp_path / NAME, slices=1, each=5)
     (tmp_path / NAME / 'metadata.yaml').write_bytes(content)
     with pytest.raises(BagDamaged, match='is not metadata of a rosbag2 bag'):
-        finished(tmp_path / NAME)
+        read_finished(tmp_path / NAME)
 
 
 @pytest.mark.parametrize(('what', 'value'), [
@@ -39,4 +39,4 @@ def test_a_metadata_with_a_wrong_value_is_refused(tmp_path: Path, what: str, val
     path = tmp_path / NAME / 'metadata.yaml'
     path.write_text(re.sub(rf'( +)({what}:).*', rf'\1\2 {value}\n\1other_{what}:', path.read_text(), count=1))
     with pytest.raises(BagDamaged, match='is not metadata of a rosbag2 bag'):
-        finished(tmp_path / NAME)
+        read_finished(tmp_path / NAME)

@@ -137,10 +137,10 @@ def test_a_broken_manifest_is_a_finding(folder: Path) -> None:
 
 def test_what_is_no_bag_is_said(tmp_path: Path) -> None:
     """An empty folder, or one of other things."""
-    with pytest.raises(BagError, match='holds no bag'):
+    with pytest.raises(BagError, match='is not a bag'):
         verify_folder(tmp_path)
     (tmp_path / 'notes.txt').write_text('x')
-    with pytest.raises(BagError, match='holds no bag'):
+    with pytest.raises(BagError, match='is not a bag'):
         verify_folder(tmp_path)
 
 

@@ -128,7 +128,7 @@ def test_an_away_tower_leaves_it_in_the_spool(home: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(('arguments', 'error', 'text'), [
     (('info', 'patrol_2025'), BagError, f'the store has {NAME}'),
-    (('cut', NAME, '--topic', '/imv', '--to', 'new'), BagError, 'is it /imu?'),
+    (('cut', NAME, '--topic', '/imv', '--to', 'new'), BagError, 'did you mean /imu?'),
     (('cut', NAME, '--start', 'noon', '--to', 'new'), SettingError, 'seconds since the start'),
     (('list', '--since', 'tomorrow'), SettingError, 'yesterday'),
     (('upload', '/nowhere'), BagError, 'is not a folder'),
@@ -244,7 +244,7 @@ def test_repair(tmp_path: Path) -> None:
     assert (told['out'], told['is_damaged']) == (str(tmp_path / 'other'), True)
     (file,) = [each for each in told['files'] if each['losses']]
     assert (file['name'], file['messages'] + file['lost_messages'], file['losses'][0]['messages']) == (torn.name, 550, None)
-    assert 'exists already' in str(run(tmp_path, 'repair', folder).exception)
+    assert 'already exists' in str(run(tmp_path, 'repair', folder).exception)
     assert 'exclude each other' in str(run(tmp_path, 'repair', folder, '--in-place', '--to', 'x').exception)
     assert run(tmp_path, 'repair', folder, '--in-place').return_value == 1
     assert run(tmp_path, 'repair', folder, '--in-place').return_value == 0

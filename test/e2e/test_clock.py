@@ -148,8 +148,8 @@ def test_bags_of_a_clock_that_is_set_later(robot: Robot, tmp_path: Path) -> None
     for bag, early_ns, span in zip(found, began_ns, robot.spans, strict=True):
         clock = bag.manifest['clock']
         assert (clock is None) == (bag is found[-1])
-        named_ns = calendar.timegm(time.strptime(bag.folder.name, 'recording_%Y%m%d_%H%M%S')) * SECOND
-        assert early_ns - 2 * SECOND <= named_ns <= span[0]
+        time_in_name = calendar.timegm(time.strptime(bag.folder.name, 'recording_%Y%m%d_%H%M%S')) * SECOND
+        assert early_ns - 2 * SECOND <= time_in_name <= span[0]
         for message in bag.messages():
             assert span[0] - RIGHT_NS <= message.log_ns + (clock['offset_ns'] if clock else 0) <= span[1] + RIGHT_NS
     assert not list((robot.node.home / 'bags' / robot.node.robot).iterdir())

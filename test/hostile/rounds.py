@@ -30,7 +30,7 @@ from PIL import Image
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder
-from shadowhound_data_logger.bags.description import of_metadata
+from shadowhound_data_logger.bags.description import describe_metadata
 from shadowhound_data_logger.bags.fetch import fetch as fetch_bag
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
@@ -553,7 +553,7 @@ def metadata(shop: Shop) -> Round:
             for each in bag_overview(store, 'thor', shop.input / 'home'):
                 assert shown_time(each.t_start_ns)
             said(lambda: verify_folder(folder))
-            return said(lambda: of_metadata(body, 'x'))
+            return said(lambda: describe_metadata(body, 'x'))
 
     return one
 

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder
-from shadowhound_data_logger.bags.description import of_metadata
+from shadowhound_data_logger.bags.description import describe_metadata
 from shadowhound_data_logger.bags.info import info_folder
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.overview import bag_overview
@@ -126,15 +126,15 @@ FINE = {'storage': 'mcap', 'duration': '5', 'start': '7', 'name': '/a', 'qos': '
 )  # fmt: skip
 def test_metadata_that_are_none_are_damaged(changed: dict[str, str]) -> None:
     """Aliases that stand for more than there is memory, depth, dates that no clock shows, lists for texts."""
-    assert of_metadata(YAML.format(**FINE).encode(), 'x').messages == 1
+    assert describe_metadata(YAML.format(**FINE).encode(), 'x').messages == 1
     with pytest.raises(BagDamaged, match='metadata'):
-        of_metadata(YAML.format(**{**FINE, **changed}).encode(), 'x')
+        describe_metadata(YAML.format(**{**FINE, **changed}).encode(), 'x')
 
 
 def test_qos_that_is_none_is_nobodys_qos() -> None:
     """Of a topic, and only of that."""
     for qos in ("'[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[['", f"'{LAUGHS}'", '"' + 70_000 * 'a' + '"', '"- {a: 1"'):
-        assert of_metadata(YAML.format(**{**FINE, 'qos': qos}).encode(), 'x').topics[0].qos == ()
+        assert describe_metadata(YAML.format(**{**FINE, 'qos': qos}).encode(), 'x').topics[0].qos == ()
 
 
 @pytest.mark.parametrize(
