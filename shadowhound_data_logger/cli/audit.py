@@ -20,7 +20,7 @@ from shadowhound_data_logger.stores.verify import KINDS
 
 
 def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> ExitCode:
-    """Ask the store that the environment names; 0 when all is there as it was delivered, else 1."""
+    """Ask the store that the environment names; 0 if all objects are there unchanged, otherwise 1."""
     with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
         deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
         earlier, known = deliveries.verified(), deliveries.known()
@@ -69,7 +69,7 @@ def finding_lines(found: Mapping[str, Any], words: Mapping[str, str]) -> Iterato
 
 def _scope(said: Mapping[str, Any]) -> str:
     since = said['since_ns']
-    text = f'{said["store"]} was asked for {number(said["asked"])} of {number(said["known"])} delivered objects'
+    text = f'{said["store"]} was checked for {number(said["asked"])} of {number(said["known"])} delivered objects'
     text += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
     if since is not None:
         text += f', those since {shown_time(since)[:19]} UTC'
@@ -82,7 +82,7 @@ def _doubt(said: Mapping[str, Any]) -> list[RenderableType]:
     if not said['findings'] or not said['delivered_to'] or said['store'] in said['delivered_to']:
         return []
     other = ' and '.join(said['delivered_to'])
-    return [plain(f'But the node delivered to {other}: is AWS_ENDPOINT_URL set here as it is for the node?', 'yellow')]
+    return [plain(f'But the node delivered to {other}: is AWS_ENDPOINT_URL set here as for the node?', 'yellow')]
 
 
 def _verdict(said: Mapping[str, Any]) -> Text:

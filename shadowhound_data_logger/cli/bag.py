@@ -101,7 +101,7 @@ robot_option = click.option(
     '--robot',
     metavar='NAME',
     callback=robot_name,
-    help='The robot  [default: SHADOWHOUND_ROBOT, else that of this machine or store]',
+    help='The robot  [default: SHADOWHOUND_ROBOT, otherwise that of this machine or store]',
 )
 bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 
@@ -126,8 +126,8 @@ bag_or_folder = click.argument('bag', metavar='BAG|DIR', callback=_bag)
 def bag() -> None:
     """Find, download, check, cut and upload bags.
 
-    BAG is the name of a bag in the store, as `bag list` shows it. The store is the S3 server that AWS_ENDPOINT_URL names, else
-    the folder SHADOWHOUND_HOME/store. A bag in a folder is named by a path with a slash in it: ./patrol_20251018_120000
+    BAG is the name of a bag in the store, as `bag list` shows it. The store is the S3 server in AWS_ENDPOINT_URL, otherwise
+    the folder SHADOWHOUND_HOME/store. A bag in a folder is named by a path with a slash: ./patrol_20251018_120000
     """
 
 
@@ -143,11 +143,11 @@ def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
     complete   all slices are known, with their checksums
     gaps       the same, but messages were dropped while it recorded: bag info says which
     recovered  the same, after a crash or power cut: bag info says what is missing
-    foreign    not made by this package: what should be in it is not known
+    foreign    not made by this package: its intended content is unknown
 
-    Exit code 1 when something is wrong with a bag, or when the store cannot be reached: then only what is on this machine is
+    Exit code 1 if something is wrong with a bag, or if the store is unreachable: then only the bags on this machine are
     listed.
-    """  # noqa: D301 - click's mark for lines that stay as they are
+    """  # noqa: D301 - click's mark for lines that are not wrapped
     robot = the_robot(robot, in_store=True)
     begin_ns = moment('--since', since, SystemClock.of_this_machine().wall_ns()) if since else 0
     with the_store(STORE_THREADS) as store:
@@ -177,8 +177,8 @@ def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
 def bag_info(*, bag: str | Path, robot: str | None, as_json: bool) -> ExitCode:
     """Show topics, rates, times and files of a bag.
 
-    It downloads almost nothing, except of MCAP files whose summary does not have the message counts: those are read as a whole.
-    Exit code 1 when a file is missing or cannot be read.
+    It downloads very little, except for MCAP files whose summary lacks the message counts: those are read completely. Exit
+    code 1 if a file is missing or cannot be read.
     """
     if isinstance(bag, Path):
         with in_folder():
@@ -253,7 +253,7 @@ def _clock(clock: Mapping[str, str], start_ns: int | None) -> str:
         return f'was never set in boot {clock[words.BOOT_ID]}: the date is not known, and the times below are by that clock'
     offset_ns = int(clock[words.CLOCK_OFFSET_NS])
     began = f'the bag began {shown_time(start_ns + offset_ns)} UTC' if start_ns is not None else 'the bag has no messages'
-    return f'was not set yet: {began}, and {offset_ns / 1e9:.3f} s are to be added to the times below'
+    return f'was not set yet: {began}, and {offset_ns / 1e9:.3f} s must be added to the times below'
 
 
 def lost_lines(missing: Sequence[Missing]) -> Iterator[RenderableType]:

@@ -55,9 +55,9 @@ MAX_LOSSES: Final = 20
 @robot_option
 @as_json
 def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool) -> ExitCode:
-    """Check that a bag is there as it was recorded.
+    """Check that a bag is complete and intact.
 
-    Exit code 0 only when every file is sound and the bag is not growing.
+    Exit code 0 only if every file is intact and the bag is not growing.
 
     In the store, sizes and checksums are compared, and only the summary of each slice is downloaded; --deep reads everything and
     unpacks every chunk. In a folder everything is read.
@@ -85,7 +85,7 @@ def bag_verify(*, bag: str | Path, deep: bool, robot: str | None, as_json: bool)
 @click.command('repair', epilog=examples('bag repair my_bag', 'bag repair my_bag/my_bag_3.mcap --to repaired.mcap'))
 @click.argument('path', metavar='PATH', type=click.Path(path_type=Path, exists=True))
 @click.option('--to', type=click.Path(path_type=Path), metavar='PATH', help='Where to write it  [default: PATH_repaired]')
-@click.option('--in-place', is_flag=True, help='Replace the damaged files. What is damaged in them is gone then.')
+@click.option('--in-place', is_flag=True, help='Replace the damaged files; their damaged parts are lost.')
 @click.option('--keep-damaged', is_flag=True,
               help='Also keep the messages of chunks whose checksum does not match: some of them are wrong.')  # fmt: skip
 @as_json

@@ -59,8 +59,8 @@ from shadowhound_data_logger.cli.question import ranges_option
 def bag_fetch(*, bag: str, to: Path, robot: str | None, as_json: bool) -> ExitCode:
     """Download a bag, verified.
 
-    It becomes DIR/BAG. Run it again after an interruption: files that are already complete are skipped. A bag that is still
-    growing gets a metadata.yaml of what there is, so that players open it; fetch it again later for the rest.
+    The bag becomes DIR/BAG. Run it again after an interruption: complete files are skipped. A bag that is still growing gets
+    a metadata.yaml of the files so far, so that players can open it; fetch it again later for the rest.
     """
     with the_store(STORE_THREADS) as store, progress('fetched', of='bytes') as bar:
         there = find_bag(store, the_robot(robot, in_store=True), bag)
@@ -72,7 +72,7 @@ def bag_fetch(*, bag: str, to: Path, robot: str | None, as_json: bool) -> ExitCo
         plain(f'{found.folder}: {counted(found.files, "file")}, {volume(found.bytes)}; downloaded {volume(found.downloaded)}')
     ]
     if found.unverified:
-        lines.append(plain(f'No checksum is known of {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
+        lines.append(plain(f'There is no checksum for {", ".join(found.unverified)}: only the size was compared.', 'yellow'))
     elif found.missing:
         lines.append(plain(f'Not in the store yet: {", ".join(found.missing)}. Fetch it again for the rest.', 'cyan'))
     elif not found.is_complete:
@@ -107,10 +107,10 @@ def bag_cut(*, bag: str | Path, topics: tuple[str, ...], to: Path, robot: str | 
            -30                     seconds before its end
            1760788805.5            seconds since 1970
 
-    Times are those at which messages were received, as in ros2 bag play; those of --ranges are stamps of messages, which are a
-    little earlier: query --pad 1 makes each longer. Of a bag in the store, only the chunks that are needed
-    are read. Exit code 1 when a slice of that time is missing or cannot be read.
-    """  # noqa: D301 - click's mark for lines that stay as they are
+    Times are when messages were received, as in ros2 bag play; those of --ranges are stamps of messages, which are slightly
+    earlier: query --pad 1 extends each. For a bag in the store, only the required chunks are read. Exit code 1 if a slice of
+    that time is missing or cannot be read.
+    """  # noqa: D301 - click's mark for lines that are not wrapped
     choice = Choice(topics=topics, spans=None if ranges is None else _spans(ranges), **wanted)
     if isinstance(bag, Path):
         with in_folder():

@@ -60,11 +60,11 @@ def bag_upload(
 ) -> ExitCode:
     """Upload a finished bag.
 
-    SQLite or MCAP, as rosbag2 wrote it: its files as they are, and a manifest with their checksums.
+    The files of an SQLite or MCAP bag of rosbag2 are stored unchanged, with a manifest of their checksums.
 
-    The bag goes through the spool of this machine, and the command waits until the store has it. If Tower cannot be reached
-    within --timeout, the exit code is 1 and the bag stays safely in the spool: the node that runs here, or the next upload,
-    delivers it. DIR itself is never changed.
+    The bag passes through the spool of this machine, and the command waits until the store has it. If the store is
+    unreachable within --timeout, the exit code is 1 and the bag is safe in the spool: the node that runs here, or the next
+    upload, delivers it. DIR is never changed.
     """
     robot, folder = the_robot(robot), folder.absolute()
     settings, clock = Settings.load({'robot': robot}, os.environ), SystemClock.of_this_machine()
@@ -84,7 +84,7 @@ def bag_upload(
         facts = {'damaged': dict(sent.damaged), 'remarks': list(sent.remarks), 'renamed': dict(sent.renamed)}
         print_json({**asdict(found), 'is_delivered': found.is_delivered, **facts})
     else:
-        damaged = (plain(f'{name} {why}; it was uploaded as it is.', 'red') for name, why in sent.damaged.items())
+        damaged = (plain(f'{name} {why}; it was uploaded unchanged.', 'red') for name, why in sent.damaged.items())
         renamed = (f'{name} is {stored} in the store.' for name, stored in sent.renamed.items())
         print_lines(_told_upload(found), *renamed, *damaged, *([REPAIR] if sent.damaged else []), *remark_lines(sent.remarks))
     return exit_code(finding=not found.is_delivered or sent.damaged)
@@ -92,19 +92,26 @@ def bag_upload(
 
 @click.command('watch', epilog=examples('bag watch bags --remove'))
 @click.argument('folder', metavar='DIR', type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option('--settle', type=click.FloatRange(0.0, 86_400.0), default=10.0, show_default=True, help='Seconds without a change.')
+@click.option(
+    '--settle',
+    type=click.FloatRange(0.0, 86_400.0),
+    default=10.0,
+    show_default=True,
+    metavar='S',
+    help='Treat a bag as finished after S seconds without a change.',
+)
 @click.option('--remove', is_flag=True, help='Remove a bag from DIR once the store has confirmed every file of it.')
-@click.option('--once', is_flag=True, help='Look, wait for what is still changing, look again, and end: for a timer.')
+@click.option('--once', is_flag=True, help='Check twice, --settle seconds apart, and exit: for a timer.')
 @robot_option
 @as_json
 def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_json: bool, remove: bool) -> ExitCode:
     """Upload each finished bag in DIR, until Ctrl-C.
 
-    For example those of `ros2 bag record`. Each is sent once.
+    It uploads each bag once, for example those of `ros2 bag record`.
 
-    A bag is finished when it is a folder in DIR with a metadata.yaml and all files that it names, unchanged for --settle seconds.
-    DIR/.shadowhound-bags.json lists what was sent, so that a restart does not send it again. With --once, exit code 1 means that
-    a bag is not in the store yet.
+    A bag is finished if it is a folder in DIR with a metadata.yaml and all files that it names, unchanged for --settle
+    seconds. DIR/.shadowhound-bags.json lists what was uploaded, so that a restart does not upload it again. With --once, exit
+    code 1 means that a bag is not in the store yet.
     """
     settings = Settings.load({'robot': the_robot(robot)}, os.environ)
     watching = Watch(folder.absolute(), settings, SystemClock.of_this_machine(), settle_s=settle, is_removing=remove)
@@ -123,7 +130,7 @@ def bag_watch(*, folder: Path, settle: float, once: bool, robot: str | None, as_
 @click.command('record', epilog=examples('bag record kitchen --duration 60 --topic /imu --topic /odom'))
 @click.argument('name')
 @click.option('--duration', type=click.FloatRange(0.1, 86_400.0), required=True,
-              metavar='S', help='Stop after S seconds; Ctrl-C stops it earlier.')  # fmt: skip
+              metavar='S', help='Stop after S seconds, or with Ctrl-C.')  # fmt: skip
 @click.option('--topic', 'topics', multiple=True, metavar='NAME', help='Only of this topic; may be repeated.')
 @click.option('--regex', default='', help='Also topics whose name matches this regular expression.')
 @click.option(
@@ -142,8 +149,8 @@ def bag_record(*, topics: tuple[str, ...], robot: str | None, as_json: bool, **w
     The bag is NAME_YYYYMMDD_HHMMSS; without --topic and --regex it has all topics, of a Unitree those of the
     default sensors.
 
-    It needs ROS 2, but neither rosbag2 nor a running node. Slices are uploaded while it records. If Tower cannot be reached, the
-    bag waits in the spool, and the exit code is 1.
+    It needs ROS 2, but neither rosbag2 nor a running node. Slices are uploaded while it records. If the store is unreachable,
+    the bag waits in the spool and the exit code is 1.
     """
     duration, timeout = wanted.pop('duration'), wanted.pop('timeout')
     found = record(duration_s=duration, deadline_s=timeout, topics=topics, robot=the_robot(robot), **wanted)

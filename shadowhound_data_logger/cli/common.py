@@ -199,7 +199,7 @@ def the_store_settings() -> StoreSettings:
 
 
 def store_hint() -> str:
-    """To be said where nothing was found: which store it was, if nobody named one. Begins with a space, or is empty."""
+    """A hint for empty answers: which folder was the store, if no server is set. It begins with a space, or is empty."""
     return '' if the_store_settings().endpoint_url else ' AWS_ENDPOINT_URL is not set, so this folder is the store.'
 
 

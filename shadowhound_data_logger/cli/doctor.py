@@ -62,7 +62,7 @@ def _is_of(check: str, name: str) -> bool:
 
 
 @click.command(epilog=examples('doctor', 'doctor --only s3 --only clock', 'doctor --fix'))
-@click.option('--role', type=click.Choice([role.value for role in Role]), help='What this machine is  [default: guessed]')
+@click.option('--role', type=click.Choice([role.value for role in Role]), help='Role of this machine  [default: detected]')
 @click.option(
     '--only', 'checks', multiple=True, metavar='CHECK', callback=_selected, help='Run only this check; may be repeated.'
 )
@@ -70,7 +70,7 @@ def _is_of(check: str, name: str) -> bool:
 @click.option(
     '--fix',
     is_flag=True,
-    help='Repair what is safe (modes of files, missing buckets, orphaned shared memory); the rest is printed for you to paste.',
+    help='Repair what is safe (modes of files, missing buckets, orphaned shared memory); for the rest, commands are printed.',
 )
 @click.option(
     '--timeout',
@@ -84,17 +84,17 @@ def _is_of(check: str, name: str) -> bool:
               help="The node's parameter file  [default: none]")  # fmt: skip
 @click.option('--namespace', default='/', metavar='NAME', show_default=True, help='Namespace of the node, as in -r __ns:=/tachi.')
 @click.option('--rate', 'rates', multiple=True, metavar='TOPIC=HZ', callback=_rates, help='Expect this rate; may be repeated.')
-@click.option('-v', '--verbose', is_flag=True, help='Also show what is fine.')
+@click.option('-v', '--verbose', is_flag=True, help='Also show checks that passed.')
 def doctor(  # noqa: PLR0913 - one for each option
     *, role: str | None, checks: tuple[Check, ...], as_json: bool, fix: bool, timeout: float, params_file: Path | None,
     namespace: str, rates: dict[str, float], verbose: bool,
 ) -> ExitCode:  # fmt: skip
-    """Find out why it does not work, and what to do.
+    """Check this machine, its network and the store, and say what to do.
 
-    It checks this machine, its network, Tower and ROS.
+    It also checks ROS and MLflow.
 
-    It leaves probe objects of 64 bytes under ROBOT/_doctor/ in the store and in the missions of MLflow; without --fix it
-    changes nothing else. Exit code 1 on errors and warnings, 0 when there are none.
+    It writes probe objects of 64 bytes below ROBOT/_doctor/ in the store and in the missions of MLflow; without --fix it
+    changes nothing else. Exit code 1 if there are errors or warnings.
     """
     try:
         context = make(
@@ -119,7 +119,7 @@ def doctor(  # noqa: PLR0913 - one for each option
 
 
 def console() -> Console:
-    """Without a terminal nothing is broken into lines: a command is to be pasted."""
+    """Without a terminal no line is wrapped, so that commands can be pasted."""
     made = Console(highlight=False)
     if not made.is_terminal:
         made.width = 10_000
@@ -127,7 +127,7 @@ def console() -> Console:
 
 
 def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> list[Result]:
-    """With what is still under way shown meanwhile on standard error, where that is a terminal."""
+    """Checks in progress are shown on standard error if that is a terminal."""
     waiting = [check.name for check in checks]
     with progress(f'asking {", ".join(waiting)}') as bar:
 
@@ -178,7 +178,7 @@ def report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], conte
 
 
 def _verdict(findings: Sequence[Result], context: Context, took_s: float) -> Text:
-    """``3 findings: 1 error, 2 warnings``, and of which machine."""
+    """``3 findings: 1 error, 2 warnings``, and the machine."""
     where = plain(f'  {context.role.value}, robot {context.settings.robot}, {took_s:.1f} s', 'dim')
     if not findings:
         return Text.assemble(('Nothing is wrong', 'bold green'), where)

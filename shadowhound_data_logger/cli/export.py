@@ -61,9 +61,9 @@ _Command = TypeVar('_Command', bound=Callable[..., Any])
     epilog=examples('export lerobot go2_patrol --mission-type patrol --since 30d', 'export verify go2_patrol'),
 )
 def export() -> None:
-    """Make training sets of missions.
+    """Make training sets from missions.
 
-    One mission is one episode. What is missing is marked, and every value names the object that it came from.
+    One mission becomes one episode. Missing data is marked, and every value names the object that it came from.
     """
 
 
@@ -95,21 +95,21 @@ def _missions(command: _Command) -> _Command:
 @click.option('--config', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
               help='YAML file with the features of the dataset and how they are made: docs/datasets.md.')  # fmt: skip
 @click.option('--allow-gaps', is_flag=True,
-              help='Also take missions with large gaps, and those of which it is not known what is missing.')  # fmt: skip
-@click.option('--wait', is_flag=True, help='Wait until the data have arrived.')
-@click.option('--pull', is_flag=True, help='Ask robots for what they keep of these missions, and wait until it has come.')
+              help='Also take missions with large gaps or unknown losses.')  # fmt: skip
+@click.option('--wait', is_flag=True, help='Wait until the data has arrived.')
+@click.option('--pull', is_flag=True, help='First request the data that robots keep of these missions, and wait for it.')
 @click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--workers', type=click.IntRange(1, 1024), metavar='N',
-              help='Episodes at a time  [default: 1; with Ray the cores of the cluster]')  # fmt: skip
+              help='Make N episodes at a time  [default: 1; with Ray, the cores of the cluster]')  # fmt: skip
 @click.option('--ray', metavar='ADDRESS',
-              help='Make episodes on this Ray cluster; auto: that of RAY_ADDRESS, or a Ray on this machine.')  # fmt: skip
+              help='Make episodes on this Ray cluster; auto: that of RAY_ADDRESS, otherwise Ray on this machine.')  # fmt: skip
 @as_json
 def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, config: Path | None, allow_gaps: bool,  # noqa: PLR0913
                    wait: bool, pull: bool, dry_run: bool, workers: int | None, ray: str | None,
                    as_json: bool) -> ExitCode:  # fmt: skip
     """Add missions to the LeRobot dataset NAME (v3.0).
 
-    Missions that are already in it stay as they are. Exit code 1 when a mission was refused or waits: the report says why.
+    Missions that are already in it are unchanged. Exit code 1 if a mission was refused or waits: the report states why.
     """
     with exporting():
         from shadowhound_data_logger.datasets import export as library  # noqa: PLC0415

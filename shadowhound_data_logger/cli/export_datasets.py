@@ -38,13 +38,13 @@ _place = click.argument('place', metavar='DIR|s3://...')
 
 @click.command('verify', epilog=examples('export verify go2_patrol', 'export verify s3://lerobot/datasets/go2/go2_patrol --all'))
 @_place
-@click.option('--all', 'is_all', is_flag=True, help='Compare every frame with its source, not five of each episode.')
+@click.option('--all', 'is_all', is_flag=True, help='Compare every frame with its source, instead of five per episode.')
 @click.option('--deep', 'is_deep', is_flag=True, help='Compare the contents too, not only sizes and checksums.')
 @as_json
 def export_verify(*, place: str, is_all: bool, is_deep: bool, as_json: bool) -> ExitCode:
-    """Prove that a dataset is as it was written.
+    """Verify a dataset against its sources.
 
-    It checks that the files are whole, the sources unchanged, and the pictures those of their sources.
+    It checks that the files are intact, the sources unchanged, and the images those of their sources.
 
     Exit code 1 when something is wrong.
     """
@@ -70,8 +70,8 @@ def export_verify(*, place: str, is_all: bool, is_deep: bool, as_json: bool) -> 
 def _proof(found: VerifyResult, place: str) -> Iterator[Text]:
     for wrong in found.wrong[:SHOWN]:
         yield plain(f'  {wrong}', 'red')
-    said = f'{number(len(found.wrong))} things are wrong' if found.wrong else 'all is as it was written'
-    like = '' if not found.frames else f', {number(found.frames)} frames compared (least SSIM {found.least_ssim:.3f})'
+    said = f'{number(len(found.wrong))} problems' if found.wrong else 'everything is unchanged'
+    like = '' if not found.frames else f', {number(found.frames)} frames compared (lowest SSIM {found.least_ssim:.3f})'
     yield plain(f'{place}: {counted(found.episodes, "episode")}, {counted(found.files, "file")}, '
                 f'{counted(found.sources, "source")}{like}: {said}.')  # fmt: skip
 
@@ -79,12 +79,12 @@ def _proof(found: VerifyResult, place: str) -> Iterator[Text]:
 @click.command('where', epilog=examples('export where sensor-data/thor/camera/20261121/120000_front.jpg'))
 @click.argument('key')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Only in this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
+              help='Only in this dataset  [default: all on this machine and in the bucket lerobot]')  # fmt: skip
 @as_json
 def export_where(*, key: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
-    """Find the datasets and models that saw an object.
+    """Find the datasets and models that contain an object.
 
-    Models are found by the MLflow runs that lake.log_dataset marked. Exit code 1 when MLflow cannot be asked.
+    Models are found through the MLflow runs that lake.log_dataset marked. Exit code 1 if MLflow cannot be queried.
     """
     with exporting():
         from shadowhound_data_logger.lake.training import runs_trained_on  # noqa: PLC0415
@@ -137,7 +137,7 @@ def all_datasets() -> tuple[list[Path], list[DatasetPlace]]:
 
 
 def _copied() -> list[DatasetPlace]:
-    """Those of which this machine has a copy, also where the upload was cut off."""
+    """Those that have a copy on this machine, including interrupted uploads."""
     from shadowhound_data_logger.datasets.export import known_folders  # noqa: PLC0415
     from shadowhound_data_logger.datasets.transfer import DatasetPlace  # noqa: PLC0415
 
@@ -167,10 +167,10 @@ def _uses(key: str, places: tuple[str, ...]) -> Iterator[DatasetUse]:
 @click.command('drop', epilog=examples('export drop mission_20261121_120000_ab12', 'export drop MISSION --in go2_patrol'))
 @click.argument('mission')
 @click.option('--in', 'places', multiple=True, metavar='DIR|s3://...',
-              help='Only in this dataset  [default: all that this machine has, and the bucket lerobot]')  # fmt: skip
+              help='Only in this dataset  [default: all on this machine and in the bucket lerobot]')  # fmt: skip
 @as_json
 def export_drop(*, mission: str, places: tuple[str, ...], as_json: bool) -> ExitCode:
-    """Take the episode of a mission out of datasets.
+    """Remove the episode of a mission from datasets.
 
     It is not exported to them again.
 

@@ -31,20 +31,20 @@ def _words(text: str) -> tuple[str, ...]:
 
 _arm = click.option('--arm', default='soarm', show_default=True, metavar='NAME', help='Name of the arm.')
 _times = click.option('--times', type=click.Path(path_type=Path), metavar='FILE',
-                      help="When each episode began, by the arm's clock: CSV with episode,begin_ns.")  # fmt: skip
+                      help="Start of each episode by the arm's clock: CSV with episode,begin_ns.")  # fmt: skip
 
 
 @click.command('import-lerobot', epilog=examples('export import-lerobot so100_fetch --arm soarm --times begins.csv --degrees'))
 @click.argument('folder', type=click.Path(file_okay=False, path_type=Path), metavar='DIR')
 @_arm
 @_times
-@click.option('--degrees', 'is_degrees', is_flag=True, help='Its joints are in degrees: make radians of them.')
+@click.option('--degrees', 'is_degrees', is_flag=True, help='Convert joints from degrees to radians.')
 @as_json
 def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degrees: bool, as_json: bool) -> ExitCode:
     """Store a LeRobotDataset (v2.1, v3.0) of an arm.
 
-    Joints and actions; its videos stay where they are. Again, when it has grown, it adds the new episodes. Exit code 1 when an
-    episode is refused: its content changed, or the store has another recording of its time.
+    It stores joints and actions, not videos. Run it again to add new episodes. Exit code 1 if an episode is refused: its
+    content changed, or the store has another recording of its time.
     """
     with exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
@@ -57,14 +57,14 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
 @_arm
 @_times
 @click.option('--fps', type=click.FloatRange(0.1, 10000), default=50.0, show_default=True, metavar='N', help='Frames per second.')
-@click.option('--joints', default='', metavar='NAMES', help='Of qpos, in their order  [default: joint_0, joint_1, ...]')
+@click.option('--joints', default='', metavar='NAMES', help='Joint names in the order of qpos  [default: joint_0, joint_1, ...]')
 @as_json
 def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None, fps: float, joints: str,
                        as_json: bool) -> ExitCode:  # fmt: skip
     """Store HDF5 demonstrations (ACT, ALOHA) of an arm.
 
-    The n-th file is episode n, from 0. Joints and actions; pictures stay where they are. Again, with more files, it adds the new
-    episodes. Exit code 1 when an episode is refused: its content changed, or the store has another recording of its time.
+    The n-th file is episode n, from 0. It stores joints and actions, not images. Run it again with more files to add
+    episodes. Exit code 1 if an episode is refused: its content changed, or the store has another recording of its time.
     """
     with exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415

@@ -58,9 +58,9 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
           as_json: bool) -> ExitCode:  # fmt: skip
     """Download objects, verified.
 
-    Either everything under a PREFIX (thor/camera/20261121/), or what the flags select, or a training set
-    (s3://lerobot/datasets/...), which becomes the folder DIR. Run again, it downloads only what is new. Exit code 1 when
-    something could not be fetched; that nothing matches is no error.
+    It downloads everything under a PREFIX (thor/camera/20261121/), the objects that the flags select, or a training set
+    (s3://lerobot/datasets/...), which becomes the folder DIR. Objects are written to DIR/KEY. A second run downloads only
+    what is new. Exit code 1 if something could not be downloaded; it is not an error if nothing matches.
     """
     if prefix is not None and prefix.startswith('s3://') and not flags:
         return _fetch_dataset(prefix, to, is_json=as_json)

@@ -69,12 +69,12 @@ class Proposal:
 @click.option('--to', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
               help='Where to write it  [default: standard output]')  # fmt: skip
 @click.option('--duration', type=click.FloatRange(1, 600), default=10.0, show_default=True, metavar='S',
-              help='Stop after S seconds; Ctrl-C stops it earlier.')  # fmt: skip
+              help='Stop after S seconds, or with Ctrl-C.')  # fmt: skip
 @click.option('--namespace', default='/', metavar='NAME', show_default=True, help='Namespace of the node, as in -r __ns:=/tachi.')
 @click.option(
     '--robot',
     metavar='NAME',
-    help='The robot  [default: SHADOWHOUND_ROBOT, else the namespace, else the host name]',
+    help='The robot  [default: SHADOWHOUND_ROBOT, otherwise the namespace or the host name]',
 )
 @click.option('--overwrite', is_flag=True, help='Overwrite the file.')
 @as_json

@@ -43,17 +43,17 @@ if TYPE_CHECKING:
 
 SHOWN: Final = 100
 _robot = click.option('--robot', metavar='NAME', callback=robot_name,
-                      help='The robot  [default: SHADOWHOUND_ROBOT, else that of this machine or store]')  # fmt: skip
+                      help='The robot  [default: SHADOWHOUND_ROBOT, otherwise that of this machine or store]')  # fmt: skip
 _only_robot = click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
-_user = click.option('--user', metavar='NAME', help='Who does it  [default: the user of this machine]')
+_user = click.option('--user', metavar='NAME', help='Name recorded as the author  [default: the user of this machine]')
 
 
 @click.group(epilog=examples('label add stairs --robot thor --since 2026-11-20T12:30 --until 2026-11-20T12:31', 'label list'))
 def label() -> None:
     """Label times, objects and boxes in images.
 
-    Labels are in the store, next to the data. Nothing is overwritten: a removal is added, too. `query`, `fetch`,
-    `search` and `export` take --label NAME.
+    Labels are in the store, next to the data. Nothing is overwritten: a removal is also added. `query`, `fetch`, `search` and
+    `export` take --label NAME.
     """
 
 
@@ -171,7 +171,7 @@ _COLUMNS: Final = ('id', 'robot', 'label', 'from (UTC)', 'to (UTC)', 'object', '
 @_user
 @as_json
 def label_remove(*, ids: Sequence[str], robot: str | None, name: str | None, user: str | None, as_json: bool) -> ExitCode:
-    """Remove labels, by their ids or all of a name.
+    """Remove labels by id, or all with a name.
 
     A layer records the removal; what was labeled before stays in the store. Exit code 1 if some of the ids do not exist.
     """

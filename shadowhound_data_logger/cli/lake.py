@@ -58,7 +58,7 @@ only_robot = click.option('--robot', metavar='NAME', help='Only of this robot.')
 def lake() -> None:
     """Manage the tables of what is stored.
 
-    Robots write rows next to their data; the lake makes tables of them.
+    Robots write rows next to their data; the lake turns them into tables.
     """
 
 
@@ -68,7 +68,7 @@ def lake() -> None:
 def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
     """Show what the tables contain, by robot.
 
-    `waiting` are row files that are not ingested yet.
+    `waiting` counts row files that are not ingested yet.
     """
     with asking():
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
@@ -99,8 +99,8 @@ def lake_status(*, robot: str | None, as_json: bool) -> ExitCode:
 def lake_ingest(*, follow: bool, interval: float, delete_after: int | None, as_json: bool) -> ExitCode:
     """Make tables of the rows that robots wrote.
 
-    On a server with a bucket `lake` the tables are in that bucket and shared by all readers, otherwise in this user's home.
-    Each row is added once, wherever this is killed and however many run at a time. Small files are merged and ordered by time.
+    If the server has a bucket `lake`, the tables are there and shared by all readers, otherwise in this user's home. Each row
+    is added exactly once, even if this is killed or several run at a time. Small files are merged and ordered by time.
 
     Exit code 1 when rows or files are rejected: each file is named.
     """
@@ -142,12 +142,12 @@ def _about_ingest(done: Ingested, root: str) -> str:
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))
 @click.option('--robot', metavar='NAME', required=True, help='The robot.')
-@click.option('--statistics', is_flag=True, help='Instead, open objects without statistics of their fields, and add those.')
+@click.option('--statistics', is_flag=True, help='Instead, add statistics for objects that lack them.')
 @as_json
 def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
     """Add objects that the catalog lacks.
 
-    It lists the store, and reads the metadata of each object that has no row.
+    It lists the store and reads the metadata of each object without a row.
     """
     with asking():
         from shadowhound_data_logger.lake import reindex as library  # noqa: PLC0415

@@ -65,12 +65,12 @@ WORDS: Final = {**KINDS, UNLISTED: "not in the store's own catalog; `lake reinde
 def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, again: bool, as_json: bool) -> ExitCode:
     """Check that the store has what the catalog says.
 
-    It asks for every object, its size and its checksum.
+    It checks the size and checksum of every object.
 
-    All objects, or those that the flags select. If data was moved to another store, name the catalog of the old one as well:
-    only it shows what the new one lost along with its rows. Started again with the same flags within a week, an interrupted run
-    resumes where it stopped. Exit code 1 when something is not as the catalog says, or when no
-    object was selected.
+    It checks all objects, or those that the flags select. If data was moved to another store, name the catalog of the old
+    store too: only it shows what was lost together with its rows. A run that was interrupted resumes where it stopped if it
+    is started with the same flags within a week. Exit code 1 if an object does not match the catalog, or if none was
+    selected.
     """
     if catalog and 'success' in flags:
         raise BadUsage('a catalog does not say which missions failed', 'omit --failed and --succeeded, or --catalog')
@@ -123,7 +123,7 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
 @only_robot
 @click.option('--topic', metavar='NAME', help='Only of this topic.')
 @click.option('--sink', type=click.Choice(['objects', 'bags', 'events']), default='objects', show_default=True,
-              help='Messages stored by the sensors, recorded in bags, or kept by events.')  # fmt: skip
+              help='Messages stored by sensors, recorded in bags, or kept by events.')  # fmt: skip
 @click.option(
     '--since',
     metavar='TIME',
@@ -133,18 +133,18 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
 )
 @click.option('--until', metavar='TIME', default='now', show_default=True, help='Before TIME.')
 @by_option
-@click.option('--chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw it, one line for each topic.')
+@click.option('--chart', type=click.Path(path_type=Path), metavar='FILE.png', help='Draw a chart with one line per topic.')
 @click.option('--wifi', type=click.Path(path_type=Path), metavar='FILE.png',
-              help='Draw instead how fast uploads went where the robot was: where to dock.')  # fmt: skip
+              help='Draw a map of upload speed by position instead: where to dock.')  # fmt: skip
 @as_json
 def lake_coverage(*, robot: str | None, topic: str | None, sink: str, since: str, until: str, by: str,  # noqa: PLR0913 - one an option
                   chart: Path | None, wifi: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Show which hours of a topic are stored or lost.
 
-    By topic and hour, with the causes, and what is not known yet.
+    It shows each topic and hour, with the causes of losses, and what is still unknown.
 
-    Up to a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. After it, and while the
-    robot was off or could not be reached, it is not known.
+    Up to a topic's watermark everything is known: it is stored, downsampled by the settings, or in a gap. After it, and while
+    the robot was off or unreachable, it is unknown.
     """
     with asking():
         from shadowhound_data_logger.lake import gaps as library  # noqa: PLC0415 - pyarrow takes a moment
@@ -199,7 +199,7 @@ def _told(each: Coverage, by: str) -> dict[str, Any]:
 
 
 def _covered(found: Sequence[Coverage], by: str) -> Iterator[RenderableType]:
-    """A line an hour; hours one after the other of which nothing is known are one line."""
+    """One line per hour; consecutive hours without information share one line."""
     from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED  # noqa: PLC0415
 
     if not found:
@@ -253,7 +253,7 @@ def _said(rows: Rows, found: Audit, lacking: list[Any], earlier: int, *, deep: b
 
 def _page(said: Mapping[str, Any]) -> list[Any]:
     by = f'its own catalog and the one in {said["catalog"]}' if said['catalog'] else 'its own catalog'
-    asked = f'{said["store"]} was asked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
+    asked = f'{said["store"]} was checked for {number(said["asked"])} of the {number(said["known"])} objects of {by}'
     asked += f' ({number(said["asked_earlier"])} more by an earlier run)' if said['asked_earlier'] else ''
     lines: list[Any] = [plain(f'{asked}, in {duration(said["took_s"])}.')]
     if said['unproved']:

@@ -44,25 +44,26 @@ from shadowhound_data_logger.cli.lake import THREADS, only_robot
         'lake prune --keep "camera 90d, lidar 14d, bags 30d" --max-bytes 2TB',
     ),
 )
-@click.option('--keep', 'rules', required=True, metavar='RULES', help='Sensors, and for how long to keep each: "camera 90d, ..."')
+@click.option('--keep', 'rules', required=True, metavar='RULES', help='Sensors, and how long to keep each: "camera 90d, ..."')
 @click.option('--max-bytes', 'most', type=Size(), metavar='SIZE',
               help='Keep at most SIZE, such as 2TB.')  # fmt: skip
 @only_robot
 @click.option('--dry-run', is_flag=True, help='Only show what would be done.')
 @click.option('--force', is_flag=True, help='Also delete what datasets, labels and open requests refer to.')
-@click.option('--yes', is_flag=True, help='Do not ask.')
+@click.option('--yes', is_flag=True, help='Do not ask for confirmation.')
 @as_json
 def lake_prune(
     *, rules: str, most: int | None, robot: str | None, dry_run: bool, force: bool, yes: bool, as_json: bool
 ) -> ExitCode:
     """Delete old objects from the store.
 
-    By sensor and age; `bags`, `events` and `missions` are sensors here, too, and go as a whole. What no rule names stays, and so
-    does what a dataset, a label or an open request (`pull`) refers to. With --max-bytes, the oldest days of the named sensors are
-    deleted too, until no more is left. The catalog keeps the rows, as forgotten.
+    Objects are deleted by sensor and age; `bags`, `events` and `missions` count as sensors and are deleted as a whole.
+    Objects that no rule names are kept, and so is what a dataset, a label or an open request (`pull`) refers to. With
+    --max-bytes, the oldest days of the named sensors are deleted too, until no more is left. The catalog keeps the rows and
+    marks them as forgotten.
 
-    It asks before it deletes all of a sensor or, with --force, what something refers to; without a terminal it then does nothing.
-    Exit code 1 when it did nothing for that reason, or when more is left than --max-bytes.
+    It asks for confirmation before it deletes all objects of a sensor or, with --force, referenced objects; without a
+    terminal it then deletes nothing. Exit code 1 if it deleted nothing for that reason, or if more than --max-bytes is left.
     """
     with asking():
         now_ns = SystemClock.of_this_machine().wall_ns()
@@ -92,7 +93,9 @@ def lake_prune(
         if not (sys.stdin.isatty() and click.confirm('Delete it?', err=True)):
             click.echo('Nothing is deleted. --yes deletes it without asking.', err=True)
             return ExitCode.FINDING
-        made = library.plan(source, keep, exported=_exported(), findings=quietly(), **how)  # it may be labelled meanwhile
+        made = library.plan(
+            source, keep, exported=_exported(), findings=quietly(), **how
+        )  # an object may have been labeled since
     with the_store(THREADS) as target, progress() as bar:
         done = library.apply(source, target, made, now_ns=now_ns, findings=left_out, tell=bar.say)
     if as_json:

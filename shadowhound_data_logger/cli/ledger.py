@@ -52,7 +52,7 @@ ALWAYS: Final = frozenset({'published', 'received', 'missed', 'skipped', 'stored
 """The other columns appear once there is something in them."""
 LOSSES: Final = frozenset({'missed', 'rejected', 'dropped'})
 GRADED: Final = ('published', 'received', 'missed')
-"""What is known of each grade by itself."""
+"""Figures of each grade separately."""
 ACCOUNTING: Final = {
     ESTIMATED: 'its messages carry no numbers here: what was missed is estimated (~) from the rhythm of those that came',
     RECEIVED_ONLY: 'its messages carry no numbers here, and no rhythm: what was missed is not known',
@@ -80,10 +80,10 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
            until: str, cause: str) -> ExitCode:  # fmt: skip
     """Account for every message: stored, or lost and why.
 
-    ~ is an estimate, - is not known.
+    ~ marks an estimate, - an unknown figure.
 
-    Works whether or not the node runs. Exit code 1 when the ledger does not balance, or when the store does not hold what was
-    delivered; an interrupted --verify resumes where it stopped. --verify and --deep need the AWS_... variables of the node.
+    It works whether or not the node runs. Exit code 1 if the ledger does not balance, or if the store lacks delivered
+    objects; an interrupted --verify resumes where it stopped. --verify and --deep need the AWS_... variables of the node.
     Times are UTC.
     """
     folder = the_spool(spool)
@@ -121,7 +121,7 @@ def _robot(folder: Path) -> str:
 
 
 def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None, cause: str) -> bool:
-    """What has no time is left out as soon as one is asked for."""
+    """A gap without a time is skipped if a time is requested."""
     if (topic and gap.topic != topic) or (cause and cause not in {gap.cause, gap.kind}):
         return False
     if begin_ns is not None and (gap.to_ns is None or gap.to_ns < begin_ns):
@@ -182,7 +182,7 @@ def page(found: LedgerPage) -> list[RenderableType]:
 
 
 def topics_table(found: LedgerPage) -> RenderableType:
-    """One row a topic; a dash is a figure that the middleware does not tell."""
+    """One row per topic; a dash is a figure that the middleware does not provide."""
     if not found['topics']:
         return Text(f'No message of {_whose(found)} has been received yet.')
     return _table(f'Messages of {_whose(found)}', found['topics'])

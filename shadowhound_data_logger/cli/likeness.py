@@ -24,7 +24,7 @@ REASONS: Final = {
 }  # fmt: skip
 model_option = click.option(
     '--model', type=click.Path(path_type=Path, exists=True, file_okay=False), metavar='DIR',
-    help='Folder with the ONNX models of pictures and text, such as those of CLIP  [default: a perceptual hash, no model]',
+    help='Folder with the ONNX models of images and text, such as CLIP  [default: a perceptual hash, no model]',
 )  # fmt: skip
 
 
@@ -35,15 +35,15 @@ model_option = click.option(
 @model_option
 @as_json
 def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -> ExitCode:
-    """Make vectors of pictures, by which `query --like` finds them.
+    """Make vectors of images for `query --like`.
 
-    Of all pictures that the flags choose and that have none of this model yet. They are kept beside the catalog, in
-    sensor-data/_vectors/: run it again whenever there are new pictures, or after it was interrupted.
+    It embeds all images that the flags select and that have no vector of this model yet. The vectors are stored in
+    sensor-data/_vectors/: run it again when there are new images, or after an interruption.
 
-    Without --model it is the perceptual hash dHash, which finds pictures that are nearly the same. A model is a folder with
+    Without --model it uses the perceptual hash dHash, which finds nearly identical images. A model is a folder with
     vision_model.onnx and, for --like-text, text_model.onnx and tokenizer.json, as Hugging Face exports CLIP and SigLIP.
 
-    Exit code 1 when pictures could not be read.
+    Exit code 1 if images could not be read.
     """
     begun_s = time.monotonic()
     with asking():
@@ -77,7 +77,7 @@ def _told(found: Embedded, name: str, took_s: float) -> Iterator[Any]:
 
 def most_similar(source: Any, like: Path | None, text: str | None, folder: Path | None, limit: int, left_out: Findings,
            flags: Mapping[str, Any]) -> Any:  # fmt: skip
-    """The rows of the most similar pictures, with how like they are; what has no vector is said on standard error."""
+    """The rows of the most similar pictures, with their similarity; objects without a vector are reported on standard error."""
     from shadowhound_data_logger.core.untrusted import open_image  # noqa: PLC0415
     from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - the extra lake
     from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415

@@ -64,15 +64,15 @@ LOOK_S = 2.0
     '--hostname', 'names', multiple=True, metavar='HOST', help='Another name of this machine in addresses; may be repeated.'
 )
 @click.option('--uploads-mbps', type=click.FloatRange(0.0, 10_000.0), default=4.0, show_default=True,
-              help='Limit of uploads in Mbit/s while a viewer watches over the network; 0: no limit.')  # fmt: skip
+              help='Limit uploads to N Mbit/s while a viewer watches over the network; 0: no limit.')  # fmt: skip
 @click.option('--rtsp', type=click.IntRange(0, 65535), is_flag=False, flag_value=RTSP_PORT, metavar='[PORT]',
               help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
 @click.option('--tiles', default='', metavar='URL',
               help='Show places on map tiles from here, such as https://tile.example/{z}/{x}/{y}.png.')  # fmt: skip
-@click.option('--new-tokens', is_flag=True, help='Make new tokens first: everybody has to sign in again.')
-@click.option('--robot-url', metavar='URL', help="Of a store's page: relay the live view of this robot's own page.")
+@click.option('--new-tokens', is_flag=True, help='Make new tokens: all viewers must sign in again.')
+@click.option('--robot-url', metavar='URL', help="Relay the live view from this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
-              help="The file with a viewer's token there.")  # fmt: skip
+              help="File with a viewer's token for --robot-url.")  # fmt: skip
 @click.option('--robot', metavar='NAME', envvar='SHADOWHOUND_ROBOT', callback=robot_name,
               help='The robot  [default: the one that ran here]')  # fmt: skip
 @spool_folder
@@ -80,14 +80,14 @@ LOOK_S = 2.0
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
          uploads_mbps: float, rtsp: int | None, tiles: str, new_tokens: bool, robot_url: str | None,
          robot_token: Path | None, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
-    """Serve a page that shows robot and data.
+    """Serve a web page that shows the robot and its data.
 
-    It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any moment before. On a
-    machine without a spool it is the page of the store: the past of every robot that has a folder there. It changes when a node
-    starts there.
+    It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any earlier moment. On
+    a machine without a spool it is the page of the store: the past of every robot that has a folder there. That changes when a
+    node starts on this machine.
 
-    Ctrl-C ends it. On 127.0.0.1 everybody on this machine may watch; other addresses need a token. Actions (bags, events, flush,
-    pause) always need the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
+    Ctrl-C stops it. On 127.0.0.1 every user of this machine can watch; other addresses require a token. Actions (bags,
+    events, flush, pause) always require the operator's token. The tokens are files in SHADOWHOUND_HOME/live.
     """
     try:
         from shadowhound_data_logger.live.access import RTSP_FILE, make_tokens  # noqa: PLC0415 - loaded by this verb alone

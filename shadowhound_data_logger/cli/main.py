@@ -20,27 +20,27 @@ from shadowhound_data_logger.cli.common import MEANINGS, PROGRAM, BadUsage, Exit
 from shadowhound_data_logger.core.errors import DataLoggerError, SettingError, UnknownName
 
 SECTIONS: Final[dict[str, Sequence[Verb]]] = {
-    'On every machine': (Verb('doctor', 'Find out why it does not work, and what to do.'),),
+    'On every machine': (Verb('doctor', 'Check this machine, its network and the store, and say what to do.'),),
     'On the robot': (
         Verb('init', 'Write a parameter file for this robot.'),
-        Verb('status', 'Show what the node on this machine does now.'),
+        Verb('status', 'Show what the node on this machine is doing.'),
         Verb('ledger', 'Account for every message: stored, or lost and why.'),
         Verb('spool', 'Show what is not in the store yet, and why.'),
         Verb('node', 'Control the node on this machine, without ROS.'),
-        Verb('live', 'Serve a page that shows robot and data.'),
+        Verb('live', 'Serve a web page that shows the robot and its data.'),
     ),
-    'On Tower and Spark': (
-        Verb('query', 'Search what is stored, by flags or SQL.'),
-        Verb('search', 'Search what was said: missions, events, errors, labels.'),
+    'On servers and workstations': (
+        Verb('query', 'Query what is stored, with flags or SQL.'),
+        Verb('search', 'Search the words of missions, events, errors and labels.'),
         Verb('fetch', 'Download objects, verified.'),
         Verb('pull', 'Request data that a robot keeps (ship: on_request).'),
         Verb('bag', 'Find, download, check, cut and upload bags.'),
         Verb('lake', 'Manage the tables of what is stored.'),
         Verb('label', 'Label times, objects and boxes in images.'),
-        Verb('export', 'Make training sets of missions.'),
+        Verb('export', 'Make training sets from missions.'),
     ),
     'Missions': (Verb('missions', 'Show and send missions logged on this machine.'),),
-    'Policies': (Verb('policy', 'Bring trained policies to robots, signed.'),),
+    'Policies': (Verb('policy', 'Sign trained policies and deliver them to robots.'),),
 }
 """The verbs by who needs them, in the order of the help."""
 NO_VERB: Final[tuple[type[click.ClickException], ...]] = (
@@ -78,8 +78,9 @@ class Verbs(click.Group):
 def cli() -> None:
     """See, find and move the data of a robot, in its spool and in the store.
 
-    SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one that ran
-    here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with --json.
+    SHADOWHOUND_HOME is the folder of the spool (default ~/.shadowhound), SHADOWHOUND_ROBOT the robot (default: the one whose
+    node ran here), AWS_ENDPOINT_URL the S3 server (default: the folder SHADOWHOUND_HOME/store). Most verbs print JSON with
+    --json.
     """
 
 
@@ -103,7 +104,7 @@ def main() -> None:
         if sys.stdout is not None:
             sys.stdout.flush()
         sys.exit(code)
-    except BrokenPipeError:  # whoever reads the output has enough of it, as `head` has
+    except BrokenPipeError:  # the reader of the output has enough of it, such as `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(ExitCode.FINDING)
     except click.exceptions.Exit as error:

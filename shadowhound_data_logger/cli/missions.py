@@ -66,7 +66,7 @@ _mission = click.argument('folder', metavar='ID', callback=_folder)
 def missions() -> None:
     """Show and send missions logged on this machine.
 
-    ID is the id of a mission or of its MLflow run, or the beginning of one.
+    ID is the id of a mission or of its MLflow run, or its first characters.
     """
 
 
@@ -75,7 +75,7 @@ def missions() -> None:
 def list_(*, as_json: bool) -> ExitCode:
     """List the missions, the newest last.
 
-    Exit code 1 if an ended mission is not sent.
+    Exit code 1 if a mission has ended and is not sent.
     """
     where = the_home()
     found = overviews(where)
@@ -114,7 +114,7 @@ def show(*, folder: MissionFolder, as_json: bool) -> ExitCode:
 def resume(*, timeout: float, experiment: str | None, as_json: bool) -> ExitCode:
     """Send what is unsent, and wait for it.
 
-    Exit code 1 if something is left after the deadline; sending continues for ten more minutes in the background.
+    Exit code 1 if something is left after --timeout; sending continues for ten more minutes in the background.
     """
     where = the_home()
     if not _late(overviews(where)):
@@ -150,7 +150,7 @@ def resume(*, timeout: float, experiment: str | None, as_json: bool) -> ExitCode
 def export_(*, folder: MissionFolder, kind: str, to: IO[str], as_json: bool) -> ExitCode:
     """Write one mission to JSON or CSV.
 
-    All points, events and parameters, as they were logged on this machine, without MLflow.
+    It writes all points, events and parameters that were logged on this machine, without MLflow.
     """
     found = export(folder)
     if as_json or kind == 'json':

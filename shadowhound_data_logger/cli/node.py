@@ -38,10 +38,9 @@ def _of_node(verb: F) -> F:
 def node() -> None:
     """Control the node on this machine, without ROS.
 
-    These verbs do what its services and parameters do.
+    These verbs do the same as its services and parameters.
 
-    They talk to the node through a socket in the spool: run them as the node's user. Exit code 1 when the node refuses, fails, or
-    does not run.
+    They use a socket in the spool: run them as the node's user. Exit code 1 if the node refuses, fails, or does not run.
     """
 
 
@@ -57,14 +56,14 @@ def _add(group: click.Group, name: str, do: str, text: str) -> None:
         return _ask(spool, robot, do, as_json=as_json)
 
 
-_add(node, 'flush', 'flush', 'Write everything received so far to disk, open batches too.')
-_add(node, 'pause', 'pause', 'Store nothing from now on; uploads continue.')
-_add(node, 'resume', 'resume', 'Store messages again.')
-_add(bag, 'start', 'bag start', 'Begin a bag and print its name.')
-_add(bag, 'stop', 'bag stop', 'End the bag.')
-_add(bag, 'split', 'bag split', 'End the file that is being written, so that it is uploaded now.')
-_add(bag, 'pause', 'bag pause', 'Record nothing until it is resumed; messages are counted.')
-_add(bag, 'resume', 'bag resume', 'Record again.')
+_add(node, 'flush', 'flush', 'Write everything received so far to disk, including open batches.')
+_add(node, 'pause', 'pause', 'Stop storing messages; uploads continue.')
+_add(node, 'resume', 'resume', 'Resume storing messages.')
+_add(bag, 'start', 'bag start', 'Start a bag and print its name.')
+_add(bag, 'stop', 'bag stop', 'Stop the bag.')
+_add(bag, 'split', 'bag split', 'Close the current file, so that it is uploaded now.')
+_add(bag, 'pause', 'bag pause', 'Pause recording; messages are still counted.')
+_add(bag, 'resume', 'bag resume', 'Resume recording.')
 
 
 @node.command(epilog=examples('node event', "node event slipped --note 'wet floor'"))
@@ -72,9 +71,9 @@ _add(bag, 'resume', 'bag resume', 'Record again.')
 @click.option('--note', default='', metavar='TEXT', help='A remark.')
 @_of_node
 def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
-    """Save the seconds before and after now as a bag.
+    """Save the seconds before and after this moment as a bag.
 
-    It prints the name of the bag. If an event is under way, that one is extended instead.
+    It prints the name of the bag. If an event is being recorded, that one is extended instead.
     """
     return _ask(spool, robot, 'event', as_json=as_json, name=name, note=note)
 
@@ -85,9 +84,10 @@ def event(*, name: str, note: str, robot: str | None, spool: Path | None, as_jso
 @click.argument('value')
 @_of_node
 def set_(*, name: str, value: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
-    """Set a parameter until the node ends.
+    """Set a parameter until the node exits.
 
-    The value is written as in a parameter file: 5.0, true, or a word. `shadowhound-data node params` says which can be set.
+    The value is written as in a parameter file: 5.0, true, or a word. `shadowhound-data node params` shows which parameters
+    can be set.
     """
     return _ask(spool, robot, 'set', as_json=as_json, values={name: _value(value)})
 
@@ -104,9 +104,9 @@ def get(*, name: str, robot: str | None, spool: Path | None, as_json: bool) -> E
 @click.argument('prefix', default='', metavar='[SENSOR|GROUP]')
 @_of_node
 def params(*, prefix: str, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:
-    """List the parameters, and which can be set now.
+    """List the parameters and whether they can be set at run time.
 
-    All of them, or those of a sensor or group.
+    It lists all of them, or those of a sensor or group.
     """
 
     def chosen(answer: dict[str, Any]) -> dict[str, Any]:
@@ -148,12 +148,12 @@ def _table(answer: dict[str, Any]) -> Iterator[RenderableType]:
 
 
 def _shown(value: object) -> str:
-    """As it is written in a parameter file."""
+    """In the syntax of a parameter file."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def _value(text: str) -> object:
-    """As ``ros2 param set`` reads it, which is YAML 1.1; what is none is the text itself."""
+    """In YAML 1.1, as ``ros2 param set`` reads it; otherwise the text itself."""
     yaml = YAML(typ='safe', pure=True)
     yaml.version = (1, 1)
     try:

@@ -27,7 +27,7 @@ UNITS: Final = ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min'), (60, 'min', 1, 
 
 
 def print_json(value: object, *, is_line: bool = False) -> None:
-    """On standard output, for programs: one value, or one of many, a line each. What JSON does not know is told as text."""
+    """On standard output, for programs: one value, or one of many, a line each. Other types are written as text."""
     click.echo(json.dumps(value, indent=None if is_line else 2, default=str))
 
 
@@ -60,7 +60,7 @@ def print_lines(*lines: str | Text, console: Console | None = None) -> None:
 
 
 def plain(text: object, style: str = '') -> Text:
-    """Text from outside, as it is: no markup in it is obeyed, and a control character becomes a question mark."""
+    """Text from outside, verbatim: markup has no effect, and a control character becomes a question mark."""
     return Text(printable(str(text)), style)
 
 
@@ -150,7 +150,7 @@ def share_bar(share: float, console: Console) -> Text:
 
 
 def number(value: int | None) -> str:
-    """With separators; a dash for what is not known."""
+    """With separators; a dash if it is unknown."""
     return '-' if value is None else f'{value:,}'
 
 
@@ -195,7 +195,7 @@ def shown_by(by: str) -> str:
 
 
 def shown_time(time_ns: int | None) -> str:
-    """UTC, to the millisecond; a dash for what is not known."""
+    """UTC, to the millisecond; a dash if it is unknown."""
     if time_ns is None:
         return '-'
     when = datetime.fromtimestamp(time_ns // SECOND, timezone.utc)
@@ -208,7 +208,7 @@ def shown_iso(stamp: str) -> str:
 
 
 def with_dates(value: Mapping[str, Any]) -> dict[str, Any]:
-    """For JSON: with each ``..._ns`` told as a date as well, to the nanosecond."""
+    """For JSON: with each ``..._ns`` as a date, too, to the nanosecond."""
     dates = {name.removesuffix('_ns'): _iso_or_none(time) for name, time in value.items() if name.endswith('_ns')}
     return {**value, **dates}
 

@@ -408,7 +408,7 @@ def _allowed(spec: Field[Any]) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A value as it is written in a parameter file."""
+    """A value in the syntax of a parameter file."""
     if isinstance(value, bool):
         return f'`{str(value).lower()}`'
     if isinstance(value, Sequence) and not isinstance(value, str):

@@ -42,10 +42,10 @@ from shadowhound_data_logger.policies.registry import MlflowRegistry
     epilog=examples('policy publish packed --alias champion', 'policy sync --name go2_patrol'),
 )
 def policy() -> None:
-    """Bring trained policies to robots, signed.
+    """Sign trained policies and deliver them to robots.
 
-    MLflow's registry says which version runs (alias champion), the store has its bytes, and The Update Framework says whether it
-    may run: a robot trusts the root.json that was installed on it, and the keys that this names.
+    MLflow's registry selects the version (alias champion), the store has its bytes, and The Update Framework decides whether
+    it may run: a robot trusts the root.json that was installed on it, and the keys that it names.
     """
 
 

@@ -41,7 +41,7 @@ JITTER: Final = 0.2
 """Of the time between two looks: a fleet that was switched on together does not ask together."""
 _isolation = click.option(
     '--isolation', envvar='SHADOWHOUND_POLICY_ISOLATION', type=click.Choice(ISOLATIONS), default=SANDBOX, show_default=True,
-    help='The least that a smoke run has to be in; limits: it may run with the rights of this user.',
+    help='Weakest isolation that a smoke run may have; limits: it may run with the rights of this user.',
 )  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def _follows(verb: _Verb) -> _Verb:
 @_follows
 @as_json
 def sync(*, as_json: bool, **given: Any) -> ExitCode:
-    """Take what the registry says, once."""
+    """Install the version that the registry selects, once."""
     with _syncing(given) as one:
         result = one.run()
     print_json(_told(result)) if as_json else click.echo(_sentence(result))
@@ -89,8 +89,8 @@ def run(*, interval: float, as_json: bool, **given: Any) -> ExitCode:
 
     With --json, each change is one line of JSON on standard output.
 
-    A Tower that is away changes nothing: what is active goes on. Where there is ROS, the node shadowhound_policy publishes the
-    active version as ~/policy (std_msgs/String, latched), and takes word of its health on ~/health.
+    An unreachable server changes nothing: the active version stays active. With ROS, the node shadowhound_policy publishes
+    the active version as ~/policy (std_msgs/String, latched) and receives reports of its health on ~/health.
     """
     logging.basicConfig(level=logging.INFO, format='%(message)s')
     logging.getLogger('tuf').setLevel(logging.WARNING)
@@ -187,9 +187,9 @@ def use(*, name: str, now: bool, isolation: str, as_json: bool) -> ExitCode:
 @click.command(epilog=examples('policy rollback'))
 @as_json
 def rollback(*, as_json: bool) -> ExitCode:
-    """Go back to the last good version, at once.
+    """Roll back to the last good version immediately.
 
-    What was active is not taken again, unless policy use brings it back.
+    The version that was active is not installed again, unless policy use activates it.
     """
     active = _policies().roll_back()
     print_json({'active': active}) if as_json else click.echo(f'active: {active or "none"}')
@@ -199,7 +199,7 @@ def rollback(*, as_json: bool) -> ExitCode:
 @click.command(epilog=examples('policy pin'))
 @as_json
 def pin(*, as_json: bool) -> ExitCode:
-    """Stay with the active version, whatever the registry says."""
+    """Keep the active version, whatever the registry selects."""
     pinned = _policies().pin()
     print_json({'pinned': pinned}) if as_json else click.echo(f'pinned: {pinned}')
     return ExitCode.FINE
@@ -216,12 +216,12 @@ def unpin(*, as_json: bool) -> ExitCode:
 
 @click.command(epilog=examples('policy report --failures 4', 'policy report --p99-ms 180'))
 @click.option('--failures', type=click.IntRange(0), default=0, help='Failed steps among the last 100.')
-@click.option('--p99-ms', type=click.FloatRange(0.0), default=0.0, help='p99 of a step.')
+@click.option('--p99-ms', type=click.FloatRange(0.0), default=0.0, help='99th percentile of the duration of a step.')
 @as_json
 def report(*, failures: int, p99_ms: float, as_json: bool) -> ExitCode:
-    """Report how the active version does.
+    """Report the health of the active version.
 
-    Beyond the limits of its manifest it is rolled back.
+    A version that exceeds the limits of its manifest is rolled back.
     """
     folder = _policies()
     name = folder.current()
@@ -269,12 +269,12 @@ def _syncing(given: dict[str, Any]) -> Iterator[PolicySync]:
 
 @contextmanager
 def _telling() -> Iterator[None]:
-    """The topics of the policy meanwhile, where there is ROS."""
+    """The topics of the policy during that time, if ROS is installed."""
     try:
         from shadowhound_data_logger.ros.policy_topics import telling  # noqa: PLC0415 - ROS is not everywhere
     except ImportError as error:
         print(
-            f'without ROS ({error}): ~/policy is not published, and only `policy report` tells of health',
+            f'without ROS ({error}): ~/policy is not published, and only `policy report` reports health',
             file=sys.stderr,
             flush=True,
         )

@@ -46,8 +46,8 @@ _key = click.option(
     '--key', type=_file, metavar='FILE', help='Private key to sign with  [default: targets.key in the folder of keys]'
 )
 _root_keys = click.option('--root-key', 'publics', type=_file, multiple=True, metavar='PUB',
-                          help='Public key of a person who keeps a part of the root; may be repeated.')  # fmt: skip
-_encrypt = click.option('--encrypt', is_flag=True, help='Ask for a passphrase for the keys that are made, except online.key.')
+                          help='Public key of a person who holds a part of the root; may be repeated.')  # fmt: skip
+_encrypt = click.option('--encrypt', is_flag=True, help='Protect the new keys, except online.key, with a passphrase.')
 
 
 @click.command(epilog=examples('policy keys', 'policy keys --person alice',
@@ -62,10 +62,10 @@ _encrypt = click.option('--encrypt', is_flag=True, help='Ask for a passphrase fo
 @as_json
 def keys(*, publics: tuple[Path, ...], threshold: int, person: str | None, encrypt: bool, folder: Path | None, as_json: bool
          ) -> ExitCode:  # fmt: skip
-    """Make the keys that say which policies may run.
+    """Make the keys that sign policies.
 
-    A team of one gets root.key, which goes offline, targets.key, which signs versions, online.key, which dates them, and
-    root.json for robots. With --root-key, several people keep the root: each signs root.json by policy sign-root.
+    A team of one gets root.key, to be kept offline, targets.key, which signs versions, online.key, which dates them, and
+    root.json for robots. With --root-key, several people hold the root: each signs root.json with policy sign-root.
     """
     place, passphrase = _keys_folder(folder), _new_passphrase() if encrypt else ''
     files, roots, _ = _signers()
@@ -99,7 +99,7 @@ def sign_root(*, root: Path, key: Path, as_json: bool) -> ExitCode:
     roots = _signers()[1]
     lines = [*roots.described(root)]
     if not as_json:
-        click.echo('\n'.join(lines))  # before the passphrase is asked for
+        click.echo('\n'.join(lines))  # before the prompt for the passphrase
     found = roots.sign_root(root, key, _passphrase)
     missing = f', {found.missing} missing' if found.missing else ': complete'
     told = {'root': str(root), 'content': lines, 'signatures': found.signed, 'missing_signatures': found.missing}
@@ -122,8 +122,8 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
            folder: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Replace keys that may have been stolen.
 
-    By default those are targets.key and online.key.
-    Robots learn of it from the store. What others signed with the old keys is no longer listed.
+    By default it replaces targets.key and online.key. Robots learn of it from the store. What others signed with the old keys
+    is no longer listed.
     """
     if (publics or threshold) and 'root' not in roles:
         raise BadUsage('--root-key and --threshold are of a new root', 'policy rotate root --root-key alice.pub')
@@ -155,7 +155,7 @@ def rotate(*, roles: tuple[str, ...], secrets: tuple[Path, ...], publics: tuple[
 @click.command(epilog=examples("policy delegate alice.pub --for 'go2/go2_patrol/*'", 'policy delegate alice --revoke'))
 @click.argument('who', metavar='PUB|NAME')
 @click.option('--for', 'paths', multiple=True, metavar='PATTERN', help='ROBOT_TYPE/POLICY/VERSION, * for any; may be repeated.')
-@click.option('--revoke', is_flag=True, help='Take the right from NAME: robots no longer run what only that key listed.')
+@click.option('--revoke', is_flag=True, help='Revoke the right of NAME: robots no longer run what only that key listed.')
 @_key
 @_signs
 @as_json
@@ -182,8 +182,8 @@ def delegate(*, who: str, paths: tuple[str, ...], revoke: bool, key: Path | None
 def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
     """Renew the signed timestamp, once a day.
 
-    It needs online.key and runs from cron.
-    It takes in what other signers have published, and puts a root in force that has all its signatures by now.
+    It needs online.key and runs from cron. It includes what other signers have published, and activates a root once it has
+    all its signatures.
     """
     with _signing(folder, expires / DAY_NS) as signing:
         state = signing.refresh()
@@ -198,8 +198,8 @@ def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
 @click.command(epilog=examples('policy pack outputs/go2_patrol --name go2_patrol --smoke sample.npz --to packed'))
 @click.argument('folder', metavar='DIR', type=_folder)
 @click.option('--name', required=True, metavar='NAME', help='Name of the registered model.')
-@click.option('--version', type=click.IntRange(1), help="Its version  [default: the registry's next one]")
-@click.option('--smoke', type=_file, required=True, metavar='NPZ', help='An array for each input, for the smoke run.')
+@click.option('--version', type=click.IntRange(1), help="Version of the policy  [default: the registry's next one]")
+@click.option('--smoke', type=_file, required=True, metavar='NPZ', help='Sample arrays, one per input, for the smoke run.')
 @click.option('--dataset', default='', metavar='DIGEST', help='Digest of the training set.')
 @click.option('--run', 'run_id', default='', metavar='ID', help='MLflow run that trained it.')
 @click.option(
@@ -217,17 +217,17 @@ def refresh(*, expires: int, folder: Path | None, as_json: bool) -> ExitCode:
 @click.option('--tolerance', type=click.FloatRange(0.0, min_open=True), default=1e-4, show_default=True,
               help="How much the sample's output may differ on a robot.")  # fmt: skip
 @click.option('--max-p99-ms', 'p99_ms', type=click.FloatRange(0.0, min_open=True), default=100.0, show_default=True,
-              help='Longest p99 of a step that is allowed.')  # fmt: skip
+              help='Maximum p99 of the duration of a step.')  # fmt: skip
 @click.option('--max-failures', 'failures', type=click.IntRange(0), default=3, show_default=True,
-              help='Failed steps among the last 100 that are allowed.')  # fmt: skip
+              help='Maximum of failed steps among the last 100.')  # fmt: skip
 @click.option('--to', type=click.Path(path_type=Path), required=True, metavar='DIR', help='Where to write it.')
 @as_json
 def pack(*, folder: Path, name: str, version: int | None, smoke: Path, to: Path, run_id: str, as_json: bool, **given: Any
          ) -> ExitCode:  # fmt: skip
-    """Make a folder with a manifest of what a training wrote.
+    """Pack the output of a training into a folder with a manifest.
 
-    DIR has model.onnx in one file, and beside it .json, .safetensors and .npy files. The model runs once, to note what the smoke
-    run on a robot has to give.
+    DIR has model.onnx as one file, and .json, .safetensors and .npy files. The model runs once, to record the expected output
+    of the smoke run on a robot.
     """
     number = version or 1 + max((each.version for each in registry().versions(name)), default=0)
     manifest = packing.pack(folder, smoke, to, packing.Packing(name=name, version=number, run=run_id, **given))
@@ -240,7 +240,12 @@ def pack(*, folder: Path, name: str, version: int | None, smoke: Path, to: Path,
     epilog=examples('policy publish packed --alias champion', 'policy publish packed --alias canary --canary thor --canary tachi')
 )
 @click.argument('packed', type=_folder)
-@click.option('--alias', 'aliases', multiple=True, help=f'Such as {CHAMPION}, {CANARY} or robot-NAME; may be repeated.')
+@click.option(
+    '--alias',
+    'aliases',
+    multiple=True,
+    help=f'Alias of the version, such as {CHAMPION}, {CANARY} or robot-NAME; may be repeated.',
+)
 @click.option('--canary', 'robots', multiple=True, metavar='ROBOT', help=f'Robot that takes it as {CANARY}; may be repeated.')
 @_key
 @_signs
@@ -248,9 +253,9 @@ def pack(*, folder: Path, name: str, version: int | None, smoke: Path, to: Path,
 def publish(
     *, packed: Path, aliases: tuple[str, ...], robots: tuple[str, ...], key: Path | None, folder: Path | None, as_json: bool
 ) -> ExitCode:
-    """Upload what was packed, register it, and sign that it may run.
+    """Upload a packed policy, register it, and sign it.
 
-    May be repeated, also to give a version that is there another alias. Nothing is overwritten.
+    It can be repeated, also to give an existing version another alias. Nothing is overwritten.
     """
     with the_store() as store:
         signing = _signers()[2].Repository(_keys_folder(folder), store, _passphrase)

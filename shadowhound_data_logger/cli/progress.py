@@ -46,7 +46,7 @@ class ProgressBar(ProgressListener):
 @contextmanager
 def progress(what: str = '', total: int | None = None, *, of: Literal['bytes', 'objects', 'words', 'seconds'] = 'words'
              ) -> Iterator[ProgressBar]:  # fmt: skip
-    """A line on standard error where that is a terminal, gone at the end: a bar of bytes or objects, or what is said to it."""
+    """A line on standard error where that is a terminal, gone at the end: a bar of bytes or objects, or the text it is given."""
     console = Console(stderr=True)
     with Progress(*_columns(of), console=console, transient=True, disable=not console.is_terminal) as bar:
         yield ProgressBar(bar, what, total)

@@ -52,7 +52,7 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
     )
 )
 @question
-@click.option('--bag', metavar='NAME', help="Slices of this bag; '*' stands for any letters.")
+@click.option('--bag', metavar='NAME', help="Slices of this bag; '*' matches any characters.")
 @click.option(
     '--priority',
     type=click.IntRange(0, 9),
@@ -68,19 +68,19 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
     show_default=True,
     help='How long it is valid, such as 2h or 30d.',
 )
-@click.option('--user', metavar='NAME', help='Who does it  [default: the user of this machine]')
-@click.option('--wait', 'is_waiting', is_flag=True, help='Wait until the data have arrived.')
+@click.option('--user', metavar='NAME', help='Name recorded as the author  [default: the user of this machine]')
+@click.option('--wait', 'is_waiting', is_flag=True, help='Wait until the data has arrived.')
 @click.option('--dry-run', is_flag=True, help='Only show what would be done.')
-@click.option('--list', 'is_listing', is_flag=True, help='List the requests and how far they are.')
+@click.option('--list', 'is_listing', is_flag=True, help='List the requests and their progress.')
 @click.option('--cancel', metavar='ID', help='Cancel a request.')
 @as_json
 def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: int, user: str | None, is_waiting: bool,  # noqa: PLR0913 - one an option
          dry_run: bool, is_listing: bool, cancel: str | None, as_json: bool) -> ExitCode:  # fmt: skip
     """Request data that a robot keeps (ship: on_request).
 
-    It prints how many objects and bytes that is and puts the request into the store; the robot polls every ten seconds.
+    It prints the number of objects and bytes and puts the request into the store; the robot polls every ten seconds.
 
-    Exit code 1 if some of it is lost, or the robot refused.
+    Exit code 1 if some of the data is lost, or the robot rejected the request.
     """
     with asking():
         from shadowhound_data_logger.lake import link  # noqa: PLC0415 - pyarrow takes a while

@@ -63,7 +63,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
 @click.argument('sql', required=False)
 @question
 @by_flag
-@click.option('--order', metavar='COLUMN', help="What to sort by, such as 't_start desc'  [default: t_start]")
+@click.option('--order', metavar='COLUMN', help="Sort by this column, such as 't_start desc'  [default: t_start]")
 @click.option('--limit', type=click.IntRange(1), metavar='N', help='At most N results.')
 @click.option(
     '--format',
@@ -74,16 +74,18 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
     help='Format of the output.',
 )
 @click.option('--when', metavar='EXPRESSION',
-              help="When values in the objects were so: 'imu.accelerometer.2 > 15'. The answer is times.")  # fmt: skip
+              help="Find times at which values in the objects meet a condition: 'imu.accelerometer.2 > 15'.")  # fmt: skip
 @click.option('--scan', is_flag=True, help='With --when: open objects without statistics as well.')
 @click.option('--join', 'join_s', type=click.FloatRange(0.0), metavar='S',
-              help='Times at most so far apart are one  [default: 1, or two periods of a slower sensor]')  # fmt: skip
-@click.option('--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='So much before and after each time.')
+              help='Join times that are at most S seconds apart  [default: 1, or two periods of a slower sensor]')  # fmt: skip
+@click.option(
+    '--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='Extend each time by S seconds at both ends.'
+)
 @click.option('--like', 'like', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
-              help='The pictures that are most like this one, by vectors that `lake embed` made.')  # fmt: skip
-@click.option('--like-text', metavar='TEXT', help='The pictures that are most like these words; needs --model.')
+              help='Find the images most similar to this one, with vectors made by `lake embed`.')  # fmt: skip
+@click.option('--like-text', metavar='TEXT', help='Find the images that best match these words; needs --model.')
 @model_option
-@click.option('--as-of', metavar='TIME', help='Answer from the tables as they were at this time, to the second.')
+@click.option('--as-of', metavar='TIME', help='Use the version of the tables at this time, to the second.')
 @click.option('--labels', 'with_labels', is_flag=True, help='Add a column with the labels.')
 @as_json
 @click.option('--sheet', type=click.Path(path_type=Path), metavar='FILE.jpg', help='Write a contact sheet of the images found.')
@@ -94,18 +96,19 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
           as_json: bool, with_labels: bool, when: str | None, scan: bool, join_s: float | None, pad_s: float, like: Path | None,
           like_text: str | None, model: Path | None, as_of: str | None, sheet: Path | None,
           ground: Path | None) -> ExitCode:  # fmt: skip
-    """Search what is stored, by flags or SQL.
+    """Query what is stored, with flags or SQL.
 
     An object must match all flags; times are UTC.
 
-    SQL knows the views objects, missions, topics, gaps and watermarks, restricted by the flags.
+    SQL has the views objects, missions, topics, gaps and watermarks, restricted by the flags.
 
-    --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' is about the values in the objects: the answer is times, which
-    --ranges takes. A plain name is about each message, first last min max mean count nan_count about each object.
+    --when 'imu.accelerometer.2 > 15 and max(imu.temperature) < 60' tests the values in the objects: the answer is times,
+    which --ranges accepts. A plain name tests each message; first last min max mean count nan_count test each object.
 
-    --like and --like-text compare all images that the flags select, and list the most similar first; 1 is identical to the model.
+    --like and --like-text compare all images that the flags select, and list the most similar first; 1 is identical to the
+    model.
 
-    Exit code 1 when files of the catalog are damaged: they are left out, and named on standard error.
+    Exit code 1 if files of the catalog are damaged: they are skipped and named on standard error.
     """
     with asking():
         from shadowhound_data_logger.lake import labels, names  # noqa: PLC0415
@@ -118,7 +121,7 @@ def query(*, sql: str | None, flags: Mapping[str, Any], order: str | None, limit
         if scan or join_s is not None or pad_s:
             raise BadUsage('--scan, --join and --pad are about the times that --when finds', 'add --when, or leave them out')
         if sql and with_labels:
-            raise BadUsage('--labels adds a column to objects, not to SQL', 'SQL has a view of its own: SELECT * FROM labels')
+            raise BadUsage('--labels adds a column to objects, not to SQL', 'SQL has the view labels: SELECT * FROM labels')
         source, left_out = default_source(the_store_settings()), quietly()
         if like or like_text or model:
             if sql or order or bool(like) is bool(like_text):

@@ -1,4 +1,4 @@
-"""The flags with which ``query`` and ``fetch`` search the catalog, and the library behind them, which a robot does not have."""
+"""The flags of ``query`` and ``fetch`` that select objects, and the library behind them, which a robot does not have."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def asking() -> Iterator[None]:
 
 
 def quietly() -> Findings:
-    """What is left out, to be told at the end."""
+    """Skipped files, to be reported at the end."""
     from shadowhound_data_logger.lake.findings import Findings  # noqa: PLC0415
 
     return Findings(lambda _: None)
@@ -143,6 +143,8 @@ def report_skipped(left_out: Findings) -> ExitCode:
     for one in left_out:
         click.echo(str(one), err=True)
     if len(left_out):
-        text = f'{number(len(left_out))} of the catalog are left out. Move them away, and run `shadowhound-data lake reindex`.'
+        text = (
+            f'{number(len(left_out))} files of the catalog are skipped. Move them away, and run `shadowhound-data lake reindex`.'
+        )
         click.echo(text, err=True)
     return exit_code(finding=len(left_out))

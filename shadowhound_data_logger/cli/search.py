@@ -67,17 +67,17 @@ def _flags(command: _Command) -> _Command:
 )
 @click.argument('words', nargs=-1, required=True)
 @_flags
-@click.option('--kind', type=click.Choice(['mission', 'event', 'error', 'label']), help='Only what is one of these.')
+@click.option('--kind', type=click.Choice(['mission', 'event', 'error', 'label']), help='Only documents of this kind.')
 @click.option('--limit', type=click.IntRange(1, 10_000), default=20, show_default=True, metavar='N', help='At most N results.')
 @click.option('--index', metavar='FILE|s3://...', help='The index of words  [default: $SHADOWHOUND_HOME/search.db]')
 @as_json
 def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None, limit: int, index: str | None,
            as_json: bool) -> ExitCode:  # fmt: skip
-    """Search what was said: missions, events, errors, labels.
+    """Search the words of missions, events, errors and labels.
 
-    All words must be there: door handle. "A phrase" has them in this order, door* what begins so, -door leaves out what has it,
-    and door OR gate takes either. The best match comes first. `lake index` makes the index, and brings it up to date: what came
-    later is not in the answer, which says when that was.
+    All words must occur: door handle. "A phrase" must occur as written, door* matches the beginning of a word, -door excludes
+    a word, and door OR gate takes either. The best match comes first. `lake index` makes and updates the index; the answer
+    shows when that was last done.
     """
     with asking():
         from shadowhound_data_logger.lake import search as library  # noqa: PLC0415
@@ -112,8 +112,8 @@ def search(*, words: tuple[str, ...], flags: Mapping[str, Any], kind: str | None
 def lake_index(*, index: str | None, as_json: bool) -> ExitCode:
     """Make the index of words for `search`, or update it.
 
-    One file, made of the store alone: of the summaries of missions, and of labels. Only what is new is read. With s3:// it is
-    updated beside the default file and then put into the store, for everybody.
+    The index is one file made from the summaries of missions and the labels in the store. Only new documents are read. With
+    s3:// the default file is updated first and then put into the store for all users.
     """
     with asking():
         from shadowhound_data_logger.lake import search as library  # noqa: PLC0415

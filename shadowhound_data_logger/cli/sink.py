@@ -1,4 +1,4 @@
-"""``shadowhound-data lake sink``: the catalog and what lies beside it into Elasticsearch or OpenSearch."""
+"""``shadowhound-data lake sink``: sends the catalog, gaps, missions and labels to Elasticsearch or OpenSearch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHOWN: Final = 10
 ))  # fmt: skip
 @click.argument('url')
 @click.option('--prefix', default='robots', show_default=True, metavar='NAME',
-              help='Name the indexes NAME-objects, NAME-gaps, NAME-missions, NAME-events and NAME-labels.')  # fmt: skip
+              help='Prefix of the indexes: NAME-objects, NAME-gaps, NAME-missions, NAME-events and NAME-labels.')  # fmt: skip
 @click.option('--robot', metavar='NAME', callback=robot_name, help='Only of this robot.')
 @click.option('--ca', type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar='FILE',
               help="Certificate of the authority that signed the server's.")  # fmt: skip
@@ -42,7 +42,7 @@ def lake_sink(
     accepted, so an interrupted run resumes there, and no document is created twice. ELASTIC_API_KEY, or
     ELASTIC_USERNAME and ELASTIC_PASSWORD, authenticate.
 
-    Exit code 1 when the server refused documents, or something was left out.
+    Exit code 1 if the server rejected documents, or something was skipped.
     """
     with asking():
         from shadowhound_data_logger.lake import sink as library  # noqa: PLC0415

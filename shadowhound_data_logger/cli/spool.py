@@ -52,7 +52,7 @@ STYLES: Final = {State.HELD.value: 'yellow', State.QUARANTINED.value: 'red'}
 def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitCode:
     """Show what is not in the store yet, and why.
 
-    Works whether or not a node runs. Exit code 1 when something is quarantined.
+    It works whether or not a node runs. Exit code 1 if something is quarantined.
     """
     context.obj = folder = the_spool(spool).absolute()
     return ExitCode.FINE if context.invoked_subcommand else _overview(folder, as_json=as_json)
@@ -71,7 +71,7 @@ def spool(context: click.Context, *, spool: Path | None, as_json: bool) -> ExitC
 def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, limit: int, as_json: bool) -> ExitCode:
     """List the objects, the oldest first.
 
-    Each with its bucket and key, its state, and its file in the spool.
+    It shows the bucket and key, the state, and the file in the spool of each object.
     """
     with _opened(folder) as index:
         found = objects(index, folder, state=State(state) if state else None, sensor=sensor, prefix=prefix)
@@ -97,9 +97,9 @@ def list_(folder: Path, *, prefix: str, state: str | None, sensor: str | None, l
 def drain(folder: Path, *, idle_timeout: float, as_json: bool) -> ExitCode:
     """Upload everything that waits, without a node.
 
-    Use it before a robot is put away, or with the disk of a broken one. It needs the AWS_... variables of the node: without them
-    the store is a folder. Each object is verified as by the node, and gets its row in the catalog. Exit code 1 when an object
-    is left or refused. Ctrl-C loses nothing.
+    Use it before a robot is put away, or with the disk of a broken one. It needs the AWS_... variables of the node; without
+    them the store is a folder. Each object is verified as by the node and gets its row in the catalog. Exit code 1 if objects
+    remain or were rejected. Ctrl-C loses nothing.
     """
     _check(folder)
     return _drain(folder, patience_s=idle_timeout, as_json=as_json)
@@ -111,11 +111,11 @@ def drain(folder: Path, *, idle_timeout: float, as_json: bool) -> ExitCode:
 @as_json
 @click.pass_obj
 def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bool) -> ExitCode:
-    """Try quarantined objects again, once the cause is gone.
+    """Retry quarantined objects once the cause is fixed.
 
-    All of them, or those that are named.
+    It retries all of them, or those that are named.
 
-    A running node tries them at once; without one, run `shadowhound-data spool drain`.
+    A running node retries them immediately; without a node, run `shadowhound-data spool drain`.
     """
     try:
         done = retry_objects(folder, reason=reason, names=frozenset(names))
@@ -137,7 +137,7 @@ def retry(folder: Path, *, names: Sequence[str], reason: str | None, as_json: bo
 def resend_gaps(folder: Path, *, as_json: bool) -> ExitCode:
     """Send the gap journal to the store again.
 
-    For a store that lost parts of it. A running node sends it within a minute (catalog.period_s). Gaps older than
+    Use it if the store lost parts of it. A running node sends it within a minute (catalog.period_s). Gaps older than
     spool.remember_days cannot be sent again.
     """
     _check(folder)
@@ -229,7 +229,7 @@ def _drain(folder: Path, *, patience_s: float, as_json: bool) -> ExitCode:
     """The exit code."""
     settings, clock = Settings.load({}, os.environ), SystemClock.of_this_machine()
     where = _destination(folder, settings)
-    # A robot of its own: its session is none of the node's, and what that left open is not for it to settle.
+    # A separate robot name: its session is not the node's, and it must not settle what the node left open.
     spool = Spool(folder, limits(folder, settings.spool), clock, f'{settings.robot} drain')
     spool.open()
     catalog = CatalogWriter(folder, settings.catalog, settings.robot, clock)

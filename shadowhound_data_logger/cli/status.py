@@ -95,11 +95,11 @@ class Page:
 )
 @spool_folder
 def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, spool: Path | None) -> ExitCode:
-    """Show what the node on this machine does now.
+    """Show what the node on this machine is doing.
 
-    Rates and ages of its topics, its queue, spool, store and workers; when no node runs, what is in its spool. Exit code 1 when
-    something needs attention: the node does not run, the store cannot be reached, messages were lost, objects were evicted. With
-    --watch it is 0.
+    It shows the rate and age of each topic, and the queue, spool, store and workers; if no node runs, the content of its
+    spool. Exit code 1 if something needs attention: the node does not run, the store is unreachable, messages were lost, or
+    objects were evicted. With --watch it is 0.
     """
     folder, clock = the_spool(spool), SystemClock.of_this_machine()
 

@@ -69,7 +69,7 @@ def test_all_is_there(home: Path, deep: list[str]) -> None:
     """Exit code 0; every bucket is asked, and of what has no checksum in the catalog it says so."""
     answer = run(home, *deep)
     assert answer.return_value == 0
-    assert 'asked for 11 of the 11 objects of its own catalog' in answer.stdout
+    assert 'checked for 11 of the 11 objects of its own catalog' in answer.stdout
     assert 'Of 1 no checksum is known' in answer.stdout
     assert 'All of them are there' in answer.stdout
     assert as_json(home, *deep, '--sensor', 'camera', '--since', '2026-10-28T12:00:02')['asked'] == 3

@@ -56,7 +56,7 @@ def test_all_is_there(home: Path, option: str) -> None:
     answer = run(option)
     assert answer.return_value == 0
     text = ' '.join(answer.stdout.split())
-    assert f'the folder {home}/store was asked for 3 of 3 delivered objects, those since 2025-10-18 12:00:00 UTC.' in text
+    assert f'the folder {home}/store was checked for 3 of 3 delivered objects, those since 2025-10-18 12:00:00 UTC.' in text
     assert 'All of them are there' in text
     assert not answer.stderr
 
