@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.core.clock import SECOND
 
 MAX_SPEED_MPS: Final = 5.0
-"""No Go2 walks faster."""
+"""A step that is faster, and is not one of several in about the same direction, is a jump of the estimate: drones fly faster."""
 REST_M: Final = 0.02
 """Smaller movements are the noise of a robot at rest: one millimeter at 50 Hz would add up to 3 m per minute."""
 
@@ -32,12 +32,14 @@ class Odometer:
     """Adds up the distance over the ground. Lifecycle: New, with the distance so far; ``add`` poses in order of time."""
 
     def __init__(self, max_speed_mps: float = MAX_SPEED_MPS, distance_m: float = 0.0) -> None:
-        """A step faster than ``max_speed_mps`` (m/s) is a jump of the estimate and is not counted."""
+        """A step faster than ``max_speed_mps`` (m/s), and than twice the one before it, is a jump and is not counted."""
         self.distance_m = distance_m
         self.jumps = 0
         self._max_speed_mps = max_speed_mps
         self._last: Pose | None = None
         self._from: Pose | None = None  # the distance includes the path up to here
+        self._velocity = (0.0, 0.0)
+        """Of the last step, meters per second."""
 
     def add(self, pose: Pose) -> bool:
         """Add a pose; returns whether it is valid: finite, and later than the previous one."""
@@ -46,11 +48,18 @@ class Odometer:
             return False
         self._last = pose
         if last is None or self._from is None or pose.frame_id != last.frame_id:
-            self._from = pose
-        elif hypot(pose.x - last.x, pose.y - last.y) * SECOND > self._max_speed_mps * (pose.stamp_ns - last.stamp_ns):
+            self._from, self._velocity = pose, (0.0, 0.0)
+        elif self._is_jump(last, pose):
             self.jumps += 1
             self._from = pose
         elif (step_m := hypot(pose.x - self._from.x, pose.y - self._from.y)) >= REST_M:
             self.distance_m += step_m
             self._from = pose
         return True
+
+    def _is_jump(self, last: Pose, pose: Pose) -> bool:
+        seconds = (pose.stamp_ns - last.stamp_ns) / SECOND
+        before, now = self._velocity, ((pose.x - last.x) / seconds, (pose.y - last.y) / seconds)
+        self._velocity = now
+        is_steady = hypot(*now) <= 2 * hypot(*before) and before[0] * now[0] + before[1] * now[1] > 0
+        return hypot(*now) > self._max_speed_mps and not is_steady

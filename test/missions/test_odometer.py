@@ -25,6 +25,18 @@ def test_a_way_is_the_sum_of_its_steps() -> None:
     assert walked((0, 0, 0), (1, 3, 0), (2, 3, 4), (3, 3, 0)).distance_m == pytest.approx(3 + 4 + 4)
 
 
+def test_a_drone_is_fast() -> None:
+    """At 15 m/s its way counts, but for the first step; a jump on the way does not, nor an estimate that jumps to and fro."""
+    odometer = Odometer()
+    for number in range(101):
+        odometer.add(Pose(number * SECOND // 10, 1.5 * number + (200 if number >= 50 else 0), 0.0, 0.0))
+    assert (odometer.distance_m, odometer.jumps) == (pytest.approx(150 - 2 * 1.5), 2)
+    odometer = Odometer()
+    for number in range(11):
+        odometer.add(Pose(number * SECOND // 10, 3.0 * (number % 2), 0.0, 0.0))
+    assert (odometer.distance_m, odometer.jumps) == (0.0, 10)
+
+
 def test_a_jump_is_no_way() -> None:
     """A step faster than the robot is left out, and the way goes on from where it led."""
     odometer = walked((0, 0, 0), (1, 1, 0), (2, 100, 0), (3, 101, 0))
