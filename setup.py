@@ -9,7 +9,7 @@ PACKAGE = 'shadowhound_data_logger'
 setup(
     name=PACKAGE,
     version='0.1.0',
-    description='Takes the sensor data of a Unitree Go2 off the robot: whole, verified, and accounted for.',
+    description='Takes the sensor data of a ROS 2 robot off it: complete, verified, and accounted for.',
     long_description='A ROS 2 data logger that stores what it receives, or lists it with the reason why not.',
     author='ShadowHound maintainers',
     maintainer='ShadowHound maintainers',

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.config import NOT_SETTINGS
 from shadowhound_data_logger.core.keys import is_name
-from shadowhound_data_logger.core.options import COMPRESSED_IMAGE, GROUPS, IMAGE, POINT_CLOUD, SensorSettings
+from shadowhound_data_logger.core.options import ARCHIVES, COMPRESSED_IMAGE, GROUPS, IMAGE, POINT_CLOUD, SensorSettings
 
-GO2_PACKAGES: Final = ('go2_interfaces', 'unitree_go', 'unitree_hg')
+UNITREE_PACKAGES: Final = ('go2_interfaces', 'unitree_go', 'unitree_hg')
 """Whoever publishes types of these is a Unitree robot, for which the default sensors were made."""
 _BATCHED: Final[Mapping[str, Any]] = {'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4}
 _SLOW: Final[Mapping[str, Any]] = {'rate_hz': 0.0, 'batch_s': 10.0, 'priority': 3}
@@ -57,9 +57,9 @@ NOT_LOGGED: Final = frozenset({'/parameter_events', '/rosout', '/clock'})
 """Topics of ROS itself: the node's own log is on one of them."""
 
 
-def is_of_go2(type_name: str) -> bool:
+def is_of_unitree(type_name: str) -> bool:
     """Whether only a Unitree robot publishes this type."""
-    return type_name.partition('/')[0] in GO2_PACKAGES
+    return type_name.partition('/')[0] in UNITREE_PACKAGES
 
 
 def not_logged(topic: str, type_name: str, graph: Mapping[str, Collection[str]]) -> str:
@@ -77,7 +77,8 @@ def sensor_for(topic: str, type_name: str, taken: Collection[str], *, is_latched
     if rule is None:
         return None
     if is_latched and type_name not in _LATCHED:
-        rule = {**_ON_CHANGE, **({'format': rule['format']} if 'format' in rule else {})}
+        of_type = rule.get('format', 'json')
+        rule = {**_ON_CHANGE, 'format': 'cdr' if of_type in ARCHIVES else of_type}
     base = re.sub(r'[^A-Za-z0-9_]', '_', topic.strip('/'))[:60]
     names = [base, *(f'{base}_{number}' for number in range(2, 100))]
     reserved = {'robot', 'sensors', *GROUPS, *NOT_SETTINGS, *taken}

@@ -15,7 +15,7 @@ from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import Rejected, SettingError
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.options import NAMED
-from shadowhound_data_logger.core.type_rules import is_of_go2
+from shadowhound_data_logger.core.type_rules import is_of_unitree
 from shadowhound_data_logger.doctor.machine import domains, processes
 from shadowhound_data_logger.doctor.model import Context, Result, error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DRIVERS, domain_of, middleware
@@ -109,7 +109,7 @@ def check(context: Context) -> Iterator[Result]:
         return
     if TF in heard:
         yield from _transforms(heard[TF])
-    is_complete = context.settings.capture.topics == NAMED or any(map(is_of_go2, (f'{name}/' for name in packages)))
+    is_complete = context.settings.capture.topics == NAMED or any(map(is_of_unitree, (f'{name}/' for name in packages)))
     for sensor in sensors:
         topics = [heard[resolved[topic]] for topic in sensor.topics]
         if is_complete or any(one.publishers for one in topics):  # the default sensors are those of a Unitree
@@ -179,7 +179,7 @@ def _types(sensors: Sequence[SensorSettings], packages: Collection[str]) -> Iter
     missing: dict[str, dict[str, str]] = {}
     for names in sorted({alternatives(name) for sensor in sensors for name in sensor.types if name}):
         reasons = {name: unavailable(name) for name in names}
-        is_needed = [name for name in names if not is_of_go2(name) or name.partition('/')[0] in packages]
+        is_needed = [name for name in names if not is_of_unitree(name) or name.partition('/')[0] in packages]
         if is_needed and all(reasons.values()):
             missing.setdefault(is_needed[0].partition('/')[0], {})[is_needed[0]] = reasons[is_needed[0]]
     for package, by_type in missing.items():
@@ -351,8 +351,7 @@ def _rate(one: Heard, sensor: SensorSettings, expected_hz: float) -> Result:
         return warning(
             'ros.rate',
             f'{one.topic} comes at {one.rate_hz:.1f} Hz, {expected_hz:g} Hz are expected',
-            'the driver is slower than a Go2 with WebRTC or DDS usually is, the connection to the robot is weak, or this '
-            'machine is busy',
+            'the driver is slower than expected, the connection to the robot is weak, or this machine is busy',
             f'ros2 topic hz {one.topic} ; where that is right: doctor --rate {one.topic}={max(one.rate_hz, 0.1):.0f}',
             **figures,
         )

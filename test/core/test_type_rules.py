@@ -7,7 +7,7 @@ import pytest
 from shadowhound_data_logger.core.config import Settings, default_parameters
 from shadowhound_data_logger.core.errors import SettingError
 from shadowhound_data_logger.core.options import ALL, AUTO, NAMED
-from shadowhound_data_logger.core.type_rules import RULES, is_of_go2, sensor_for
+from shadowhound_data_logger.core.type_rules import RULES, is_of_unitree, sensor_for
 
 
 @pytest.mark.parametrize('type_name', RULES)
@@ -52,9 +52,9 @@ def test_a_type_without_a_rule() -> None:
 
 
 def test_which_types_a_unitree_has() -> None:
-    assert is_of_go2('unitree_go/msg/LowState')
-    assert is_of_go2('go2_interfaces/msg/IMU')
-    assert not is_of_go2('sensor_msgs/msg/Imu')
+    assert is_of_unitree('unitree_go/msg/LowState')
+    assert is_of_unitree('go2_interfaces/msg/IMU')
+    assert not is_of_unitree('sensor_msgs/msg/Imu')
 
 
 def test_listed_sensors_are_all_that_is_logged() -> None:

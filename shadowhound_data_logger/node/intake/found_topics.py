@@ -12,14 +12,14 @@ from rclpy.node import Node
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.keys import printable
 from shadowhound_data_logger.core.options import AUTO, DEFAULT_SENSORS
-from shadowhound_data_logger.core.type_rules import NOT_LOGGED, RULES, is_of_go2, not_logged, sensor_for
+from shadowhound_data_logger.core.type_rules import NOT_LOGGED, RULES, is_of_unitree, not_logged, sensor_for
 from shadowhound_data_logger.node.intake.consumers import is_plain_name
 from shadowhound_data_logger.ros.reader import endpoints
 
 log = logging.getLogger(__name__)
 
 SETTLE_S: Final = 3.0
-"""How long the graph is looked at before it is concluded that it is not that of a Go2."""
+"""How long the graph is looked at before it is concluded that it is not that of a Unitree."""
 MIN_TOPICS: Final = 3
 """Topics with the names of the default sensors, in one namespace, that are those of a robot."""
 _RELATIVE: Final = frozenset(topic for sensor in DEFAULT_SENSORS.values() for topic in sensor['topics'])
@@ -30,8 +30,8 @@ MAX_FOUND: Final = 200
 
 def is_unitree(node: Node, graph: Mapping[str, Collection[str]]) -> bool:
     """Whether something publishes what only a Unitree does: the default sensors are made for that robot."""
-    topics = (topic for topic, types in graph.items() if any(map(is_of_go2, types)))
-    return any(is_of_go2(each.type) for topic in topics for each in endpoints(node, topic))
+    topics = (topic for topic, types in graph.items() if any(map(is_of_unitree, types)))
+    return any(is_of_unitree(each.type) for topic in topics for each in endpoints(node, topic))
 
 
 def robots_in(topics: Collection[str], own: str) -> list[str]:
@@ -56,7 +56,7 @@ class FoundTopics:
         self._seen: set[str] = set()
         self._namespace = f'{node.get_namespace().rstrip("/")}/'
         self._since_s: float | None = None
-        self._is_go2 = self._has_told = False
+        self._is_unitree = self._has_told = False
         self._count = 0
         self.not_logged: Mapping[str, str] = {}
         """Topic -> why it is not logged. Replaced as a whole."""
@@ -65,7 +65,7 @@ class FoundTopics:
         """The sensors to add. A topic is judged once: what its publishers are when it is first seen decides."""
         graph = {name: types for name, types in self._node.get_topic_names_and_types() if is_plain_name(name)}
         self._since_s = now_s if self._since_s is None else self._since_s
-        self._is_go2 = self._is_auto and (self._is_go2 or is_unitree(self._node, graph))
+        self._is_unitree = self._is_auto and (self._is_unitree or is_unitree(self._node, graph))
         has_settled = now_s - self._since_s >= SETTLE_S
         if has_settled and not self._has_told:
             self._tell_of_robots(graph)
@@ -78,7 +78,7 @@ class FoundTopics:
                 continue
             self._seen.add(topic)
             type_name = publishers[0].type
-            if self._is_go2 and not (is_of_go2(type_name) and type_name in RULES):
+            if self._is_unitree and not (is_of_unitree(type_name) and type_name in RULES):
                 continue
             latched = all(each.transient_local for each in publishers)
             sensor = sensor_for(topic, type_name, sensors.keys(), is_latched=latched)
@@ -98,8 +98,8 @@ class FoundTopics:
     def _tell_of_robots(self, graph: Mapping[str, list[str]]) -> None:
         """Once: topics of robots in namespaces, of which this node logs none, or all under one name."""
         robots = robots_in(graph, self._node.get_namespace())
-        is_mixed = len(robots) > 1 and not self._is_go2
-        if is_mixed or (robots and self._is_go2 and not any(map(self._node.count_publishers, self._named & graph.keys()))):
+        is_mixed = len(robots) > 1 and not self._is_unitree
+        if is_mixed or (robots and self._is_unitree and not any(map(self._node.count_publishers, self._named & graph.keys()))):
             self._has_told = True
             what = 'are logged under one name' if is_mixed else 'are not logged'
             launch = (
