@@ -1,8 +1,8 @@
 """The next objects to ship, looked up some at a time, so that a claim costs the same whatever the backlog.
 
-While what has just been spooled waits beside a backlog, each gets every second turn, whatever lies in the other. The turns go
-to the most important objects, but each fourth of the backlog to its oldest, and each second of what is live to the priority
-that was served least lately. So nothing starves, and a store that is twice as fast as the robot keeps up with all that is live.
+While there are live objects (spooled just now) and a backlog, they take turns. A turn goes to the most important object; but
+every fourth turn of the backlog goes to its oldest object, and every second turn of live objects to the priority that was served
+longest ago. So nothing starves, and a store that is twice as fast as the robot keeps up with all live objects.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Final
 from shadowhound_data_logger.core.model import SpooledObject
 
 IMPORTANT: Final = 128
-"""Objects asked for by importance at a time."""
+"""Objects looked up by importance at a time."""
 FEW: Final = 32
-"""From here on more are asked for: a look waits for the disk behind a commit, and meanwhile the others have these."""
+"""With fewer, more are looked up: a lookup may wait for the disk during a commit, and the other threads use these until then."""
 OLDEST: Final = 43
-"""Objects asked for by age at a time: as many as leave beside the important ones, lest one of the two wait for a slow look."""
+"""Objects looked up by age at a time: as many as are shipped between two lookups by importance, so that neither waits."""
 LIVE: Final = 64
 """Objects remembered that have just been spooled, ten seconds of the default profile; older ones are backlog."""
 OLDEST_OF_BACKLOG: Final = 4

@@ -54,7 +54,7 @@ class Audit:
 
 def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
           tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
-    """Check every object of ``source``; ``deep`` also reads their content. ``tell`` is called after each one.
+    """Check every object of ``source``; ``deep`` also reads their content. The callback is called after each one.
 
     Of an object without a known SHA-256 only the size is compared. Intact objects are noted; findings are not, so an audit that
     ended early checks those again.
@@ -99,8 +99,8 @@ def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor
 
 
 def _confirm_store(store: ObjectStore) -> None:
-    """Raises StoreError unless it is the store that said so: a hotel's network also answers that there is no such thing."""
+    """Raises StoreError unless the store itself answered: a hotel's network also answers that an object does not exist."""
     try:
         store.probe()
     except AccessDenied:
-        return  # whoever may only read is answered all the same
+        return  # it is the store, and this key may only read

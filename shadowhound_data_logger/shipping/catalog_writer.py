@@ -36,7 +36,7 @@ OBJECTS_A_PART: Final = 400
 SOON_S: Final = 5.0
 """After the end of a mission: by then its last objects are usually delivered."""
 KEPT_S: Final = 5.0
-"""Between two files about kept objects: these can be requested as soon as they are known."""
+"""Between two files about kept objects: they can be requested once the file has arrived."""
 PRIORITY: Final = 1
 """That of a mission's summary."""
 

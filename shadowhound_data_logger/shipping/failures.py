@@ -38,7 +38,7 @@ class Verdict(Enum):
     PAUSE = 'pause'
     """No object's fault: nothing is sent until credentials and certificate are right, but for one probe at a time."""
     BUCKET = 'bucket'
-    """The objects of this bucket wait, those of others go on."""
+    """The objects of this bucket wait, those of others are sent."""
     DENIED = 'denied'
     """This object's fault if others of its bucket are taken, else the bucket waits."""
     QUARANTINE = 'quarantine'
@@ -93,7 +93,7 @@ class Notice:
         """The line for the log; ``pending`` is what the spool holds for delivery."""
         held = f'{pending} objects wait in the spool'
         if self.lasted_s is not None:
-            what = f'bucket {self.bucket} takes objects again' if self.bucket else 'delivery goes on'
+            what = f'bucket {self.bucket} takes objects again' if self.bucket else 'delivery continues'
             return f'{what} after {self.lasted_s:.1f} s; {held}'
         if self.bucket:
             return f'bucket {self.bucket} gets nothing, others do: {self.error}; {held}'
@@ -113,7 +113,7 @@ class Outage:
     """Tries that each waited for the one before; puts that were under way together are one."""
     retry_at: float = 0.0
     probe: int | None = None
-    """Id of the one object that is being tried meanwhile."""
+    """Id of the one object that is tried during that time."""
     confirmed: bool = False
     announced: set[Verdict] = field(default_factory=set)
 
@@ -121,7 +121,7 @@ class Outage:
         return self.probe is None and now >= self.retry_at
 
     def fail(self, item: SpooledObject, verdict: Verdict, error: StoreError, pause_s: float, now: float) -> list[Notice]:
-        """One more put failed; what is to be said about it, if anything."""
+        """Count another failed put; returns the notices to log."""
         self.confirmed = self.confirmed or self.failures > 0 or verdict in _AT_ONCE
         self.verdict, self.error = verdict, str(error)
         if not self.failures or self.probe == item.id:
@@ -273,7 +273,7 @@ class History:
         return before is not None and before.denials > 0 and self._delivered[item.bucket] > before.delivered_to_bucket
 
     def is_to_blame(self, item: SpooledObject) -> bool:
-        """Whether the denial just now is the last one that is needed to tell that the object will never be taken."""
+        """Whether this denial is the last one needed to conclude that the object will never be accepted."""
         return self.is_denied_alone(item) and self._failures[item.id].denials + 1 >= DENIALS
 
     def due(self, now: float, allowed: Callable[[SpooledObject], bool]) -> SpooledObject | None:

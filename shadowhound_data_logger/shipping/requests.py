@@ -1,8 +1,8 @@
-"""Serves what is asked for of what the robot keeps: polls the mailbox, makes requests rows, releases objects, answers.
+"""Serves requests for data that the robot keeps: polls the mailbox, makes requests rows, releases objects, answers.
 
 A request is a row before anything is done about it, and each answer is spooled in the transaction that notes it. Objects are
-released a few at a time, so that requests share the link by their priorities: no requester waits for another one to be done. Of
-slices that reach beyond the time that is asked for a bag of that time is cut, some milliseconds of work at each step.
+released a few at a time, so that requests share the link by their priorities: no requester waits for another's
+to finish. From slices that extend beyond the requested time, a bag of that time is cut, some milliseconds of work at each step.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ from shadowhound_data_logger.stores.base import ObjectStore
 log = logging.getLogger(__name__)
 
 STEP_S: Final = 0.25
-"""Between two releases while something is asked for."""
+"""Between two releases while requests are open."""
 WINDOW: Final = 64
-"""Released objects that wait for delivery at most: what is asked for later has its turn after these."""
+"""Maximum of released objects that wait for delivery: later requests have their turn after these."""
 WINDOW_S: Final = 5.0
 """The same in seconds of the link, but one object always may go."""
 WINDOW_BYTES: Final = 4 << 20
@@ -85,7 +85,7 @@ CUT_S: Final = 0.05
 
 
 class SliceCut(Protocol):
-    """A range of time out of kept slices as a bag of its own (``bags/kept.py``)."""
+    """A range of time from kept slices, as a separate bag (``bags/kept.py``)."""
 
     @property
     def slices(self) -> Sequence[KeptSlice]: ...
@@ -116,8 +116,8 @@ class _Cutting(NamedTuple):
 class RequestServer:
     """Serves the requests for what a robot keeps.
 
-    Life: New; open once; ``wake`` from any thread; close once. Owns the thread ``requests``; what it asks of the spool is durable
-    when it returns, so a death at any moment leaves nothing half done.
+    Lifecycle: New; open once; ``wake`` from any thread; close once. Owns the thread ``requests``; its changes to the spool are
+    durable when they return, so a crash at any moment leaves nothing half done.
     """
 
     def __init__(self, spool: Spool, store: ObjectStore, settings: KeepSettings, robot: str, clock: Clock, *,  # noqa: PLR0913 - each is a neighbor
@@ -125,10 +125,10 @@ class RequestServer:
                  mbps: Callable[[], float | None] = lambda: None, may_send: Callable[[], bool] = lambda: True,
                  finished: Callable[[], None] = lambda: None, thin: Callable[[], bool] = lambda: False,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``put`` takes answers to be spooled, ``released`` hears of objects that may be shipped; ``mbps`` is the pace.
+        """``put`` takes answers to be spooled, ``released`` receives objects that may be shipped; ``mbps`` is the pace.
 
-        While not ``may_send``, requests are accepted and nothing is released for them. ``finished`` is called when all that a
-        request wants is in the store: somebody may wait to hear of it. ``thin`` makes room for what is kept, a little at a time.
+        While not ``may_send``, requests are accepted and nothing is released for them. ``finished`` is called when all objects of
+        a request are in the store: a client may wait for that. ``thin`` makes room for what is kept, a little at a time.
         """
         self._spool = spool
         self._store = store
@@ -211,7 +211,7 @@ class RequestServer:
                 pass
         return self._thin() | is_busy
 
-    # -- what is asked for -----------------------------------------------------------------------------------------
+    # -- requests -------------------------------------------------------------------------------------------------
 
     def ask(self, want: Mapping[str, Any], by: str) -> str:
         """Ask for something at the robot itself, from any thread: its id. Raises RequestRefused."""
@@ -233,7 +233,7 @@ class RequestServer:
         return read.id
 
     def _look(self) -> None:
-        """At how much is asked for."""
+        """Count the open requests and their bytes."""
         count, size = self._spool.requests.open()
         mbps = self._mbps()
         self.status = RequestStatus(count, size, mbps, round(8e-6 * size / mbps) if mbps else None)
@@ -359,7 +359,7 @@ class RequestServer:
         return bool(chosen)
 
     def _begin_cut(self, row: RequestRow) -> None:
-        """Unless one is being made: of the oldest bag of which a request wants parts of slices."""
+        """Start a cut, unless one is being made, of the oldest bag from which a request wants parts of slices."""
         if self._cutting is not None or not (slices := self._spool.requests.to_cut(row.id)):
             return
         folder = slices[0].key.rpartition('/')[0]
@@ -413,7 +413,7 @@ class RequestServer:
         self._spool.requests.set_complete(row.id, [each.id for each in cut.slices])
 
     def _next(self, rows: Sequence[RequestRow]) -> RequestRow | None:
-        """Of the requester who was served least, the most important request, of these the oldest."""
+        """The most important, oldest request of the requester who was served the fewest bytes, weighted by priority."""
         if not rows:
             return None
         asking = {row.requester for row in rows}
@@ -440,7 +440,7 @@ class RequestServer:
             self._spool.requests.let_go(row.id)
         progress = self._spool.requests.progress(row.id)
         if not row.is_open and progress.outcomes.get('pending'):
-            return  # what was released goes on its way, and the last answer tells of it
+            return  # the released objects are still delivered, and the last answer reports them
         number = row.answers + 1
         self._answering[row.id] = number
         answer = RequestAnswer(
@@ -472,7 +472,7 @@ def _in_turn(requests: Sequence[PullRequest]) -> list[PullRequest]:
 
 
 def _gone(items: Sequence[KeptObject]) -> dict[str, Any]:
-    """What of a request left the robot for good before it was asked for: how much, why, of when, and when it went."""
+    """Requested objects that were deleted before the request: how many, why, from what time, and when they were deleted."""
     if not items:
         return {}
     return {

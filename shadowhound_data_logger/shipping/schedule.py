@@ -1,8 +1,8 @@
 """Decides which object is sent next, and what a failure means for the others: every decision of delivery, and no I/O.
 
 A thread asks ``step`` what to do, does it outside the lock, and reports back with ``found``, ``delivered``, ``failed`` or
-``crashed``. A failure is held against the store, or the bucket, unless a delivery since tells that it is the object's
-own: then the object alone waits (or, denied again and again while its bucket takes others, goes to quarantine).
+``crashed``. A failure is held against the store, or the bucket, unless a later delivery shows that it is the
+object's: then the object alone waits (or is quarantined if it is denied repeatedly while its bucket accepts others).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ Step = Ship | Look | Rest
 
 @dataclass(frozen=True, slots=True)
 class Ruling:
-    """What follows from a failure: the reason to quarantine the object, if so, and what is to be logged."""
+    """What follows from a failure: the reason to quarantine the object, if any, and what must be logged."""
 
     quarantine: str | None = None
     notices: Sequence[Notice] = ()
@@ -221,7 +221,7 @@ class Schedule:
                 self._notify()
 
     def wait_for(self, rules: frozenset[str]) -> None:
-        """Send nothing that waits for these, which do not hold; what is under way goes on."""
+        """Send nothing that waits for these rules, which are false; transfers in progress continue."""
         with self._changed:
             if rules != self._waiting_for:
                 self._waiting_for = rules

@@ -38,7 +38,7 @@ def span_of(count: int, first_ns: int, last_ns: int) -> float:
 class Thinner:
     """Thins what a spool keeps, a little at each step.
 
-    New; ``step`` from one thread. What is requested or protected stays as it is. It remembers how far it came; a new one begins
+    New; ``step`` from one thread. Requested or protected objects are not thinned. It remembers how far it came; a new one begins
     again with the oldest.
     """
 
@@ -90,7 +90,7 @@ class Thinner:
         try:
             thinned = self._halve(item)
         except (DataLoggerError, FileNotFoundError) as error:
-            if item.path.exists():  # not evicted meanwhile
+            if item.path.exists():  # not evicted since
                 log.warning('%s cannot be thinned: %s', item.path, error)
             return None
         return None if thinned is None else self._spool.kept.thin(item, thinned)

@@ -33,7 +33,7 @@ from shadowhound_data_logger.stores.base import ObjectStore
 log = logging.getLogger(__name__)
 
 LOCK_EVERY_S: Final = 1.0
-"""How often a drain that another process has is asked for."""
+"""How often the drain lock is tried while another process holds it."""
 DRAINED_EVERY_S: Final = 0.02
 """How often ``drain`` looks: a wake for each object delivered would cost more."""
 
@@ -62,10 +62,10 @@ class UploadStatus(DeliveryStatus):
 class Uploader:
     """Delivers what is spooled to the store.
 
-    Life: New; open once; wake, settled, status, drain from any thread; close any number of times.
+    Lifecycle: New; open once; wake, settled, status, drain from any thread; close any number of times.
 
     It owns the threads ``upload-0`` ... and ``upload-lock``, which holds the drain lock while they run. ``settle`` is
-    called from its threads (``SpoolWriter.settle``); whoever makes the outcomes durable calls ``settled`` afterwards
+    called from its threads (``SpoolWriter.settle``); the writer calls ``settled`` when the outcomes are durable
     (``SpoolWriter.on_commit``).
     """
 
@@ -98,7 +98,7 @@ class Uploader:
         return self._keeper, *self._threads
 
     def wake(self, new: Sequence[SpooledObject] = ()) -> None:
-        """The spool has new objects; those that are told need not wait behind a backlog. Cheap, from any thread."""
+        """The spool has new objects; those in ``new`` need not wait behind a backlog. Cheap, from any thread."""
         self._schedule.wake(new)
 
     def settled(self, ids: Iterable[int]) -> None:
@@ -110,11 +110,11 @@ class Uploader:
         self._store.pace.set(max_mbps)
 
     def yield_to(self, max_mbps: float, seconds: float) -> None:
-        """Send no more than this for so long; it ends by itself. Raises ValueError for 0 and below."""
+        """Limit the rate for some seconds; the limit then expires. Raises ValueError for 0 and below."""
         self._store.pace.yield_to(max_mbps, seconds)
 
     def wait_for(self, rules: Mapping[str, str]) -> None:
-        """Send nothing that waits for these rules, which do not hold (and why not); what is under way goes on."""
+        """Send nothing that waits for these rules, which are false (and why); transfers in progress continue."""
         self._waits_for = rules
         self._schedule.wait_for(frozenset(rules) & {UPLOAD_WHEN, EVENTS_WHEN})
 
@@ -136,7 +136,7 @@ class Uploader:
     def close(self, deadline_s: float) -> None:
         """Begin no put any more and wait for those under way, at most ``deadline_s`` seconds; idempotent.
 
-        What is still under way then is left to its daemon thread and reported to nobody: it is pending, and sent again.
+        What is still under way then is left to its daemon thread and not reported: it is still pending, and is sent again.
         """
         for worker in self.workers:
             worker.stop()
@@ -146,7 +146,7 @@ class Uploader:
         if hung and not self._ended.is_set():
             log.warning('%d uploads did not end within %g s; their objects will be sent again next time', len(hung), deadline_s)
         self._ended.set()
-        self._store.pace.abandon()  # a body that waits for the cap would go on for minutes
+        self._store.pace.abandon()  # a body that waits for the cap would take minutes
         self._keeper.join(max(end - self._monotonic(), 0.1))
 
     def status(self) -> UploadStatus:
@@ -213,7 +213,7 @@ class Uploader:
         if ruling.quarantine is not None:
             gone = not item.path.exists()
             self._settle((Outcome(item, State.QUARANTINED, 'missing' if gone else ruling.quarantine),))
-            if gone:  # evicted since it was looked up, as a rule: the index then leaves it as it is
+            if gone:  # usually evicted since it was looked up: the index does not change it then
                 log.debug('%s/%s is no longer in the spool', item.bucket, item.key)
             else:
                 self._announce_quarantine(item, ruling.quarantine, error)

@@ -84,7 +84,7 @@ def test_an_outage_is_announced_once_and_its_end_once(drive: Drive) -> None:
                              'it is tried again until it works')  # fmt: skip
     assert end.lasted_s is not None
     assert end.lasted_s >= lasted
-    assert 'delivery goes on after' in end.text(4)
+    assert 'delivery continues after' in end.text(4)
 
 
 def test_puts_that_fail_together_are_one_failure(spool: FakeSpool, clock: Time) -> None:
