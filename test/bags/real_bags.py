@@ -26,13 +26,13 @@ T0 = 1_760_788_800_000_000_000
 STEP_NS = 10_000_000
 IMU = Channel('/imu', 'std_msgs/msg/String', 'ros2msg', 'string data\n', 'RIHS01_' + 'a' * 64, '')
 BLOB = Channel('/camera/blob', 'nowhere/msg/Blob', '', '', '', '')
-"""Of a type that nobody knows."""
+"""With a type that is unknown on this machine."""
 EVER = MessageFilter(0, 1 << 63, lambda _: True)
 NAME = 'patrol_20251018_120000'
 
 
 def write_ours(folder: Path, *, slices: int = 3, each: int = 500, is_ended: bool = True, robot: str = 'thor') -> list[SliceInfo]:
-    """A bag as the node writes it, 10 ms a message; every tenth with a large one beside it."""
+    """A bag as the node writes it, one message every 10 ms; every tenth with an additional large one."""
     folder.mkdir(parents=True)
     rng, infos = random.Random(7), []
     for number in range(slices):

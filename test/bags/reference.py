@@ -24,7 +24,7 @@ BARE: dict[str, Any] = {
 
 
 def write(path: Path, fill: Callable[[Writer], None], *, profile: str = 'ros2', **options: Any) -> Path:
-    """A file of the reference writer, in a folder of its own; returns the folder."""
+    """A file of the reference writer, in a separate folder; returns the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open('wb') as file:
         writer = Writer(file, **options)

@@ -153,7 +153,7 @@ def test_upload(store: DirectoryStore, tmp_path: Path) -> None:
 
 
 def test_fetch(store: DirectoryStore, tmp_path: Path) -> None:
-    """Each file arrives as it was."""
+    """Each file arrives unchanged."""
     found = fetch(store, find_bag(store, 'thor', BAG), tmp_path)
     assert found.is_complete
     assert not found.unverified

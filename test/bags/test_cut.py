@@ -67,7 +67,7 @@ def source(origin: Path, wanted: Callable[[RecordedMessage], bool]) -> list[Reco
 def test_it_has_these_messages_and_no_others(
     origin: Path, store: MemoryStore, tmp_path: Path, choice: Choice, first: int, last: int, topics: set[str]
 ) -> None:
-    """Topic, both stamps, sequence number and bytes of each, in their order; the source is left as it is."""
+    """Topic, both stamps, sequence number and bytes of each message are copied in order; the source is unchanged."""
     found = cut_remote(store, find_bag(store, 'thor', NAME), tmp_path / 'piece', choice)
     start_ns, end_ns = T0 + first * STEP_NS, T0 + last * STEP_NS
     wanted = source(origin, lambda one: start_ns <= one.log_ns < end_ns and one.channel.topic in topics)
@@ -78,7 +78,7 @@ def test_it_has_these_messages_and_no_others(
 
 
 def test_several_times_are_one_bag(origin: Path, store: MemoryStore, tmp_path: Path) -> None:
-    """In their order, within the start and end that are asked for."""
+    """Messages between the requested start and end are copied in order."""
     spans = (
         (T0 - STEP_NS, T0 + 3 * STEP_NS),
         (T0 + 700 * STEP_NS, T0 + 705 * STEP_NS),
@@ -92,7 +92,7 @@ def test_several_times_are_one_bag(origin: Path, store: MemoryStore, tmp_path: P
 
 
 def test_little_more_is_read_than_its_chunks(store: MemoryStore, tmp_path: Path) -> None:
-    """Of a second out of fifteen, not a fifth of the bag; of a topic that lies in every fifth chunk, those chunks."""
+    """For one second of fifteen, less than a fifth of the bag is read; for a topic in every fifth chunk, only those chunks."""
     bag = find_bag(store, 'thor', NAME)
     found = cut_remote(store, bag, tmp_path / 'second', Choice('7', '8'))
     assert found.read_bytes < bag.size / 5
@@ -256,7 +256,7 @@ def test_an_existing_folder_is_left_alone(store: MemoryStore, tmp_path: Path) ->
 
 
 def test_a_damaged_chunk_is_not_copied(origin: Path, tmp_path: Path) -> None:
-    """Its CRC-32 tells, and nothing is left of the cut."""
+    """Its CRC-32 reveals it, and nothing remains of the cut."""
     folder = tmp_path / NAME
     folder.mkdir()
     content = bytearray((origin / f'{NAME}_0.mcap').read_bytes())

@@ -39,7 +39,7 @@ def test_the_seconds_before_a_trigger_and_after_it(tmp_path: Path) -> None:
 
 
 def test_the_manifest_says_who_asked_for_it(tmp_path: Path) -> None:
-    """Of each trigger the operator at the page, beside when it was; nobody is named where nobody is known."""
+    """Each trigger has the operator at the page, in addition to its time, if the operator is known."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(10))
         it.events.trigger('fall', 'page', 'on the stairs', who='operator at 192.0.2.7')
@@ -53,7 +53,7 @@ def test_the_manifest_says_who_asked_for_it(tmp_path: Path) -> None:
 
 
 def test_what_was_on_its_way_for_a_while_counts_from_when_it_happened(tmp_path: Path) -> None:
-    """An agent's log_event is noticed late: the event's seconds are counted from when it was said."""
+    """An agent's log_event is noticed late: the event's seconds are counted from the call."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(20))
         it.events.trigger('fall', 'log_event', None, 1.0)
@@ -63,7 +63,7 @@ def test_what_was_on_its_way_for_a_while_counts_from_when_it_happened(tmp_path: 
 
 
 def test_triggers_that_overlap_are_one_event(tmp_path: Path) -> None:
-    """A trigger in the seconds after another one makes the bag longer, and all of them are told."""
+    """A trigger within seconds of another one extends the bag, which lists all of them."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(10))
         it.events.trigger('fall', 'service')
@@ -103,7 +103,7 @@ def test_an_event_is_no_longer_than_it_may_be(tmp_path: Path) -> None:
 
 
 def test_an_event_after_another_begins_where_that_ended(tmp_path: Path) -> None:
-    """What the first one has is not in the second one, though it is not long ago; what nobody asked for is nobody's loss."""
+    """Messages of the first event are not in the second one, even if they are recent; unclaimed messages are not losses."""
     with buffer(tmp_path) as it:
         hear_each_second(it, range(10))
         it.events.trigger('one', 'service')
@@ -124,7 +124,7 @@ def test_an_event_after_another_begins_where_that_ended(tmp_path: Path) -> None:
 
 
 def test_a_gap_within_an_event_is_missed(tmp_path: Path) -> None:
-    """As it is anywhere else: numbers that never came are told as missed."""
+    """As in other accounts, numbers that never arrived are reported as missed."""
     with buffer(tmp_path) as it:
         it.hear(range(5))
         it.hear(range(7, 10))
@@ -197,7 +197,7 @@ def test_it_says_in_which_mission_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', ['../../etc', 'über den Berg', '', 'x' * 300])
 def test_a_name_that_cannot_be_in_a_key_is_made_one_that_can(tmp_path: Path, name: str) -> None:
-    """Whatever an agent calls its event; the manifest has what it said."""
+    """An agent may call its event anything; the manifest has the name that it used."""
     with buffer(tmp_path) as it:
         it.hear(range(2))
         it.events.trigger(name or '?', 'log_event')
@@ -231,7 +231,7 @@ def test_a_close_ends_the_event(tmp_path: Path) -> None:
 
 
 def test_without_topics_there_is_nothing(tmp_path: Path) -> None:
-    """No thread, no ring, and a trigger is told why."""
+    """There is no thread and no ring, and a trigger returns the reason."""
     with buffer(tmp_path, topics=('',)) as it:
         assert list(it.events.workers) == []
         assert it.events.status() == EventStatus(enabled=False)

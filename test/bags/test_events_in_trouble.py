@@ -31,7 +31,7 @@ class Disk:
 
 
 def test_what_had_to_go_before_it_was_written_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk that hangs costs the oldest of what was asked for, which is counted; the ring grows no larger than it may be."""
+    """A hung disk costs the oldest claimed messages, which are counted; the ring does not exceed its limit."""
     disk = Disk(monkeypatch)
     with buffer(tmp_path, max_bytes=1 << 20) as it:
         disk.works.clear()

@@ -59,7 +59,7 @@ def files(folder: Path) -> dict[str, str]:
 
 
 def test_it_is_the_very_bag(store: Counting, tmp_path: Path) -> None:
-    """Every file is what the robot wrote, and nothing else lies beside it; what was told adds up to all bytes."""
+    """Every file is what the robot wrote, there are no others, and the reported progress adds up to all bytes."""
 
     class Sum(ProgressListener):
         total = 0
@@ -144,7 +144,7 @@ def test_a_growing_bag_can_be_opened_and_completed(tmp_path: Path) -> None:
 
 
 def test_a_bag_of_which_a_slice_is_missing_can_be_opened_and_completed(tmp_path: Path) -> None:
-    """Though its metadata.yaml was faster, and names what is not there: what is missing is told, and fetched once it is there."""
+    """Even if its metadata.yaml arrived first and names missing files: these are reported, and fetched once they exist."""
     folder = tmp_path / 'robot' / NAME
     write_ours(folder)
     store = MemoryStore()
@@ -161,7 +161,7 @@ def test_a_bag_of_which_a_slice_is_missing_can_be_opened_and_completed(tmp_path:
 
 
 def test_a_foreign_bag_is_fetched_as_it_is(tmp_path: Path) -> None:
-    """What another program put there without a checksum is told so."""
+    """Files that another program uploaded without a checksum are reported as such."""
     write_rosbags(tmp_path / 'store' / BUCKET / 'thor' / 'rosbags' / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)
     store = DirectoryStore(tmp_path / 'store')
     found = fetch(store, find_bag(store, 'thor', 'theirs'), tmp_path / 'here')
@@ -170,7 +170,7 @@ def test_a_foreign_bag_is_fetched_as_it_is(tmp_path: Path) -> None:
 
 
 def test_two_at_a_time_do_not_mix(store: Counting, tmp_path: Path) -> None:
-    """A second process in the same folder is told of the first."""
+    """A second process in the same folder gets an error that names the first."""
     folder = tmp_path / 'here' / NAME
     folder.mkdir(parents=True)
     with (folder / f'{NAME}_0.mcap.part').open('ab') as part:

@@ -1,4 +1,4 @@
-"""Bags of other recorders: what their files hold counts, and what is not decoded is copied as it is."""
+"""Bags of other recorders: the contents of their files count, and data that is not decoded is copied verbatim."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_every_folder_has_a_name_in_the_store(name: str) -> None:
 
 
 def test_a_torn_file_of_a_split_bag(tmp_path: Path) -> None:
-    """The others are shown, cut, verified and uploaded, and each verb says so; the torn one is kept in the store as it is."""
+    """The others are shown, cut, verified and uploaded, and each verb reports the truncated one, which is stored unchanged."""
     for part in range(3):
         write(tmp_path / 'b' / f'b_{part}.mcap', ten)
     folder = tmp_path / 'b'

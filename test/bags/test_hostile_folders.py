@@ -1,4 +1,4 @@
-"""Whatever lies in the folder of a bag at a start: nothing outside is touched, the node starts, the other bags are made whole."""
+"""Whatever is in a bag's folder at startup: nothing outside is touched, the node starts, and other bags are completed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def recovered(home: Path) -> dict[str, Path]:
 
 
 def counts(found: dict[str, Path], home: Path) -> dict[str, int]:
-    """Slice -> messages, as the manifest tells it."""
+    """Slice -> messages, according to the manifest."""
     (path,) = home.glob(f'spool/ready/*/{ROBOT}/rosbags/{BAG}/manifest.json')
     return {entry['file'].removeprefix(f'{BAG}_'): entry['messages'] for entry in json.loads(path.read_bytes())['slices']}
 
@@ -45,7 +45,7 @@ WHOLE = {'0.mcap': 10, '1.mcap': 10}
 
 
 def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
-    """A slice, an open one, a bag: what a link leads to stays as it is, and the link is set aside."""
+    """For a slice, an open one and a bag: the target of a link is unchanged, and the link is set aside."""
     home, precious = tmp_path / 'home', tmp_path / 'precious.mcap.open'
     closed(tmp_path / 'other.mcap', 5)
     precious.write_bytes(b'precious')
@@ -77,7 +77,7 @@ def test_what_is_no_slice_is_set_aside(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_bag_that_cannot_be_made_whole_keeps_none_of_the_others(folder: Path, tmp_path: Path) -> None:
-    """It is tried again; those after it are whole meanwhile, and the node records."""
+    """It is tried again; the bags after it are completed during that time, and the node records."""
     later = folder.with_name('patrol_20251018_130000')
     later.mkdir()
     closed(later / f'{later.name}_0.mcap', 7)

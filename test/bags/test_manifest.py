@@ -1,4 +1,4 @@
-"""manifest.json: read back as it was written, and wrong ones refused by the name of the field."""
+"""manifest.json is read back unchanged, and invalid ones are rejected with the name of the field."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_fields_that_others_read() -> None:
 
 
 def test_what_made_an_event_comes_back() -> None:
-    """Each trigger with its time; a manifest of before there were events has none, and damage is told with its place."""
+    """Each trigger has its time; a manifest without an event has none, and damage is reported with its field."""
     event = EventOf(
         'fall', 30.0, 12.5, 10.0,
         (TriggerOf('fall', 'page', 7, None, 'operator at ::1'), TriggerOf('low', 'condition', 8, 'soc < 20: 19')),
@@ -74,7 +74,7 @@ def test_what_made_an_event_comes_back() -> None:
 
 
 def test_made_of_slices(tmp_path: Path) -> None:
-    """An entry and the topics are what the writer of the slices told."""
+    """An entry and the topics are those that the slice writer returned."""
     one, _ = closed(tmp_path / 'bag_0.mcap', 10)
     two, _ = closed(tmp_path / 'bag_1.mcap', 4)
     entry = SliceEntry.of(one, 'key')

@@ -35,7 +35,7 @@ class Record(Protocol):
 
 
 def packed(*records: Record | bytes) -> bytes:
-    """One after the other; bytes as they are."""
+    """Records in order, with verbatim bytes."""
     builder = RecordBuilder()
     for record in records:
         if isinstance(record, bytes):
@@ -128,7 +128,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize('name', DAMAGED)
 def test_what_it_does_not_allow(tmp_path: Path, name: str) -> None:
-    """Is damage: never a message on the wrong topic, and none left out without a word."""
+    """They are damage: no message appears on the wrong topic, and none is lost silently."""
     records, says = DAMAGED[name]
     folder = assembled(tmp_path / 'b', *records)  # type: ignore[misc]
     for attempt in (lambda: info_folder(folder), lambda: cut_folder(folder, tmp_path / 'piece', Choice())):
@@ -167,7 +167,7 @@ def test_attachments_are_not_read(tmp_path: Path) -> None:
 
 
 def test_attachments_alone(tmp_path: Path) -> None:
-    """Are a bag without messages; a cut of others says how many it leaves out."""
+    """They are a bag without messages; a cut of others reports how many it omits."""
     alone = write(tmp_path / 'alone' / 'b_0.mcap', lambda writer: writer.add_attachment(1, 1, 'map.png', 'image/png', b'x' * 999))
     found = info_folder(alone).description
     assert (found.messages, found.topics, found.t_start_ns) == (0, (), None)
@@ -247,7 +247,7 @@ def test_every_checksum_of_a_file_is_checked(tmp_path: Path, is_chunked: bool) -
 
 
 def test_schemas_of_one_name(tmp_path: Path) -> None:
-    """Are told apart, on one topic or on two."""
+    """They are kept apart, on one topic or on two."""
 
     def fill(writer: Writer) -> None:
         schemas = [writer.register_schema(STRING[0], STRING[1], text) for text in (b'string data', b'string other', b'')]

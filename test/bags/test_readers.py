@@ -114,7 +114,7 @@ def test_as_a_folder(bag: tuple[Path, list[Recorded]]) -> None:
 
 
 def test_with_the_types_of_the_bag(bag: tuple[Path, list[Recorded]]) -> None:
-    """Messages are decoded by the definitions in the slices alone; a type that nobody knows is not an obstacle."""
+    """Messages are decoded with the definitions in the slices only; an unknown type does not prevent that."""
     folder, _ = bag
     with AnyReader([folder]) as reader:
         wanted = [one for one in reader.connections if one.topic == '/odom']
@@ -126,7 +126,7 @@ def test_with_the_types_of_the_bag(bag: tuple[Path, list[Recorded]]) -> None:
 
 
 def test_a_single_slice(bag: tuple[Path, list[Recorded]]) -> None:
-    """A slice is a bag by itself, of which a time range can be read."""
+    """A single slice is a bag, from which a time range can be read."""
     folder, written = bag
     with AnyReader([folder / 'patrol_2.mcap']) as reader:
         found = [(one.topic, at) for one, at, _ in reader.messages(start=written[55].log_ns, stop=written[60].log_ns)]

@@ -38,7 +38,7 @@ while True:
 
 @pytest.fixture
 def home(domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """With somebody who publishes odometry and text at 50 Hz."""
+    """While a program publishes odometry and text at 50 Hz."""
     environ = {'ROS_DOMAIN_ID': str(domain),
                'SHADOWHOUND_HOME': str(tmp_path / 'home'), 'AWS_ENDPOINT_URL': ''}  # fmt: skip
     for name, value in environ.items():
@@ -99,7 +99,7 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
 
 @long
 def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
-    """The bag is made whole and another follows it; both are in the store, and the call tells of the last."""
+    """The bag is completed and another one follows; both are in the store, and the call returns the last one."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
     command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:

@@ -123,7 +123,7 @@ def test_a_full_queue_is_a_loss_with_a_name(tmp_path: Path) -> None:
 
 
 def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
-    """It begins and ends with it, bears its type, and says its ids, also the run's that became known meanwhile."""
+    """The bag starts and ends with the mission, is named after its type, and has its ids, even if that of the run came later."""
     with desk(tmp_path, record='mission') as it:
         it.recorder.on_mission(None)
         assert not it.recorder.status().recording
@@ -139,7 +139,7 @@ def test_a_bag_follows_its_mission(tmp_path: Path) -> None:
 
 
 def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
-    """Recording always, a mission has a bag of its own; the intake listens all the time, and is told of each that begins."""
+    """If recording is always on, a mission gets a separate bag; the intake keeps listening and is informed of each bag."""
     with desk(tmp_path, record='always') as it:
         names = [it.recorder.status().bag]
         for number, told in enumerate((None, mission(), mission(number=2), None)):
@@ -157,7 +157,7 @@ def test_one_bag_follows_the_other_without_a_gap(tmp_path: Path) -> None:
 
 
 def test_what_comes_while_the_next_bag_is_made_is_in_one_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its folder is synced to a disk that may be slow, and the intake goes on meanwhile."""
+    """Its folder is synced to a disk that may be slow, and the intake keeps working."""
     begin = BagState.begin
     with desk(tmp_path, record='always') as it:
 
@@ -223,7 +223,7 @@ def kill(home: Path, number: int = 0) -> Path:
 
 
 def _copy(source: str, target: str) -> None:
-    """What leaves meanwhile is not there any more."""
+    """Slices that were delivered in between are no longer in the spool."""
     with suppress(FileNotFoundError):
         shutil.copy2(source, target)
 

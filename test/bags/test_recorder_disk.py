@@ -1,4 +1,4 @@
-"""A disk that takes nothing costs what comes meanwhile, with a reason, and the bag goes on as soon as it takes something."""
+"""A disk that accepts no writes costs the messages of that time, with a reason; then the bag continues."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:
-    """The slice is closed and spooled, what comes is dropped as no_room, and the recording goes on once there is room."""
+    """The slice is closed and spooled, messages are dropped as no_room, and the recording continues once there is room."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         it.hear(range(5))
@@ -89,7 +89,7 @@ def _retry(it: Desk) -> None:
 def test_a_disk_that_refuses_costs_what_it_did_not_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, number: int, reason: str
 ) -> None:
-    """The broken slice is saved as far as it goes, the rest is dropped with the disk's reason, and the bag goes on."""
+    """The intact part of the slice is kept, the rest is dropped with the disk's reason, and the bag continues."""
     with desk(tmp_path) as it:
         name = start(it.recorder)
         it.hear(range(5))
@@ -123,7 +123,7 @@ def test_a_disk_that_refuses_costs_what_it_did_not_take(
 
 
 def test_what_did_not_get_in_is_in_the_manifest(tmp_path: Path) -> None:
-    """A bag that ended by itself without some messages has gaps, by topic and reason, as in the ledger; the next has none."""
+    """A bag that ended normally without some messages has gaps, by topic and reason, as in the ledger; the next has none."""
     with desk(tmp_path, queue_bytes=100) as it:
         name = start(it.recorder)
         it.hear(range(2))
@@ -150,7 +150,7 @@ def test_what_did_not_get_in_is_in_the_manifest(tmp_path: Path) -> None:
 
 
 def test_slices_that_the_full_spool_gave_up_are_in_the_manifest(tmp_path: Path) -> None:
-    """As missing, with their messages and the reason, and not among the slices: nobody waits for them."""
+    """They are listed as missing, with messages and reason, and not among the slices, so no reader waits for them."""
     with desk(tmp_path, slice_bytes=1 << 20, spool={'max_bytes': 4 << 20}) as it:
         name = start(it.recorder)
         for first in range(0, 80, 10):

@@ -1,4 +1,4 @@
-"""What a start makes of a bag where the index was lost, or somebody put something into its folder."""
+"""Recovery at startup if the index was lost or another program put files into the folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def foreign(path: Path, bag: str, robot: str, owner: str) -> None:
 
 
 def test_a_slice_of_another_recording_tells_nothing_of_this_one(tmp_path: Path) -> None:
-    """It is spooled as a slice of the folder that it lies in, or set aside; the bag keeps its name."""
+    """It is spooled as a slice of the folder in which it is, or set aside; the bag keeps its name."""
     folder = tmp_path / 'bags' / ROBOT / BAG
     folder.mkdir(parents=True)
     closed(folder / f'{BAG}_0.mcap', 10)
@@ -42,7 +42,7 @@ def test_a_slice_of_another_recording_tells_nothing_of_this_one(tmp_path: Path) 
 
 
 def test_what_was_dropped_after_the_last_slice_is_missing_without_the_index(tmp_path: Path) -> None:
-    """The last slice tells of it, so the manifest is the same with and without the index."""
+    """The last slice describes it, so the manifest is the same with and without the index."""
     clock = Clocks()
     home = tmp_path / 'home'
     with desk(home, clock, queue_bytes=1000) as it:
@@ -66,7 +66,7 @@ def test_what_was_dropped_after_the_last_slice_is_missing_without_the_index(tmp_
 
 
 def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
-    """What lies behind it is neither read, moved nor removed."""
+    """Its target is neither read, moved nor removed."""
     home, outside = tmp_path / 'home', tmp_path / 'outside'
     with desk(home, record='always') as it:
         name = it.recorder.status().bag

@@ -25,7 +25,7 @@ def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> Ba
 
 
 def test_a_complete_bag(tmp_path: Path) -> None:
-    """Its manifest tells everything of it."""
+    """Its manifest describes it completely."""
     store = MemoryStore()
     write_ours(tmp_path / NAME)
     stored(store, tmp_path / NAME)
@@ -58,7 +58,7 @@ def test_a_manifest_before_its_slices_is_no_complete_bag(tmp_path: Path) -> None
 
 
 def test_bags_of_others_are_foreign(tmp_path: Path) -> None:
-    """With metadata.yaml as much is known of them; of an archive nothing."""
+    """With metadata.yaml, they are described as well; only the size of an archive is known."""
     folder = tmp_path / 'store' / BUCKET / 'thor' / 'rosbags'
     folder.mkdir(parents=True)
     write_rosbags(folder / 'theirs', StoragePlugin.SQLITE3, CompressionMode.NONE)

@@ -41,7 +41,7 @@ def ours(tmp_path: Path) -> Path:
 
 
 def test_a_bag_without_damage_is_left_alone(ours: Path) -> None:
-    """Nothing is written, neither beside it nor in place."""
+    """Nothing is written, neither a new file nor in place."""
     before = content(ours)
     for in_place in (False, True):
         found = repair_bag(ours, in_place=in_place)
@@ -51,7 +51,7 @@ def test_a_bag_without_damage_is_left_alone(ours: Path) -> None:
 
 
 def test_torn_slices_of_a_bag_of_ours(ours: Path, tmp_path: Path) -> None:
-    """Two of three: the copy is a bag that verifies, its manifest lists what is missing, and the original is as it was."""
+    """Two of three slices: the copy is a bag that verifies, its manifest lists the losses, and the original is unchanged."""
     tear(ours / f'{NAME}_0.mcap', 200_000)
     tear(ours / f'{NAME}_2.mcap', 10)
     (ours / 'notes.txt').write_text('kept')
@@ -113,7 +113,7 @@ def test_metadata_that_is_missing_or_wrong(tmp_path: Path, plugin: StoragePlugin
 
 @pytest.mark.parametrize('part', [0.3, 0.7, 0.97])
 def test_a_torn_database(tmp_path: Path, part: float) -> None:
-    """Of SQLite the rows that can be read are kept; the metadata tell how many are lost."""
+    """The readable rows of SQLite are kept; the metadata has the number of lost ones."""
     bag = tmp_path / 'bag'
     write_rosbags(bag, StoragePlugin.SQLITE3, CompressionMode.NONE)
     with AnyReader([bag]) as reader:
@@ -173,7 +173,7 @@ def test_a_database_that_was_not_closed(tmp_path: Path, *, in_place: bool) -> No
 
 
 def test_one_file(tmp_path: Path, ours: Path) -> None:
-    """Beside it, where it is asked for, or in place; a slice that is still open gets its name."""
+    """Next to it, at the requested path, or in place; an open slice is renamed."""
     path = ours / f'{NAME}_1.mcap'
     tear(path, 300_000)
     found = repair_bag(path)
@@ -205,7 +205,7 @@ def test_what_is_no_bag_at_all(tmp_path: Path) -> None:
 
 
 def test_one_file_of_which_nothing_can_be_read(ours: Path) -> None:
-    """The others are repaired, and it is reported; in place it is left as it is."""
+    """The others are repaired, and it is reported; in place, it is unchanged."""
     (ours / f'{NAME}_0.mcap').write_bytes(b'no bag at all' * 50)
     tear(ours / f'{NAME}_1.mcap', 5000)
     found = repair_bag(ours)

@@ -25,7 +25,7 @@ def told(held: RingItem) -> list[int]:
 
 
 def test_what_is_too_old_goes() -> None:
-    """Of what nobody asked for the last seconds are kept, in the order of arrival."""
+    """Of unclaimed messages, the last seconds are kept, in order of arrival."""
     ring = Ring(1 << 20, KEEP_S)
     for second in range(30):
         assert ring.put(batch(range(second, second + 1)), None, float(second)) == []
@@ -72,7 +72,7 @@ def test_messages_are_not_copied() -> None:
 
 
 def test_while_it_is_claimed_nothing_grows_old() -> None:
-    """What an event asked for waits for it, until it is taken or somebody else needs its place, which is told."""
+    """Claimed messages wait until the event takes them or newer ones need the room, which is reported."""
     ring = Ring(5 * (12 + MESSAGE_BYTES), KEEP_S)
     for second in range(3):
         ring.put(batch(range(second, second + 1)), None, float(second))

@@ -187,7 +187,7 @@ def test_other_encodings_keep_their_name(tmp_path: Path) -> None:
 
 
 def test_messages_of_no_topic(tmp_path: Path) -> None:
-    """Are damage, as is a file with a page that is none; no messages are no error but of a cut."""
+    """They are damage, as is a file with an invalid page; no messages are an error only for a cut."""
     path = storage(tmp_path / 'b' / 'b_0.db3', HUMBLE, [*MESSAGES, (99, T0, CDR)])
     with pytest.raises(BagDamaged, match='topic 99'):
         info_folder(path.parent)

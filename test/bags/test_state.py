@@ -1,4 +1,4 @@
-"""What is known of a bag until it is whole: read back from the index and from a slice."""
+"""The state of a bag until it is complete is read back from the index and from a slice."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def state(tmp_path: Path) -> BagState:
 
 
 def test_it_is_read_as_it_was_told(state: BagState) -> None:
-    """By the index, and by the slice that follows; definitions are in the slices, and not told again."""
+    """From the index and from the next slice; the slices have the definitions, which are not repeated."""
     (_, rows) = state.all_rows()
     assert BagState.of_rows(state.folder, 'thor', rows) == state
     assert BagState.of_record(state.folder, 'thor', state.record('thor', 2)) == state
@@ -51,7 +51,7 @@ def test_it_is_read_as_it_was_told(state: BagState) -> None:
 
 
 def test_each_change_is_told_alone(state: BagState) -> None:
-    """With its own place among what is missing, so that what is told twice is there once."""
+    """Each loss has its own number, so a loss that is stored twice exists once."""
     rows = state.add_missing(Missing('b_1.mcap', 'more', 1))
     assert ([one.place for one in rows.missing], rows.slices) == ([2], ())
     rows = state.add_slice(info(state.folder, 2))
@@ -96,6 +96,6 @@ def test_what_a_slice_says_later_counts(tmp_path: Path) -> None:
     {'missing': '[[0, 7, "what", null, null, null]]'}, {'missing': '[' * 100_000}, {'slices': 'x'},
 ])  # fmt: skip
 def test_what_makes_no_sense_is_refused(state: BagState, change: dict[str, str]) -> None:
-    """Whatever a flipped bit or somebody else made of it."""
+    """Whatever a flipped bit or another program made of it."""
     with pytest.raises(BagDamaged):
         BagState.of_record(state.folder, 'thor', {**state.record('thor', 2), **change})

@@ -1,4 +1,4 @@
-"""Uploading finished bags: as they are, verified, through the spool or past it, and watching a folder for them."""
+"""Uploading finished bags: unchanged, verified, through the spool or directly, and watching a folder for them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_any_finished_bag_arrives_as_it_is(
     settings: Settings, store: DirectoryStore, tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
 ) -> None:
-    """With a manifest that tells its checksums; the folder is left as it was."""
+    """With a manifest that has its checksums; the folder is unchanged."""
     write_rosbags(tmp_path / 'theirs', plugin, mode)
     before = contents(tmp_path / 'theirs')
     assert send(settings, tmp_path / 'theirs').is_delivered
@@ -246,7 +246,7 @@ def test_a_watched_bag_is_shipped_once_it_is_finished(settings: Settings, store:
 
 
 def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: Path) -> None:
-    """After ten minutes without a change; it is not sent, it is owed, and once somebody goes on with it all is as before."""
+    """After ten minutes without a change it is reported, not sent; it becomes normal again once its recorder continues."""
     folder = tmp_path / 'recordings'
     write_ours(folder / NAME, is_ended=False)
     (folder / 'empty').mkdir()
@@ -268,7 +268,7 @@ def test_a_bag_that_nobody_finishes_is_told_once(settings: Settings, tmp_path: P
 
 
 def test_a_bag_is_removed_only_when_the_store_has_it(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
-    """Not when a file of it is gone from there, nor when somebody changed the bag since."""
+    """Not if one of its files is missing in the store, nor if the bag has changed since."""
     hand, folder = Hand(), tmp_path / 'recordings'
     for name in ('gone', 'kept', 'changed'):
         write_ours(folder / name, slices=1, each=10)
@@ -284,7 +284,7 @@ def test_a_bag_is_removed_only_when_the_store_has_it(settings: Settings, store: 
 
 
 def test_one_bad_bag_costs_itself_alone(settings: Settings, store: DirectoryStore, tmp_path: Path) -> None:
-    """It is told once, and the others are shipped."""
+    """It is reported once, and the others are uploaded."""
     hand, folder = Hand(), tmp_path / 'recordings'
     write_ours(folder / 'bad', slices=2, each=10)
     write_ours(folder / 'good', slices=1, each=10)
@@ -308,7 +308,7 @@ def test_a_damaged_list_of_sent_bags_is_an_error(settings: Settings, tmp_path: P
 
 
 def test_two_do_not_watch_one_folder(settings: Settings, tmp_path: Path) -> None:
-    """The second is told of the first."""
+    """The second one gets an error."""
     watching = watch(settings, tmp_path, Hand())
     with (
         watching.exclusive(),

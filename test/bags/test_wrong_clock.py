@@ -1,4 +1,4 @@
-"""A bag that begins before the clock is set gets the date at which it began, or a name that says that nobody knows it."""
+"""A bag that starts before the clock is set gets its start date later, or a name without a date."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_bag_never_spans_the_moment_in_which_the_clock_is_set(tmp_path: Path) 
 
 
 def test_what_came_before_the_clock_was_set_has_a_right_time_in_a_later_bag(tmp_path: Path) -> None:
-    """It waited in the queue meanwhile: its time is told by the clock of the bag that it is in."""
+    """It waited in the queue: its time is converted to the clock of its bag."""
     clock = Clocks()
     with desk(tmp_path, clock) as it:
         early = Clocks()

@@ -173,7 +173,7 @@ def test_the_command_line_does_what_the_services_do(operated: Operated) -> None:
     assert operated.station.bag('start') == tell(operated, 'bag', 'start') == (False, f'{bag} is being recorded already')
     assert operated.station.bag('split') == tell(operated, 'bag', 'split') == (True, f'{bag} has 0 closed slices')
     assert operated.station.bag_pause(paused=True) == tell(operated, 'bag', 'pause') == (True, f'{bag} is paused')
-    assert operated.station.bag_pause(paused=False) == tell(operated, 'bag', 'resume') == (True, f'{bag} is recorded')
+    assert operated.station.bag_pause(paused=False) == tell(operated, 'bag', 'resume') == (True, f'{bag} is being recorded')
     assert operated.station.bag('stop') == (True, f'{bag}: 0 messages in 0 slices')
     assert operated.station.bag('stop') == tell(operated, 'bag', 'stop') == (False, 'nothing is recorded')
     assert operated.station.event() == tell(operated, 'event')

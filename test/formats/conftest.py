@@ -73,7 +73,7 @@ class Ros:
         return bytes(self.store.serialize_cdr(message, type_name, little_endian=little_endian))
 
     def encode(self, type_name: str, *cdrs: bytes, sensor: str = '', stamps: Sequence[int] = (), **changes: Any) -> Encoding:
-        """What the encoder makes of these messages in the default settings of the type's sensor, changed as told."""
+        """What the encoder makes of these messages with the default settings of the type's sensor, and these changes."""
         name = sensor or TOPICS[type_name]
         settings = self.sensors[name]
         settings = type(settings)(**{field: getattr(settings, field) for field in settings.__slots__} | changes)

@@ -31,7 +31,7 @@ SHARE: Final = 100
 """Bytes that encoding may take for each byte of a message: Python objects of small records are the most wasteful."""
 FLOOR_BYTES: Final = 2 << 20
 SLOWEST_S: Final = 30.0
-"""A second would do; other processes may have the machine meanwhile."""
+"""A second would suffice on an idle machine."""
 TYPES: Final = (
     'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image', 'sensor_msgs/msg/PointCloud2', 'sensor_msgs/msg/JointState',
     'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry', 'nav_msgs/msg/OccupancyGrid', 'std_msgs/msg/String',
@@ -120,7 +120,7 @@ class Fuzzer:
 
 
 def measured(work: Callable[[], Encoding]) -> tuple[Encoding, int, float]:
-    """What it returns, the most memory that Python and numpy took meanwhile (bytes), and seconds."""
+    """The result, the peak memory of Python and numpy (bytes), and the seconds."""
     tracemalloc.start()
     began = time.monotonic()
     try:

@@ -1,4 +1,4 @@
-"""Archives hold every message of a batch as a file and a JSON beside it, named so that WebDataset pairs them."""
+"""Archives contain every message of a batch as a file and a JSON, named so that WebDataset pairs them."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def types() -> MessageTypes:
 
 
 class Writer:
-    """Writes random messages of a type as a vendor of its own would, by the rules that it is made with."""
+    """Writes random messages of a type as a DDS vendor with these rules would."""
 
     def __init__(self, types: MessageTypes, rng: random.Random, *, order: str = '<', nul: bool = True, align: int = 8) -> None:
         self.types, self.rng, self.order, self.nul, self.align = types, rng, order, nul, align

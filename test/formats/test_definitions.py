@@ -104,7 +104,7 @@ def test_what_nobody_knows(name: str) -> None:
 
 
 def test_without_ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing is sourced, common types are described all the same."""
+    """If nothing is sourced, common types are described anyway."""
     monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
     encoding, definition, type_hash = describe('sensor_msgs/msg/Imu')
     assert encoding == 'ros2msg'

@@ -19,7 +19,7 @@ IMU = 'go2_interfaces/msg/IMU'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 STAMP_NS = 1_760_788_800_250_000_000
 JPEG = bytes.fromhex('ffd8ffc0000b080001000101011100ffda0008010100003f0000ffd9')
-"""The least that has a frame header, a scan header and a byte of scan: one gray pixel."""
+"""The smallest file with a frame header, a scan header and a byte of scan: one gray pixel."""
 SENSOR_OF = {
     COMPRESSED: 'camera',
     'sensor_msgs/msg/Image': 'camera',
@@ -115,7 +115,7 @@ def test_a_type_without_a_definition(ros: Any, format_name: str) -> None:
 
 
 def test_the_first_of_each_reason_is_told(ros: Any) -> None:
-    """Beside the count of a reason stands a sentence about the first sample, for people."""
+    """In addition to its count, each reason has a sentence about the first sample."""
     encoding = ros.encode('sensor_msgs/msg/Image', b'', b'', ros.cdr('sensor_msgs/msg/Image', encoding='bayer_rggb8'))
     assert encoding.rejected == {'malformed': 2, 'empty': 1}
     assert list(encoding.details) == ['malformed', 'empty']
@@ -124,7 +124,7 @@ def test_the_first_of_each_reason_is_told(ros: Any) -> None:
 
 @pytest.mark.parametrize('type_name', [IMU, 'go2_interfaces/msg/VoxelMapCompressed', 'nobody_msgs/msg/X'])
 def test_serialized_bytes(ros: Any, type_name: str) -> None:
-    """With format cdr the object is the message as it was taken, whatever its type; what is too short for CDR is rejected."""
+    """With format cdr, the object is the received message, whatever its type; messages too short for CDR are rejected."""
     cdr = b'\0\1\0\0' + bytes(range(40))
     made = ros.encode(type_name, cdr, sensor='voxel_map').object
     assert made.body == cdr

@@ -68,7 +68,7 @@ def bucket(ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize('example', EXAMPLES, ids=[example.splitlines()[0][:40] for example in EXAMPLES])
 def test_the_examples(bucket: Path, example: str) -> None:
-    """Each example runs as it stands there; those of libraries that are not installed here are left out."""
+    """Each example runs unchanged; those of libraries that are not installed here are skipped."""
     for name in re.findall(r'^(?:import|from) (\w+)', example, re.MULTILINE):
         pytest.importorskip(name)
     exec(f'{START}\nfrom PIL import Image\n{example}', {})  # noqa: S102

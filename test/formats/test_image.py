@@ -58,7 +58,7 @@ def test_big_endian_cdr(ros: Any) -> None:
 
 
 def test_a_missing_end_and_fill_bytes_are_passed(ros: Any) -> None:
-    """Cameras leave out the EOI marker, append bytes or fill before a marker: such frames are theirs, and are kept."""
+    """Some cameras omit the EOI marker, append bytes or insert fill bytes before a marker: such frames are kept."""
     whole = jpeg()
     for data in (whole[:-2], whole + bytes(7), whole[:2] + b'\xff\xff' + whole[2:], whole[: len(whole) - 100]):
         assert compressed(ros, data).object.body == data
@@ -132,7 +132,7 @@ def test_quality(ros: Any) -> None:
     ],
 )
 def test_raw_images_that_lie(ros: Any, lies: dict[str, Any], reason: str) -> None:
-    """Sizes that contradict each other and images without pixels are told apart, whatever is made."""
+    """Inconsistent sizes and images without pixels have different reasons, for every format."""
     for format_name in ('jpeg', 'png'):
         result = raw(ros, gradient().reshape(48, -1), sensor={'format': format_name}, **({'encoding': 'bgr8'} | lies))
         assert result.object is None
@@ -146,7 +146,7 @@ def test_too_large_for_a_jpeg(ros: Any) -> None:
 
 
 def test_a_jpeg_has_brightness_and_sharpness(ros: Any) -> None:
-    """Of its gray: an even picture is as bright as it is and has no edges; whoever opens the object finds the same."""
+    """Computed from its gray: an even image has its brightness and no edges; a reader of the object computes the same."""
     board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((16, 16))) * 255
     told = {}
     for name, gray in (('dark', np.full((96, 128), 20)), ('board', board)):

@@ -84,7 +84,7 @@ def test_a_png_whose_header_lies(ros: Any, changes: dict[int, int]) -> None:
 @pytest.mark.parametrize(('encoding', 'order'), [('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 3]),
                                                  ('bgra8', [2, 1, 0, 3]), ('mono8', [0])])  # fmt: skip
 def test_colors_without_loss(ros: Any, encoding: str, order: list[int], padding: int) -> None:
-    """With format png every 8-bit image reads back as it was, alpha included, whatever its order and its padding."""
+    """With format png, every 8-bit image reads back unchanged, alpha included, for any channel order and padding."""
     made = raw(ros, PIXELS[:, :, order], encoding, padding=padding, format='png')
     wanted = PIXELS[:, :, sorted(order)]
     np.testing.assert_array_equal(pixels_of(made), wanted[:, :, 0] if encoding == 'mono8' else wanted)
@@ -108,7 +108,7 @@ def test_sixteen_bits(ros: Any, format_name: str, encoding: str, bigendian: bool
 @pytest.mark.parametrize('bigendian', [False, True])
 @pytest.mark.parametrize('format_name', ['jpeg', 'png'])
 def test_floats(ros: Any, format_name: str, bigendian: bool, padding: int) -> None:
-    """float32 images are TIFFs, with both formats, and every bit is as it was, in NaN and infinities too."""
+    """float32 images are TIFFs with both formats, and every bit is preserved, also in NaN and infinities."""
     meters = np.random.default_rng(13).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
     meters[0, :4] = np.nan, np.inf, -np.inf, -0.0
     meters[1, 0] = np.frombuffer(b'\1\2\xc0\x7f', np.float32)[0]  # a NaN with something in it

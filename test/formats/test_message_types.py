@@ -119,7 +119,7 @@ def test_a_definition_that_is_no_text(tmp_path: Path) -> None:
 
 
 def test_a_nested_type_is_usable_by_itself(ros: Any) -> None:
-    """A type that came in as part of another can be asked for afterwards."""
+    """A type that was loaded as part of another can be requested afterwards."""
     types = MessageTypes()
     assert types.has_header('sensor_msgs/msg/PointCloud2')
     assert not types.has_header('sensor_msgs/msg/PointField')

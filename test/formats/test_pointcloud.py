@@ -113,7 +113,7 @@ def test_packed_color_keeps_its_bits(ros: Any) -> None:
 
 
 def test_what_the_header_cannot_hold_is_in_a_comment(ros: Any) -> None:
-    """Stamp, frame and density stand in a comment line, and a hostile frame_id cannot break out of it."""
+    """Stamp, frame and density are in a comment line, and a hostile frame_id cannot break out of it."""
     frame = 'odom\nPOINTS 9\r\n"é' + 'x' * 500
     cdr = cloud(ros, XYZI, xyzi().tobytes(), width=5, point_step=16, header={'frame_id': frame}, is_dense=False)
     body = ros.encode(CLOUD, cdr).object.body
@@ -292,7 +292,7 @@ def test_any_layout(ros: Any, data: st.DataObject) -> None:
 
 
 def test_a_cloud_has_its_number_of_points_and_their_bounds(ros: Any) -> None:
-    """Field by field, with how many are not finite; whoever opens the object finds the same."""
+    """Field by field, with the count of non-finite values; a reader of the object computes the same."""
     points = xyzi()
     made = ros.encode(CLOUD, cloud(ros, XYZI, points.tobytes(), width=5, point_step=16)).object
     told = unpack_statistics(made.statistics)

@@ -127,7 +127,7 @@ def test_odometry_in_batches(ros: Any) -> None:
 
 
 def test_a_record_of_another_type(ros: Any) -> None:
-    """A single message of any other type stands beside its origin, time and stamp; headers and times are objects."""
+    """A single message of any other type is next to its origin, time and stamp; headers and times are objects."""
     header = {'stamp': {'sec': 7, 'nanosec': 8}, 'frame_id': 'front'}
     info = document(ros.encode('sensor_msgs/msg/CameraInfo', ros.cdr('sensor_msgs/msg/CameraInfo', header=header, width=640)))
     assert list(info)[:6] == ['robot', 'sensor', 'topic', 'type', 'timestamp', 'stamp_ns']

@@ -1,4 +1,4 @@
-"""What a whole file holds, told by its summary: ours, and other people's with more or less of one."""
+"""The contents of a complete file, from its summary: ours, and other writers' with more or less of a summary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shadowhound_data_logger.formats.mcap.recovery import read_info
 
 
 def test_ours(tmp_path: Path) -> None:
-    """The same as what closing it told."""
+    """The same as closing it returned."""
     info, _ = closed(tmp_path / 'bag_0.mcap', 70, compression='zstd', sync_every=30)
     assert read_info(info.path, digest=True) == info
     assert read_info(info.path).sha256 == ''

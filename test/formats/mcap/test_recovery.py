@@ -25,7 +25,7 @@ HOSTILE = settings(max_examples=examples(60), deadline=None, suppress_health_che
 
 @pytest.fixture(autouse=True)
 def _without_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hundreds of files, none of which has to outlive the machine."""
+    """Hundreds of files that need not survive the machine."""
     for name in ('fsync', 'fdatasync'):
         monkeypatch.setattr(os, name, lambda _: None)
 
@@ -65,7 +65,7 @@ def test_a_killed_writer_loses_its_open_chunk(tmp_path: Path, opened: bytes) -> 
 
 
 def test_a_recovered_slice_is_a_closed_one(tmp_path: Path, opened: bytes) -> None:
-    """Byte for byte what the writer would have written, and SHA-256, times, counts and channels are told as it does."""
+    """Byte for byte what the writer would have written, with the same SHA-256, times, counts and channels."""
     info, _ = closed(tmp_path / 'bag_0.mcap', COUNT, sync_every=A_CHUNK)
     content = info.path.read_bytes()
     again = recovered(tmp_path, opened)
@@ -94,7 +94,7 @@ def test_cut_off_anywhere(tmp_path: Path, opened: bytes, data: st.DataObject) ->
 @HOSTILE
 @given(st.data())
 def test_a_byte_that_flipped(tmp_path: Path, opened: bytes, data: st.DataObject) -> None:
-    """Nothing is read that was not written: a chunk whose checksum does not hold is left out, and told."""
+    """Nothing is read that was not written: a chunk with a wrong checksum is skipped and reported."""
     at, flipped = data.draw(st.integers(0, len(opened) - 1)), data.draw(st.integers(1, 255))
     content = bytearray(opened)
     content[at] ^= flipped
@@ -150,7 +150,7 @@ def test_nothing_whole(tmp_path: Path, content: bytes) -> None:
 
 
 def test_a_slice_that_was_being_closed(tmp_path: Path, opened: bytes) -> None:
-    """A kill while the ending is written costs nothing: it is written anew."""
+    """A kill while the ending is written costs nothing: it is written again."""
     info, _ = closed(tmp_path / 'bag_0.mcap', COUNT, sync_every=A_CHUNK)
     content = info.path.read_bytes()
     for length in range(len(opened), len(content) + 1, 61):

@@ -48,7 +48,7 @@ def recovered(folder: Path, content: bytes) -> SliceInfo:
 
 
 def chunk(data: bytes, *, size: int, compression: str = '', crc: int = 0) -> bytes:
-    """A chunk record that claims what it is told to."""
+    """A chunk record with these claims."""
     fields = CHUNK.pack(1, 1, size, crc) + text(compression) + struct.pack('<Q', len(data))
     return record(Opcode.CHUNK, fields, data)
 
@@ -73,7 +73,7 @@ def test_records_of_any_kind(tmp_path: Path, records: list[tuple[int, int, bytes
 @HOSTILE
 @given(st.binary(max_size=200), NUMBERS, st.sampled_from(['', 'zstd', 'lz4', 'x']), st.booleans())
 def test_chunks_of_any_kind(tmp_path: Path, data: bytes, size: int, compression: str, packs: bool) -> None:
-    """A chunk with a checksum that holds, but whose content is not messages, is left out."""
+    """A chunk with a correct checksum whose content is not messages is skipped."""
     packed = zstd.compress(data) if packs else data
     content = chunk(packed, size=len(data) if size == 1 else size, compression=compression, crc=zlib.crc32(data))
     info = recovered(tmp_path, head() + declared() + content)

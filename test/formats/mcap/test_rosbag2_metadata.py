@@ -32,7 +32,7 @@ def read(content: bytes) -> dict[str, Any]:
 
 
 def test_a_bag_of_several_slices() -> None:
-    """Times span all slices, counts are sums, files stand in their order, topics once."""
+    """Times span all slices, counts are sums, files are in order, each topic appears once."""
     slices = [info(0, 100, 200, 2, TALK), info(1, 0, 0, 0, OTHER), info(2, 150, 390, 3, TALK, OTHER)]
     found = read(metadata_yaml(slices, ros_distro='humble', custom_data={'robot': 'thor', 'a b': 'c: "d"'}))
     assert found['version'] == 8
@@ -113,7 +113,7 @@ IN_WORDS = """- history: unknown
 
 
 def test_qos_in_words_becomes_numbers() -> None:
-    """Those of rmw/types.h, with all else as it was; numbers stay, and so does what is not a QoS at all."""
+    """The numbers are those of rmw/types.h; numbers, other fields and text that is not QoS are unchanged."""
     first, second = yaml.safe_load(qos_in_numbers(IN_WORDS))
     assert first == yaml.safe_load(IN_WORDS)[0] | {'history': 3, 'reliability': 1, 'durability': 1, 'liveliness': 3}
     assert second == {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 2, 'liveliness': 1}
@@ -132,7 +132,7 @@ def test_qos_in_words_becomes_numbers() -> None:
 
 @pytest.mark.ros
 def test_qos_of_rclpy() -> None:
-    """What rclpy says of a publisher's QoS can be told as it is."""
+    """The QoS that rclpy reports for a publisher can be used directly."""
     qos = pytest.importorskip('rclpy.qos')
     (found,) = yaml.safe_load(offered_qos([qos.qos_profile_sensor_data]))
     assert (found['history'], found['depth'], found['reliability'], found['durability']) == (1, 5, 2, 2)

@@ -105,7 +105,7 @@ def test_a_chunk_ends_by_itself(tmp_path: Path) -> None:
 
 
 def test_what_does_not_shrink_is_left_alone(tmp_path: Path) -> None:
-    """A chunk that zstd makes no smaller (pictures) is stored as it is; readers are not made to unpack it."""
+    """A chunk that zstd does not make smaller (images) is stored uncompressed, so readers need not unpack it."""
     noise = random.Random(1).randbytes(20_000)
     writer = SliceWriter(tmp_path / 'bag_0.mcap', compression='zstd')
     writer.write(BLOB, 1, 1, 0, noise)
@@ -147,7 +147,7 @@ STRING_WITH_COMMENT = '# the same\nstring data\n'
 
 
 def test_an_empty_slice(tmp_path: Path) -> None:
-    """A slice without messages is a whole file all the same."""
+    """A slice without messages is a complete file too."""
     info = SliceWriter(tmp_path / 'bag_0.mcap').close()
     assert indexed(info.path) == in_order(info.path) == []
     assert (info.messages, info.t_start_ns, info.t_end_ns, info.counts) == (0, 0, 0, {})
@@ -181,7 +181,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_unknown_compression_is_refused(tmp_path: Path) -> None:
-    """Nothing is created for a compression that is none."""
+    """Nothing is created if the compression is unknown."""
     with pytest.raises(ValueError, match='lz4'):
         SliceWriter(tmp_path / 'bag_0.mcap', compression='lz4')
     assert not list(tmp_path.iterdir())
