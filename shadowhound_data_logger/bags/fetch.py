@@ -120,7 +120,7 @@ def _ensure_file(
 
     with _exclusive(path) as resumed:
         progress.have(resumed)
-        info = download(store, ObjectInfo(BUCKET, file.key, file.size, None), path, tell=tell).info
+        info = download(store, ObjectInfo(BUCKET, file.key, file.size, None), path, on_progress=tell).info
     if promised and info.sha256 != promised and fingerprint(path)[1] != promised:
         path.unlink()
         raise BagDamaged(f'{file.key} in the store is not the recorded file: its SHA-256 is not {promised}',

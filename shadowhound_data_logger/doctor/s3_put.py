@@ -38,12 +38,13 @@ def single_requests(settings: StoreSettings) -> Iterator[S3Requests]:
     A store (``stores/base.py``) hides what a check wants to see: it creates a bucket that is missing, looks by itself where a
     condition is not honoured, sends no wrong checksum, and lists all of a prefix where the first page is enough.
     """
-    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415 - botocore costs half a second
+    from shadowhound_data_logger.stores.s3_client import S3Client  # noqa: PLC0415 - botocore costs half a second
+    from shadowhound_data_logger.stores.s3_requests import S3Requests  # noqa: PLC0415
 
     upload = UploadSettings(threads=1, connect_timeout_s=CONNECT_S, read_timeout_s=ANSWER_S)
-    with closing(S3Requests(settings, upload)) as requests:
-        requests.open()
-        yield requests
+    with closing(S3Client(settings, upload)) as client:
+        client.open()
+        yield S3Requests(client)
 
 
 def buckets(settings: Settings) -> tuple[str, ...]:

@@ -211,14 +211,14 @@ class _Fetch:
 
         try:
             wanted = ObjectInfo(wish.bucket, wish.key, wish.size, wish.sha256)
-            found = download(self._store, wanted, path, part=part, is_synced=False, tell=tell, pause=self._pause)
+            found = download(self._store, wanted, path, part=part, is_synced=False, on_progress=tell, pause=self._pause)
         except BaseException:
             self._tell(-moved, 0)
             part.unlink(missing_ok=True)
             raise
         self._tell(0, 1)
         file = Verified(wish.key, wish.bucket, wish.size, path.stat().st_mtime_ns, found.sha256, wish.etag)
-        return _Done(file, moved=True, proved=found.is_proved)
+        return _Done(file, moved=True, proved=found.is_verified)
 
     def _pause(self, seconds: float) -> None:
         """Wait between two tries. Raises LakeError if the run has ended."""

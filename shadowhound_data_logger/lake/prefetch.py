@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, path_below
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.download import damaged, twice
+from shadowhound_data_logger.stores.download import damaged, retry_damaged
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -146,7 +146,7 @@ class Prefetch:
             raise damaged(wanted.bucket, wanted.key, 'its SHA-256 differs')
 
         try:
-            return twice(once)
+            return retry_damaged(once)
         except ObjectRefused as error:
             if error.data.get('reason') != 'damaged':
                 raise

@@ -283,7 +283,7 @@ class PolicySync:
         fetched_before, max_restarted = -1, traffic.restarted_files + 1
         while True:
             try:
-                download(self.store, wanted, path, tell=traffic.count, pause=self.pause)
+                download(self.store, wanted, path, on_progress=traffic.count, pause=self.pause)
                 return
             except StoreUnavailable:
                 if traffic.fetched_bytes <= fetched_before or traffic.restarted_files > max_restarted:

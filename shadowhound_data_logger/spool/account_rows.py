@@ -65,7 +65,7 @@ class TopicRow:
     by_arrival: Mapping[str, int] = field(default_factory=dict)
     """Messages dated by their arrival, by the reason why their own time was not trusted."""
     corrected: Mapping[str, int] = field(default_factory=dict)
-    """Stored messages that had to be corrected, by fault."""
+    """Messages stored after a correction, by fault."""
     stamps: StampReport | None = None
     """What was last unusual about the stamps of its publishers."""
 

@@ -72,7 +72,7 @@ class ActRecord:
         self._now_ns = now_ns
 
     def add(self, who: str, do: str, *, ok: bool, said: str) -> None:
-        """Record that ``who`` requested ``do`` and got the answer ``said``."""
+        """Record a request ``do`` of ``who``, and its answer."""
         self._acts.append({'at_ns': self._now_ns(), 'who': who, 'do': do, 'ok': ok, 'said': said[:MAX_TEXT]})
         del self._acts[:-MAX_ACTS]
         try:

@@ -78,7 +78,7 @@ class ArrivalContext(NamedTuple):
     is_only: bool = True
     """Whether the topic has one publisher in the graph."""
     gid: str = ''
-    """The only publisher's, by which it is recognized after a restart; '' otherwise."""
+    """The only publisher's, which identifies it after a restart; '' otherwise."""
     is_shared: bool = False
     """Whether several publishers have been in the graph for longer than a crashed one stays in it."""
     has_new: bool = False

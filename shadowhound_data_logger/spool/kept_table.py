@@ -72,7 +72,7 @@ class KeptTable(Table):
         left = {**metadata, words.SHA256: body.sha256, word: str(samples), words.THINNED: str(step)}
         values = {'bytes': len(body), 'sha256': body.sha256, 'samples': samples, 'metadata': json.dumps(left)}
         self._states.set_thinned(row['id'], values)
-        # A separate state: a catalog part that is being written describes the object as it was, and removes the earlier state.
+        # A separate state: a catalog part that is being written describes the former content, and removes the former state.
         self._catalog.report(row['id'], f'{reason} {step}')
         removed_body = FileBody(body.path, row['bytes'] - len(body), row['sha256'])
         item = DataObject(

@@ -89,7 +89,7 @@ class UnreleasedObject(NamedTuple):
 
 
 class KeptSlice(NamedTuple):
-    """A slice of which a request wants a part."""
+    """A slice that a request needs only partly."""
 
     id: int
     key: str
@@ -217,7 +217,7 @@ class RequestedTable(Table):
         return self._db.execute(query, {'request': request, 'limit': PIECE}).rowcount == PIECE
 
     def to_cut(self, request: str) -> list[tuple[int, str, str, str, Mapping[str, str]]]:
-        """(id, bucket, key, SHA-256, metadata) of the kept slices of which a request wants a part, oldest first."""
+        """(id, bucket, key, SHA-256, metadata) of the kept slices that a request needs only partly, oldest first."""
         found = self._db.execute(
             'SELECT id, bucket, key, sha256, metadata FROM requested JOIN objects USING (id) WHERE request = ?'
             " AND outcome = 'kept' AND requested.bytes < objects.bytes ORDER BY id", (request,),

@@ -53,7 +53,7 @@ class Requests:
         return self._connections.reading.requested.unreleased(request, limit)
 
     def to_cut(self, request: str) -> list[KeptSlice]:
-        """Kept slices of which a request wants a part, oldest first."""
+        """Kept slices that the request needs only partly, oldest first."""
         return [KeptSlice(number, key, self._tree.path(State.KEPT, None, bucket, key), sha256, metadata)
                 for number, bucket, key, sha256, metadata in self._connections.reading.requested.to_cut(request)]  # fmt: skip
 

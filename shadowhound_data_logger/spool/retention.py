@@ -52,7 +52,7 @@ def make_room(index: Index, tree: Tree, settings: SpoolSettings, keep: KeepSetti
               leaving: int, now_ns: int) -> RoomMade:  # fmt: skip
     """Decide which of the objects to store, by priority, and evict objects that are not more important.
 
-    On a full disk, kept objects are evicted first; then the least important ones, and the oldest among these. Protected objects
+    On a full disk, kept objects are evicted first; then the others, by priority and age. Protected objects
     are always stored, and nothing is evicted unless that makes enough room. ``leaving`` bytes are about to be freed. The caller
     holds the spool's lock and is not in a transaction: each round of evictions is a separate one.
     """
@@ -147,7 +147,7 @@ def is_short(tree: Tree, settings: SpoolSettings, objects: Sequence[DataObject])
 
 
 def _evict(index: Index, tree: Tree, settings: SpoolSettings, needed: int, on_disk: int, now_ns: int) -> int:
-    """Evict the least important and oldest objects until ``needed`` bytes fit; returns how many objects."""
+    """Evict objects, by priority and age, until ``needed`` bytes fit; returns how many objects."""
     evicted = 0
     while (excess := _excess(index, tree, settings, needed, on_disk)) > 0 and (rows := index.objects.evictable(EVICTION_STEP)):
         count = 0

@@ -77,7 +77,7 @@ class SpoolWriter:
         self._units: deque[_Unit] = deque()
         self._outcomes: deque[Outcome] = deque()
         self._leaving: deque[Outcome] = deque()
-        """Durable outcomes whose files still have to be removed."""
+        """Durable outcomes whose files are not removed yet."""
         self._removing = threading.Lock()
         self._bytes = 0
         self._added = self._done = 0
@@ -214,8 +214,7 @@ class SpoolWriter:
     def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:
         """The groups to commit one by one: as few as possible if the disk has room.
 
-        Otherwise first the outcomes, because their commit frees files; then objects whose files exist, some of which may be
-        evicted; last those that must be written.
+        Otherwise first the outcomes, because their commit frees files; then objects whose files exist and may be evicted; last those that must be written.
         """
         objects = [item for unit in units for item in unit.objects]
         if not objects or self.spool.fits(objects):

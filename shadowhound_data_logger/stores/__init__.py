@@ -1,7 +1,6 @@
-"""Where objects are kept: S3, a folder, or memory; one Protocol (``base.py``), one table of errors (``s3_errors.py``).
+"""Stores for objects: S3, a folder, or memory; with one Protocol (``base.py``) and one table of errors (``s3_errors.py``).
 
-How fast bytes may leave is kept by ``bandwidth.py``, how long a retry waits by ``retry.py``, both beside the folders;
-``download.py`` makes a file of what is fetched.
+``bandwidth.py`` limits the upload rate, ``core/retry.py`` retries, ``download.py`` downloads objects to files.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ __all__ = ['open_reader', 'open_store']
 
 
 def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
-    """The store that the settings name, opened: S3 with an endpoint, else a folder. Close it once.
+    """Open the store of the settings: S3 if there is an endpoint, otherwise a folder. Close it once.
 
     Raises SettingError for an endpoint that no request can be sent to.
     """
     store: ObjectStore = DirectoryStore(settings.directory)
     if settings.endpoint_url:
         with _without_pyopenssl():
-            from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - botocore costs 60 MB and half a second
+            from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - botocore takes 60 MB and half a second
 
         store = S3Store(settings, upload)
     store.open()
@@ -36,9 +35,9 @@ def open_store(settings: StoreSettings, upload: UploadSettings) -> ObjectStore:
 
 
 def open_reader(settings: StoreSettings) -> ObjectStore:
-    """The same for a machine that reads much: by obstore, which the extra ``lake`` brings. Asks nobody yet.
+    """The same for machines that read many objects: through obstore, from the extra ``lake``. Sends no request yet.
 
-    A process that is forked afterwards must not use it.
+    A child process that is forked afterwards must not use it.
     """
     if not settings.endpoint_url:
         return open_store(settings, UploadSettings())
@@ -51,15 +50,15 @@ def open_reader(settings: StoreSettings) -> ObjectStore:
 
 @contextmanager
 def _without_pyopenssl() -> Iterator[None]:
-    """Hide pyOpenSSL, which botocore loads and never uses: 12 MB in each process where the extra ``webrtc`` is installed.
+    """Hide pyOpenSSL, which botocore loads but never uses: it takes 12 MB if the extra ``webrtc`` is installed.
 
-    Another thread that imports it meanwhile does not find it either.
+    Other threads cannot import it during that time.
     """
     modules: dict[str, Any] = sys.modules
     if 'OpenSSL' in modules:
         yield
         return
-    modules['OpenSSL'] = None  # to import it is an error meanwhile
+    modules['OpenSSL'] = None  # an import raises ImportError
     try:
         yield
     finally:

@@ -1,7 +1,7 @@
-"""How fast payload is sent: one token bucket for all puts of a store, so that the radio stays free for the robot.
+"""Limits the upload rate: one token bucket for all puts of a store, which keeps the radio free for the robot.
 
-Under a cap a body leaves in small pieces, each when its time has come: never at line rate with silence afterwards. The most
-important body goes first, but each fourth piece is of the one that waited longest: none starves, and no server gives up on one.
+Under a cap, a body is sent in small, evenly spaced pieces, never in bursts at line rate. The body with the highest priority is
+sent first, but every fourth piece is from the one that has waited longest, so that none starves until the server times out.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 PIECE_S: Final = 0.02
-"""Time on the radio that one piece takes at the cap: what a control message may have to wait for."""
+"""Time that one piece takes at the cap, which is the longest delay of a control message."""
 SMALLEST_PIECE: Final = 1 << 10
 LARGEST_PIECE: Final = 1 << 16
-"""Without a cap, too: a socket's timeout is over one piece, so the slowest link that works carries 64 KiB in that time."""
+"""Also without a cap: the socket's timeout applies to one piece, so the slowest usable link sends 64 KiB in that time."""
 LATE_S: Final = 0.05
-"""So much of the cap a thread that woke late may catch up with."""
-LONGEST_EVERY: Final = 4
+"""A thread that wakes up late may catch up this much."""
+OLDEST_EVERY: Final = 4
+"""Every so many pieces, the body that has waited longest is served."""
 BYTES_PER_MEGABIT: Final = 125_000
 
 
 class Body(Protocol):
-    """What is sent: a file, or a part of one."""
+    """The content to send: a file, or a part of one."""
 
     def seek(self, place: int, /) -> int: ...
 
@@ -33,7 +34,7 @@ class Body(Protocol):
 
 
 class PacedBody:
-    """A body that is read once, from its start to its end: each ``read`` waits until its piece may leave."""
+    """A body that is read once from start to end; each ``read`` waits until the piece may be sent."""
 
     def __init__(self, pieces: Iterator[bytes]) -> None:
         self._pieces = pieces
@@ -45,27 +46,27 @@ class PacedBody:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiter:
-    """One body that wants to send its next piece."""
+    """A body that waits to send its next piece."""
 
     rank: tuple[int, bool, int]
-    """Priority, whether it stands back, order of arrival: the smallest goes first."""
+    """(priority, ``is_background``, order of arrival); the smallest is sent first."""
     turn: threading.Condition
 
 
 class Pace:
-    """Limits how fast all puts of a store send, together.
+    """Limits the total rate of all puts of a store.
 
-    Thread-safe: ``_lock`` guards all of it, and each waiter's condition is one of this lock.
+    Thread-safe: ``_lock`` guards all of it; the waiters' conditions share it.
     """
 
     def __init__(self, max_mbps: float = 0.0, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._now = monotonic
         self._lock = threading.Lock()
-        self._waiting: list[_Waiter] = []  # who waits longest first
+        self._waiting: list[_Waiter] = []  # longest waiting first
         self._max_mbps = 0.0
         self._yielded_mbps = 0.0
         self._yields_until = 0.0
-        self._free_at = 0.0  # when the next piece may leave
+        self._free_at = 0.0  # when the next piece may be sent
         self._bodies = self._pieces = self._sent_bytes = self._abandoned = 0
         self.set(max_mbps)
 
@@ -73,7 +74,7 @@ class Pace:
         return f'Pace({self.max_mbps:g} Mbit/s)' if self.max_mbps else 'Pace(no cap)'
 
     def set(self, max_mbps: float) -> None:
-        """The cap in megabits a second of payload, 0 for none; at once, for bodies under way as well."""
+        """Set the cap on payload in Mbit/s, 0 for none; it applies immediately, also to bodies that are being sent."""
         if not 0.0 <= max_mbps < float('inf'):
             raise ValueError(f'{max_mbps} Mbit/s is not a cap')
         with self._lock:
@@ -82,7 +83,7 @@ class Pace:
             self._wake_all()
 
     def yield_to(self, max_mbps: float, seconds: float) -> None:
-        """For so long no more than this, whatever the cap is: it ends by itself, and a later call takes its place."""
+        """Temporarily lower the cap; it ends after ``seconds``, and a later call replaces it."""
         if not 0.0 < max_mbps < float('inf'):
             raise ValueError(f'{max_mbps} Mbit/s is not a cap')
         with self._lock:
@@ -92,45 +93,45 @@ class Pace:
 
     @property
     def max_mbps(self) -> float:
-        """The cap that is in force now; 0 for none."""
+        """The current cap in Mbit/s; 0 for none."""
         if self._now() >= self._yields_until:
             return self._max_mbps
         return min(self._max_mbps or self._yielded_mbps, self._yielded_mbps)
 
     @property
     def sent_bytes(self) -> int:
-        """Payload bytes that left since this was made: repeats among them, headers not."""
+        """Payload bytes sent so far, with retries, without headers."""
         return self._sent_bytes
 
     def bytes_in(self, seconds: float) -> float:
-        """What the cap lets leave in that time; infinite without one."""
+        """How many bytes the cap allows in that time; infinite without one."""
         return self.max_mbps * BYTES_PER_MEGABIT * seconds or float('inf')
 
     def count(self, size: int) -> None:
-        """So many bytes left by a way that knows no cap."""
+        """Count bytes that were sent without the cap."""
         with self._lock:
             self._sent_bytes += size
 
-    def body(self, body: bytes | Body, priority: int, *, stands_back: bool = False) -> PacedBody:
-        """The body as a file for an HTTP client: ``pieces`` of it, read once."""
-        return PacedBody(self.pieces(body, priority, stands_back=stands_back))
+    def body(self, body: bytes | Body, priority: int, *, is_background: bool = False) -> PacedBody:
+        """The body as a file for an HTTP client, to be read once; as ``pieces``."""
+        return PacedBody(self.pieces(body, priority, is_background=is_background))
 
-    def pieces(self, body: bytes | Body, priority: int, *, stands_back: bool = False) -> Iterator[bytes]:
-        """The whole body, each piece when it may leave. Raises ConnectionAbortedError after a later ``abandon``.
+    def pieces(self, body: bytes | Body, priority: int, *, is_background: bool = False) -> Iterator[bytes]:
+        """The pieces of a body, each when it may be sent. Raises ConnectionAbortedError after a later ``abandon``.
 
-        One that ``stands_back`` comes after all others of its priority, for it is one of very many.
+        A background body is sent after all others of its priority, because it is one of many parts.
         """
         with self._lock:
             self._bodies += 1
-            return self._leave(body, (priority, stands_back, self._bodies), self._abandoned)
+            return self._send(body, (priority, is_background, self._bodies), self._abandoned)
 
     def abandon(self) -> None:
-        """No piece leaves any more of the bodies that are under way."""
+        """Abort all bodies that are being sent."""
         with self._lock:
             self._abandoned += 1
             self._wake_all()
 
-    def _leave(self, body: bytes | Body, rank: tuple[int, bool, int], abandoned: int) -> Iterator[bytes]:
+    def _send(self, body: bytes | Body, rank: tuple[int, bool, int], abandoned: int) -> Iterator[bytes]:
         file = io.BytesIO(body) if isinstance(body, bytes) else body
         file.seek(0)
         while piece := file.read(self._piece_bytes()):
@@ -138,7 +139,7 @@ class Pace:
             yield piece
 
     def _take(self, size: int, rank: tuple[int, bool, int], abandoned: int) -> None:
-        """Wait until so many bytes of the body may leave."""
+        """Wait until so many bytes of the body may be sent."""
         with self._lock:
             waiter = _Waiter(rank, threading.Condition(self._lock))
             self._waiting.append(waiter)
@@ -149,7 +150,7 @@ class Pace:
                         self._grant(size)
                         return
                     waiter.turn.wait(pause_s)
-                raise ConnectionAbortedError('the upload was given up')
+                raise ConnectionAbortedError('the upload was aborted')
             finally:
                 self._waiting.remove(waiter)
                 if self._waiting:
@@ -158,13 +159,13 @@ class Pace:
     # -- under the lock --------------------------------------------------------------------------------------------
 
     def _pause(self, waiter: _Waiter) -> float | None:
-        """How long the waiter has to wait; None when it is another one's turn."""
+        """How long the waiter must wait; None if it is another one's turn."""
         if not self.max_mbps:
             return 0.0
         return self._free_at - self._now() if self._next() is waiter else None
 
     def _next(self) -> _Waiter:
-        if self._pieces % LONGEST_EVERY == LONGEST_EVERY - 1:
+        if self._pieces % OLDEST_EVERY == OLDEST_EVERY - 1:
             return self._waiting[0]
         return min(self._waiting, key=lambda waiter: waiter.rank)
 

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """An object that is being read: iterate over it once, for its bytes in pieces; leave it where not all of them are wanted."""
+    """An object that is being read: iterate once over its content. Exit the context to stop before its end."""
 
     info: ObjectInfo
-    """Of the whole object, wherever the pieces begin."""
+    """Of the whole object, wherever the pieces start."""
     pieces: Iterator[bytes]
-    """Of a few megabytes at most. Raise StoreError."""
+    """Up to a few megabytes each. Raises StoreError."""
     release: Callable[[], None] = lambda: None
-    """Lets go of the connection."""
+    """Releases the connection."""
 
     def __iter__(self) -> Iterator[bytes]:
         return self.pieces
@@ -38,29 +38,29 @@ class Content:
 
 
 class ObjectStore(Protocol):
-    """Puts, gets and lists objects in buckets. Thread-safe after ``open``; life: New; open once; use from any thread; close once.
+    """Puts, gets and lists objects in buckets. Lifecycle: new; open once; use from any thread; close once.
 
-    Each request is one try (``retry.steadily`` makes it more). Errors are those of ``shadowhound_data_logger.core.errors``:
-    StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied, ObjectRefused, ForeignObject. No other
-    exception leaves a store. Whatever reads raises ObjectRefused with ``data['reason'] == 'missing'`` where there is no such
-    object, and ``'name'`` for a key that can be no path.
+    Each request is tried once (``retry.steadily`` retries). The only exceptions are those of
+    ``shadowhound_data_logger.core.errors``: StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied,
+    ObjectRefused, ForeignObject. Methods that read raise ObjectRefused with ``data['reason'] == 'missing'`` if the object does
+    not exist, and ``'name'`` for a key that is not a path.
     """
 
     @property
     def pace(self) -> Pace:
-        """What its puts send: counted, and over a network kept to the cap."""
+        """Counts the bytes of puts, and limits their rate over a network."""
 
     def open(self) -> None:
-        """Acquire clients and sockets. Does not talk to the network: a store that is away is not an error yet."""
+        """Acquire clients and sockets. Sends no request, so an unreachable store is not an error yet."""
 
     def close(self) -> None:
         """Release everything; idempotent."""
 
     def describe(self) -> str:
-        """Where data goes, for a log line: URL or folder, never a secret."""
+        """The store's URL or folder for a log line, without secrets."""
 
     def put(self, item: SpooledObject) -> Put:
-        """Store the file at ``item.path`` under its key, never overwriting, and return once the store confirmed it.
+        """Store the file at ``item.path`` under its key without overwriting, and return once the store has confirmed it.
 
         The content is verified by the server (checksum) or by reading back. A missing bucket is created where the
         credentials allow it. A key that already holds ``item.sha256`` is ``Put.IDENTICAL``; other content raises
@@ -68,67 +68,67 @@ class ObjectStore(Protocol):
         """
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
-        """The object's size and metadata, None when there is none."""
+        """The object's size and metadata; None if it does not exist."""
 
-    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
-        """The whole content. Raises ObjectRefused (reason ``size``) where it has more than ``most`` bytes, which are not read."""
+    def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
+        """The whole content. Raises ObjectRefused (reason ``size``), without reading it, if it has more than ``max_bytes``."""
 
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
-        """These parts of the content, each from begin to before its end; shorter, or empty, where it ends before."""
+        """Parts of the content, each given as (start, exclusive end); shorter or empty beyond the end of the object."""
 
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         """The content from ``start`` on.
 
-        ``version`` is the ETag of an earlier answer: raises ObjectRefused (reason ``changed``) where it has another one now.
+        ``version`` is the ETag of an earlier answer: raises ObjectRefused (reason ``changed``) if the object has another one.
         """
 
-    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
-        """The whole content and its version (an ETag); None where it has this version still. As ``get`` otherwise."""
+    def changed(self, bucket: str, key: str, version: str, max_bytes: int) -> tuple[bytes, str] | None:
+        """The whole content and its version (an ETag); None if that is still ``version``. Otherwise as ``get``."""
 
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
-        """Put other content in the place of this version; False where another one is there meanwhile. The key must exist.
+        """Replace the content of an existing object; False if it no longer has this version.
 
-        The one thing that is ever overwritten: a mailbox. Raises ObjectRefused (``missing``) where there is no such object.
+        Only mailboxes are ever overwritten. Raises ObjectRefused (``missing``) if the object does not exist.
         """
 
     def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
-        """The objects whose keys start with the prefix, in key order, without ``sha256`` and metadata; none without the bucket.
+        """The objects whose keys start with the prefix, by key, without ``sha256`` and metadata; none if the bucket is missing.
 
         An object whose key is not a path is skipped: ``skipped`` is called with its bucket and key.
         """
 
     def folders(self, bucket: str, prefix: str = '') -> Sequence[str]:
-        """The names of the folders directly below a prefix that ends with ``/`` or is empty, sorted; of paths alone."""
+        """The names of the folders directly below a prefix that ends with ``/`` or is empty, sorted; only valid path names."""
 
     def delete(self, bucket: str, key: str) -> None:
-        """For good; one that is gone already is not an error. No stage of the robot deletes."""
+        """Delete an object permanently; a missing one is not an error. The robot never deletes objects."""
 
     def probe(self) -> None:
-        """One cheap authenticated request; raises what a put would raise for the store as a whole."""
+        """Send a cheap authenticated request; raises what a put would raise for a fault of the store itself."""
 
 
-def joined(content: Content, most: int | None) -> bytes:
-    """All of it. Raises ObjectRefused (reason ``size``), before it is read, where there are more than ``most`` bytes.
+def joined(content: Content, max_bytes: int | None) -> bytes:
+    """The whole content. Raises ObjectRefused (reason ``size``), without reading it, if it has more than ``max_bytes``.
 
-    A server that sends more than it said is refused as well: what it sends takes no more memory than that.
+    Also refuses a server that sends more than the announced size, to bound the memory.
     """
     with content:
         info, pieces, size = content.info, list[bytes](), 0
-        if most is not None and info.size > most:
-            raise too_large(info.bucket, info.key, most)
+        if max_bytes is not None and info.size > max_bytes:
+            raise too_large(info.bucket, info.key, max_bytes)
         for piece in content:
             size += len(piece)
             if size > info.size:
                 raise too_large(info.bucket, info.key, info.size)
             pieces.append(piece)
-        return bytes(pieces[0]) if len(pieces) == 1 else b''.join(pieces)  # obstore's are no bytes to json
+        return bytes(pieces[0]) if len(pieces) == 1 else b''.join(pieces)  # json does not accept obstore's type
 
 
-def changed_meanwhile(bucket: str, key: str) -> ObjectRefused:
-    """The error for an object that is no longer the one that was asked for."""
-    return ObjectRefused(f'{bucket}/{key} has changed meanwhile', reason='changed', bucket=bucket, key=key)
+def has_changed(bucket: str, key: str) -> ObjectRefused:
+    """The error for an object that no longer has the requested version."""
+    return ObjectRefused(f'{bucket}/{key} has changed', reason='changed', bucket=bucket, key=key)
 
 
-def too_large(bucket: str, key: str, most: int) -> ObjectRefused:
-    """The error for an object that is larger than whoever asks for it can take."""
-    return ObjectRefused(f'{bucket}/{key} has more than {most:,} bytes', reason='size', bucket=bucket, key=key)
+def too_large(bucket: str, key: str, max_bytes: int) -> ObjectRefused:
+    """The error for an object that is larger than the caller accepts."""
+    return ObjectRefused(f'{bucket}/{key} has more than {max_bytes:,} bytes', reason='size', bucket=bucket, key=key)

@@ -1,6 +1,6 @@
-"""What stores need for a put: a spooled file's content, whole or in parts, verified; and whether a taken key has the same.
+"""What stores need for a put: the verified content of a spooled file, whole or in parts, and the verdict on a taken key.
 
-Nothing of a large file is held in memory: each of its parts is read twice, to know it and to send it.
+A large file is never held in memory: each of its parts is read twice, to hash it and to send it.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from shadowhound_data_logger.core.keys import check_key, check_name
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.core.untrusted import is_path, visible
 
-_PASSING: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
-"""Troubles of this process or machine that say nothing of the file; EIO does: its disk is rotten."""
+_TRANSIENT: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE, errno.EINTR, errno.EAGAIN})
+"""Errors of this process or machine; others, such as EIO from a failing disk, concern the file."""
 CHUNK_BYTES: Final = 1 << 20
-"""Most objects are smaller: they are read, hashed and sent as one piece."""
+"""Most objects are smaller, and are read, hashed and sent in one piece."""
 PART_BYTES: Final = 8 << 20
-"""What a broken connection costs at most: eight seconds of a link of 1 MB/s. S3 allows no smaller one than 5 MiB."""
+"""Sent again after a broken connection, which takes 8 s at 1 MB/s. S3 requires at least 5 MiB."""
 MAX_PARTS: Final = 10_000
 """S3's own limit."""
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 def check_target(bucket: str, key: str) -> None:
-    """Raises ObjectRefused (``data['reason'] == 'name'``) for a bucket or key that no store may be asked for."""
+    """Raises ObjectRefused (``data['reason'] == 'name'``) for a bucket or key that is invalid for a put."""
     try:
         check_name(bucket, 'the bucket')
         check_key(key)
@@ -43,7 +43,7 @@ def check_target(bucket: str, key: str) -> None:
 
 
 def check_read(bucket: str, key: str) -> None:
-    """The same for reading: what other programs wrote may be read by any key that is a path."""
+    """The same for reading: objects of other programs may have any key that is a path."""
     try:
         check_name(bucket, 'the bucket')
     except NameRefused as error:
@@ -54,15 +54,15 @@ def check_read(bucket: str, key: str) -> None:
 
 @lru_cache(maxsize=1024)
 def warn_of(bucket: str, key: str) -> None:
-    """Once per process and object."""
+    """Log that an object is skipped, once per process."""
     log.warning('%s/%s is skipped: its key is not a path', bucket, visible(key))
 
 
 def paths(entries: Iterable[ObjectInfo], skipped: Callable[[str, str], None]) -> Iterator[ObjectInfo]:
-    """The objects whose keys are paths; ``skipped`` is called with bucket and key of each of the others.
+    """The objects whose keys are paths; ``skipped`` is called with the bucket and key of each other one.
 
-    Such keys (``a//b``, ``a/``, with a control character) are made by other programs: no file can have such a name, and some
-    clients ask for another object than the one that was listed.
+    Other programs create keys such as ``a//b``, ``a/`` or with a control character: no file can have such a name, and some
+    clients request a different object than the listed one.
     """
     for entry in entries:
         if is_path(entry.key):
@@ -72,9 +72,9 @@ def paths(entries: Iterable[ObjectInfo], skipped: Callable[[str, str], None]) ->
 
 
 def chunks(item: SpooledObject) -> Iterator[bytes]:
-    """The file's content in pieces; raises ObjectRefused (``data['reason'] == 'damaged'``) where it is not ``item``'s.
+    """The file's content in pieces. Raises ObjectRefused (``data['reason'] == 'damaged'``) if it is not ``item``'s.
 
-    The verdict comes after the last piece: nothing of it is final before the iterator ended.
+    That is known only after the last piece: do not use the content before the iterator has ended.
     """
     digest, size = hashlib.sha256(), 0
     with opened(item) as file:
@@ -91,7 +91,7 @@ def chunks(item: SpooledObject) -> Iterator[bytes]:
 
 
 def check_content(item: SpooledObject, size: int, sha256: str) -> None:
-    """Raises ObjectRefused where what was read is not the item's content."""
+    """Raises ObjectRefused if size or SHA-256 are not the item's."""
     if size != item.size:
         raise _damaged(item, f'its size is not {item.size} bytes')
     if sha256 != item.sha256:
@@ -100,9 +100,9 @@ def check_content(item: SpooledObject, size: int, sha256: str) -> None:
 
 @contextmanager
 def opened(item: SpooledObject) -> Iterator[int]:
-    """A descriptor, not a file object: that asks the system twice as often, and each time other threads may go first.
+    """A descriptor: a file object makes twice as many system calls, and each one lets other threads run first.
 
-    An OSError within is the file's: it is ObjectRefused (``damaged``), or StoreUnavailable where it may pass.
+    An OSError inside becomes ObjectRefused (``damaged``), or StoreUnavailable if it is transient.
     """
     try:
         descriptor = os.open(item.path, os.O_RDONLY | os.O_CLOEXEC)
@@ -111,22 +111,22 @@ def opened(item: SpooledObject) -> Iterator[int]:
         finally:
             os.close(descriptor)
     except FileNotFoundError as error:
-        raise _damaged(item, 'it is gone') from error
+        raise _damaged(item, 'it is missing') from error
     except OSError as error:
-        if error.errno in _PASSING:
+        if error.errno in _TRANSIENT:
             raise StoreUnavailable(f'the spooled file {item.path} cannot be read now: {error.strerror}') from error
         raise _damaged(item, f'it cannot be read: {error.strerror}') from error
 
 
 def object_metadata(item: SpooledObject) -> dict[str, str]:
-    """What a store keeps beside the content: the object's own metadata, ``sha256`` always among it."""
+    """The metadata that a store keeps with the content; always with ``sha256``."""
     return {**item.metadata, words.SHA256: item.sha256}
 
 
 def identical_or_foreign(item: SpooledObject, held: ObjectInfo, content_sha256: Callable[[], str]) -> Put:
-    """Judge a key that is taken: ``Put.IDENTICAL``, or ForeignObject.
+    """``Put.IDENTICAL`` if a taken key has our content; otherwise raises ForeignObject.
 
-    ``content_sha256`` is asked only when the sizes agree and no metadata tells (another program wrote it).
+    ``content_sha256`` is called only if the sizes are equal and the metadata have no checksum (another program wrote it).
     """
     found = held.sha256
     if held.size == item.size:
@@ -134,25 +134,25 @@ def identical_or_foreign(item: SpooledObject, held: ObjectInfo, content_sha256: 
         if found == item.sha256:
             return Put.IDENTICAL
     raise ForeignObject(
-        f'{item.bucket}/{item.key} holds other content already ({held.size} bytes, ours has {item.size})',
-        remedy='it is never overwritten; does a second writer use the same robot name?',
+        f'{item.bucket}/{item.key} already has other content ({held.size} bytes, ours has {item.size})',
+        remedy='it is not overwritten; does another robot use the same name?',
         bucket=item.bucket, key=item.key, held_size=held.size, held_sha256=found, size=item.size, sha256=item.sha256,
     )  # fmt: skip
 
 
 def _damaged(item: SpooledObject, detail: str) -> ObjectRefused:
     return ObjectRefused(
-        f'the spooled file of {item.bucket}/{item.key} is not what was spooled: {detail}',
-        remedy=f'look at {item.path}', reason='damaged', bucket=item.bucket, key=item.key, path=str(item.path),
+        f'the spooled file of {item.bucket}/{item.key} is damaged: {detail}',
+        remedy=f'check {item.path}', reason='damaged', bucket=item.bucket, key=item.key, path=str(item.path),
     )  # fmt: skip
 
 
 @dataclass(slots=True)
 class Part:
-    """Bytes ``start`` ... ``start + size`` of an open file, as a body to send."""
+    """Bytes ``start`` to ``start + size`` of an open file, as a body to send."""
 
     file: int
-    """The descriptor; only read at places of its own, so several may share it."""
+    """The descriptor, which several parts may share, because they use pread."""
     start: int
     size: int
     md5: bytes
@@ -169,23 +169,23 @@ class Part:
 
 
 def parts(file: int, size: int, whole: Any) -> Iterator[Part]:
-    """The parts of a file of that size, in order; ``whole`` is told all of its bytes. Raises OSError.
+    """The parts of a file of that size, in order; updates the hash ``whole`` with all bytes. Raises OSError.
 
-    A file that is shorter ends them early.
+    Ends early if the file is shorter.
     """
     step = part_bytes(size)
     for start in range(0, size, step):
-        part = _known(file, start, min(step, size - start), whole)
+        part = _hashed(file, start, min(step, size - start), whole)
         if part.size:
             yield part
 
 
 def part_bytes(size: int) -> int:
-    """Of each part but the last, for a file of that size."""
+    """The size of each part but the last, for a file of that size."""
     return max(PART_BYTES, -(-size // MAX_PARTS))
 
 
-def _known(file: int, start: int, size: int, whole: Any) -> Part:
+def _hashed(file: int, start: int, size: int, whole: Any) -> Part:
     md5, place = hashlib.md5(usedforsecurity=False), 0
     while place < size and (chunk := os.pread(file, min(CHUNK_BYTES, size - place), start + place)):
         md5.update(chunk)

@@ -1,9 +1,9 @@
-"""The keys with which an S3 client signs, and the certificates that it trusts.
+"""The keys and the trusted certificates of an S3 client.
 
-Keys in the settings (``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY``) come first and stay: the environment of a process cannot
-change. Otherwise they are those of a profile, which botocore finds and parses as for every program of AWS
-(https://docs.aws.amazon.com/sdkref/latest/guide/file-location.html), and which are read again once a server refuses them. For a
-server of one's own nobody in a network is asked for keys. No message and no repr holds a secret.
+Keys in the settings (``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY``) take precedence and never change. Otherwise the keys are
+those of a profile, which botocore finds and parses as for every AWS program
+(https://docs.aws.amazon.com/sdkref/latest/guide/file-location.html); they are read again once a server refuses them. Network
+services provide keys only if the server is Amazon's. No message or repr contains a secret.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from shadowhound_data_logger.core.config import StoreSettings
 from shadowhound_data_logger.core.errors import SettingError
 
 REREAD_S: Final = 1.0
-"""Refused keys are not read again sooner: a file is read, a program (``credential_process``) run."""
-NETWORKED: Final = ('assume-role', 'assume-role-with-web-identity', 'sso', 'login', 'container-role', 'iam-role')
-"""Those of botocore's providers that ask Amazon's services."""
+"""Refused keys are not read again sooner, because that reads files or runs a program (``credential_process``)."""
+NETWORK_PROVIDERS: Final = ('assume-role', 'assume-role-with-web-identity', 'sso', 'login', 'container-role', 'iam-role')
+"""botocore's providers that ask Amazon's services."""
 BUNDLES: Final = ('AWS_CA_BUNDLE', 'REQUESTS_CA_BUNDLE')
-"""The first that is set, as in botocore's own client."""
+"""The first one that is set counts, as in botocore's client."""
 
 _log = logging.getLogger(__name__)
 
 
 class Keys(Credentials):
-    """Finds the keys that one store signs with, and reads them again when they are refused.
+    """Finds the keys of one store, and reads them again when they are refused.
 
-    Thread-safe; ``_lock`` guards what was found, and is held while a file is read.
+    Thread-safe: ``_lock`` guards the found keys, and is held while files are read.
     """
 
     def __init__(self, settings: StoreSettings, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """Raises SettingError for one half of a pair. Nothing is read yet."""
+        """Raises SettingError for half a pair. Reads nothing yet."""
         if bool(settings.access_key_id) != bool(settings.secret_access_key):
             name = 'AWS_SECRET_ACCESS_KEY' if settings.access_key_id else 'AWS_ACCESS_KEY_ID'
             raise SettingError(name, '', 'both of AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or neither')
-        super().__init__('', '')  # botocore asks for the frozen ones
+        super().__init__('', '')  # botocore uses the frozen ones
         self.are_given = bool(settings.access_key_id)
-        """By the settings, and so for good."""
+        """Whether the keys are in the settings, and so never change."""
         self._settings = settings
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -57,11 +57,11 @@ class Keys(Credentials):
 
     @property
     def generation(self) -> int:
-        """Counts the changes."""
+        """How often the keys have changed."""
         return self._generation
 
     def get_frozen_credentials(self) -> ReadOnlyCredentials:
-        """Raises BotoCoreError where there are none, or none that can be read."""
+        """The current keys. Raises BotoCoreError if there are none or they cannot be read."""
         with self._lock:
             if self._found is None:
                 self._found = self._read()
@@ -70,7 +70,7 @@ class Keys(Credentials):
             return self._found.get_frozen_credentials()
 
     def renew(self, generation: int) -> bool:
-        """A server refused what was signed with this generation: whether there is another one by now."""
+        """Read the keys again after a server refused this generation; whether they have changed."""
         if self.are_given:
             return False
         with self._lock:
@@ -84,22 +84,22 @@ class Keys(Credentials):
             found = self._read()
             if found is None or (before and found.get_frozen_credentials() == before.get_frozen_credentials()):
                 return
-        except BotoCoreError as error:  # a file that is being written; what was there before stays
-            _log.debug('no keys can be read: %s', type(error).__name__)
+        except BotoCoreError as error:  # such as a file that is being written: keep the current keys
+            _log.debug('cannot read the keys: %s', type(error).__name__)
             return
         self._found = found
         self._generation += 1
         if before:
-            _log.info('the keys were refused, and the file has other keys now: using those')
+            _log.info('the keys were refused; using the new keys in the file')
 
     def _read(self) -> Credentials | None:
         given = self._settings
         if given.access_key_id and given.secret_access_key:
             return Credentials(given.access_key_id, given.secret_access_key, given.session_token)
         self._read_s = self._monotonic()
-        providers: Any = Session().get_component('credential_provider')  # a new session: one reads its files once
+        providers: Any = Session().get_component('credential_provider')  # a new session, because each one reads its files once
         if not _is_amazon(given.endpoint_url or ''):
-            for name in NETWORKED:
+            for name in NETWORK_PROVIDERS:
                 providers.remove(name)
         try:
             found: Credentials | None = providers.load_credentials()
@@ -109,7 +109,7 @@ class Keys(Credentials):
 
 
 def has_keys(settings: StoreSettings) -> bool:
-    """Whether there are keys for this store, here or given. Raises SettingError for half a pair, or a profile that is missing."""
+    """Whether there are keys for this store. Raises SettingError for half a pair or a missing profile."""
     keys = Keys(settings)
     try:
         keys.get_frozen_credentials()
@@ -121,7 +121,7 @@ def has_keys(settings: StoreSettings) -> bool:
 
 
 def no_profile(error: ProfileNotFound) -> SettingError:
-    """The same for every client."""
+    """The error for a missing profile."""
     allowed = (
         'a profile in ~/.aws/credentials or ~/.aws/config, or in the files of AWS_SHARED_CREDENTIALS_FILE and AWS_CONFIG_FILE'
     )
@@ -129,7 +129,7 @@ def no_profile(error: ProfileNotFound) -> SettingError:
 
 
 def with_keys(settings: StoreSettings) -> StoreSettings:
-    """The settings, with the keys of a profile if they have none. Raises SettingError for a profile that is missing."""
+    """The settings, with the keys of the profile if they have none. Raises SettingError for a missing profile."""
     if settings.access_key_id or not has_keys(settings):
         return settings
     found = Keys(settings).get_frozen_credentials()
@@ -137,7 +137,7 @@ def with_keys(settings: StoreSettings) -> StoreSettings:
 
 
 class _Provider:
-    """Gives botocore the keys that are known already, in place of its own providers."""
+    """Replaces botocore's providers by known keys."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
@@ -147,7 +147,7 @@ class _Provider:
 
 
 def session_with(keys: Keys) -> Session:
-    """A session of botocore that signs with these keys; keys in hand need no profile."""
+    """A botocore session that signs with these keys; ignores AWS_PROFILE if they are in the settings."""
     variables: dict[str, Any] = {'ca_bundle': ('ca_bundle', [*BUNDLES], None, None)}
     if keys.are_given:
         variables['profile'] = (None, None, None, None)
@@ -157,9 +157,9 @@ def session_with(keys: Keys) -> Session:
 
 
 def trusted(session: Session, endpoint: str) -> str | bool:
-    """The file of authorities to trust (``BUNDLES``, else the profile's ``ca_bundle``); True for those of the system.
+    """The file of trusted certificates (``BUNDLES``, otherwise the profile's ``ca_bundle``); True for those of the system.
 
-    Raises SettingError for a file that holds no certificate or cannot be read: nothing could be sent with it.
+    Raises SettingError for a file that contains no certificate or cannot be read.
     """
     path = session.get_config_variable('ca_bundle')
     if path and urlsplit(endpoint).scheme == 'https':

@@ -1,7 +1,7 @@
-"""A folder laid out as a bucket store: ``<folder>/<bucket>/<key>``, every object whole, durable and never overwritten.
+"""A folder as a store: ``<folder>/<bucket>/<key>``, with every object complete, durable and never overwritten.
 
-What S3 keeps as metadata lies beside the buckets in ``<folder>/.metadata/<bucket>/<key>.json``: unlike extended attributes it
-survives ``cp``, ``tar`` and any file system, and unlike a file beside the object it is no object to ``aws s3 sync`` or a glob.
+Metadata are in ``<folder>/.metadata/<bucket>/<key>.json``: unlike extended attributes, these files survive ``cp``, ``tar`` and
+any file system; unlike files next to the objects, ``aws s3 sync`` and globs do not take them for objects.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, Sto
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.core.untrusted import from_json, is_path
 from shadowhound_data_logger.stores.bandwidth import Pace
-from shadowhound_data_logger.stores.base import Content, changed_meanwhile, too_large
+from shadowhound_data_logger.stores.base import Content, has_changed, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
     check_read,
@@ -37,7 +37,7 @@ from shadowhound_data_logger.stores.content import (
 
 METADATA: Final = '.metadata'
 PARTS: Final = '.part'
-"""Unfinished files, on the same file system as the buckets; both names are impossible for a bucket."""
+"""The folder of unfinished files, on the file system of the buckets. Neither name is valid for a bucket."""
 
 _REFUSED: Final = {errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.EFBIG}
 _DENIED: Final = {errno.EACCES, errno.EPERM}
@@ -46,18 +46,18 @@ _FULL: Final = {errno.ENOSPC, errno.EDQUOT}
 
 
 class DirectoryStore:
-    """Stores objects as files. Several processes may use one folder: ``link(2)`` decides who was first."""
+    """Stores objects as files. Several processes may use one folder: ``link(2)`` creates a name only once."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self.pace = Pace()
-        """It only counts: a disk is not a radio."""
+        """Only counts bytes: a disk needs no cap."""
 
     def __repr__(self) -> str:
         return f'DirectoryStore({str(self._directory)!r})'
 
     def open(self) -> None:
-        """Nothing to acquire: the folder is made by the first put."""
+        """Nothing to acquire: the first put creates the folder."""
 
     def close(self) -> None:
         """Nothing to release."""
@@ -68,31 +68,31 @@ class DirectoryStore:
     def put(self, item: SpooledObject) -> Put:
         check_target(item.bucket, item.key)
         target = self._path(item.bucket, item.key)
-        with self._touching(item.bucket, item.key):
+        with self._translating(item.bucket, item.key):
             if not target.exists():
                 with self._part() as part:
                     _write(part, chunks(item))
                     self.pace.count(item.size)
-                    if _appear(part, target):
+                    if _publish(part, target):
                         self._write_metadata(item)
                         return Put.CREATED
             if target.is_dir():
                 raise OSError(errno.EISDIR, 'a folder has this name')
             held = self._info(item.bucket, item.key)
-            end = identical_or_foreign(item, held, lambda: fingerprint(target)[1])
-            if held.sha256 is None:  # power was cut between the content and its metadata
+            outcome = identical_or_foreign(item, held, lambda: fingerprint(target)[1])
+            if held.sha256 is None:  # a power cut between writing the content and its metadata
                 self._write_metadata(item)
-            return end
+            return outcome
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         with self._reading(bucket, key):
             return self._info(bucket, key) if self._path(bucket, key).is_file() else None
 
-    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
+    def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
         with self._reading(bucket, key), self._path(bucket, key).open('rb') as file:
-            body = file.read() if most is None else file.read(most + 1)
-        if most is not None and len(body) > most:
-            raise too_large(bucket, key, most)
+            body = file.read() if max_bytes is None else file.read(max_bytes + 1)
+        if max_bytes is not None and len(body) > max_bytes:
+            raise too_large(bucket, key, max_bytes)
         return body
 
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
@@ -103,11 +103,11 @@ class DirectoryStore:
         with self._reading(bucket, key):
             info = self._info(bucket, key)
             if version not in {'', info.etag}:
-                raise changed_meanwhile(bucket, key)
+                raise has_changed(bucket, key)
             return Content(info, self._pieces(bucket, key, start))
 
-    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
-        body = self.get(bucket, key, most)
+    def changed(self, bucket: str, key: str, version: str, max_bytes: int) -> tuple[bytes, str] | None:
+        body = self.get(bucket, key, max_bytes)
         found = hashlib.sha256(body).hexdigest()
         return None if found == version else (body, found)
 
@@ -117,7 +117,7 @@ class DirectoryStore:
                 return False
             with self._part() as part:
                 _write(part, iter((body,)))
-                self._beside(bucket, key).unlink(missing_ok=True)
+                self._metadata_path(bucket, key).unlink(missing_ok=True)
                 part.replace(self._path(bucket, key))
             sync(self._path(bucket, key).parent)
         return True
@@ -142,20 +142,20 @@ class DirectoryStore:
 
     def delete(self, bucket: str, key: str) -> None:
         with self._reading(bucket, key):
-            self._beside(bucket, key).unlink(missing_ok=True)
+            self._metadata_path(bucket, key).unlink(missing_ok=True)
             self._path(bucket, key).unlink(missing_ok=True)
 
     def probe(self) -> None:
-        """Writes and removes a file: a full disk, a missing mount or a read-only one shows here as it does in a put."""
-        with self._touching(), self._part() as part:
+        """Write and remove a file: raises as a put for a full disk, a missing mount or a read-only one."""
+        with self._translating(), self._part() as part:
             _write(part, iter((b'probe',)))
 
     def _path(self, bucket: str, key: str) -> Path:
         return self._directory / bucket / key
 
     @contextmanager
-    def _touching(self, bucket: str = '', key: str = '') -> Iterator[None]:
-        """Nothing but a StoreError leaves."""
+    def _translating(self, bucket: str = '', key: str = '') -> Iterator[None]:
+        """Raise StoreError instead of OSError."""
         try:
             yield
         except OSError as error:
@@ -164,7 +164,7 @@ class DirectoryStore:
     @contextmanager
     def _reading(self, bucket: str, key: str) -> Iterator[None]:
         check_read(bucket, key)
-        with self._touching(bucket, key):
+        with self._translating(bucket, key):
             try:
                 yield
             except FileNotFoundError as error:
@@ -179,7 +179,7 @@ class DirectoryStore:
 
     @contextmanager
     def _part(self) -> Iterator[Path]:
-        """A name for an unfinished file, which is gone afterwards."""
+        """The path of an unfinished file, which is removed afterwards."""
         part = self._directory / PARTS / uuid.uuid4().hex
         part.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -189,29 +189,29 @@ class DirectoryStore:
 
     def _write_metadata(self, item: SpooledObject) -> None:
         record = {'content_type': item.content_type, 'metadata': object_metadata(item)}
-        beside = self._beside(item.bucket, item.key)
-        _make_folders(beside.parent)
+        path = self._metadata_path(item.bucket, item.key)
+        _make_folders(path.parent)
         with self._part() as part:
             _write(part, iter((json.dumps(record).encode(),)))
-            part.replace(beside)
-        sync(beside.parent)
+            part.replace(path)
+        sync(path.parent)
 
     def _info(self, bucket: str, key: str) -> ObjectInfo:
         seen = self._path(bucket, key).stat()
         size, etag = seen.st_size, str(seen.st_mtime_ns)
         try:
-            record = from_json(self._beside(bucket, key).read_bytes())
+            record = from_json(self._metadata_path(bucket, key).read_bytes())
             metadata, content_type = dict(record['metadata']), str(record['content_type'])
-        except (FileNotFoundError, ValueError, TypeError, LookupError):  # cut short, or written by anybody
+        except (FileNotFoundError, ValueError, TypeError, LookupError):  # truncated, or written by another program
             return ObjectInfo(bucket, key, size, None, etag=etag)
         return ObjectInfo(bucket, key, size, metadata.get('sha256'), metadata, content_type, etag)
 
-    def _beside(self, bucket: str, key: str) -> Path:
+    def _metadata_path(self, bucket: str, key: str) -> Path:
         return self._directory / METADATA / bucket / f'{key}.json'
 
 
 def _translated(error: OSError, directory: Path, bucket: str, key: str) -> StoreError:
-    """What an error of the file system means for delivery."""
+    """The StoreError for an error of the file system."""
     data: dict[str, Any] = {'bucket': bucket, 'key': key, 'errno': error.errno}
     if error.errno in _FULL:
         return StoreUnavailable(f'no space left in {directory}', remedy='free some space there', **data)
@@ -225,7 +225,7 @@ def _translated(error: OSError, directory: Path, bucket: str, key: str) -> Store
 
 
 def _write(path: Path, content: Iterator[bytes]) -> None:
-    """A new file with this content, on the disk before it returns."""
+    """Write a new file and sync it."""
     with path.open('xb') as file:
         for chunk in content:
             file.write(chunk)
@@ -233,8 +233,8 @@ def _write(path: Path, content: Iterator[bytes]) -> None:
         os.fsync(file.fileno())
 
 
-def _appear(part: Path, target: Path) -> bool:
-    """Give the whole file its final name for good; False when the name is taken (a bare rename would overwrite it)."""
+def _publish(part: Path, target: Path) -> bool:
+    """Durably give a complete file its final name; False if the name is taken, which a rename would overwrite."""
     _make_folders(target.parent)
     try:
         os.link(part, target)
@@ -243,14 +243,14 @@ def _appear(part: Path, target: Path) -> bool:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        if not _rename_alone(part, target):
+        if not _rename_locked(part, target):
             return False
     sync(target.parent)
     return True
 
 
-def _rename_alone(part: Path, target: Path) -> bool:
-    """``link`` for exFAT and its kind, which have none: one process at a time looks, then renames."""
+def _rename_locked(part: Path, target: Path) -> bool:
+    """The same on file systems without links, such as exFAT: under a lock, check that the name is free, then rename."""
     with flock(part.with_name('rename.lock'), mode=0o666):
         if target.exists():
             return False
@@ -259,7 +259,7 @@ def _rename_alone(part: Path, target: Path) -> bool:
 
 
 def _make_folders(folder: Path) -> None:
-    """The folder and its parents, each new one's name on the disk."""
+    """Durably create a folder and its parents."""
     missing = [folder]
     while not missing[-1].parent.exists():
         missing.append(missing[-1].parent)
@@ -274,13 +274,13 @@ def _make_folders(folder: Path) -> None:
 
 
 def _files(root: Path, below: str) -> Iterator[tuple[str, os.stat_result]]:
-    """Key and facts of each file of a bucket under a folder, in no order; none when there is no such bucket."""
+    """The key and status of each file below a folder of a bucket, in any order; none if the bucket is missing."""
     if not (root / below).is_dir():
         return
     for folder, _, names in os.walk(root / below, onerror=_raise):
         prefix = Path(folder).relative_to(root)
         for name in names:
-            with suppress(FileNotFoundError):  # deleted meanwhile
+            with suppress(FileNotFoundError):  # deleted in the meantime
                 yield str(prefix / name), Path(folder, name).stat()
 
 

@@ -1,4 +1,4 @@
-"""A store in memory for tests: it behaves like the others, and fails when it is told to."""
+"""A store in memory for tests, which behaves like the others and fails on request."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shadowhound_data_logger.core import metadata_words as words
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.bandwidth import Pace
-from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined, too_large
+from shadowhound_data_logger.stores.base import Content, has_changed, joined, too_large
 from shadowhound_data_logger.stores.content import (
     CHUNK_BYTES,
     check_read,
@@ -26,11 +26,10 @@ from shadowhound_data_logger.stores.content import (
 
 
 class MemoryStore:
-    """A store in memory, for tests.
+    """A store in memory, for tests: a dict under one lock.
 
-    It holds objects in a dict under one lock.
-
-    ``fail`` is asked before each put (with the item) and each probe (with None); the exception it returns is raised.
+    ``fail`` is called before each put (with the item) and each probe, ``changed`` and ``replace`` (with None); an
+    exception that it returns is raised.
     """
 
     def __init__(self, fail: Callable[[SpooledObject | None], Exception | None] | None = None, *, name: str = 'memory') -> None:
@@ -47,7 +46,7 @@ class MemoryStore:
         """Nothing to acquire."""
 
     def close(self) -> None:
-        """Nothing to release; what it holds stays."""
+        """Nothing to release; the objects remain."""
 
     def describe(self) -> str:
         return self._name
@@ -69,8 +68,8 @@ class MemoryStore:
             found = self._objects.get((bucket, key))
         return found[0] if found else None
 
-    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
-        return joined(self.content(bucket, key), most)
+    def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
+        return joined(self.content(bucket, key), max_bytes)
 
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
         _, body = self._held(bucket, key)
@@ -79,16 +78,16 @@ class MemoryStore:
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         info, body = self._held(bucket, key)
         if version not in {'', info.etag}:
-            raise changed_meanwhile(bucket, key)
+            raise has_changed(bucket, key)
         return Content(info, (body[place : place + CHUNK_BYTES] for place in range(start, len(body), CHUNK_BYTES)))
 
-    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
+    def changed(self, bucket: str, key: str, version: str, max_bytes: int) -> tuple[bytes, str] | None:
         self._fail(None)
         info, body = self._held(bucket, key)
         if info.etag == version:
             return None
-        if len(body) > most:
-            raise too_large(bucket, key, most)
+        if len(body) > max_bytes:
+            raise too_large(bucket, key, max_bytes)
         return body, info.etag
 
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:

@@ -1,7 +1,7 @@
-"""What an S3 client's failure means for delivery, in one table: the error class, words for the operator, and a remedy.
+"""What an S3 client's failure means for delivery, in one table: the error class, a message and a remedy for the operator.
 
 Codes: https://docs.aws.amazon.com/AmazonS3/latest/API/ErrorResponses.html, and MinIO's ``cmd/api-errors.go`` for ``XMinio...``,
-``SlowDownWrite``, ``InvalidTokenId``. No message repeats a request, so none can hold a secret.
+``SlowDownWrite``, ``InvalidTokenId``. No message quotes a request, so none can contain a secret.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from shadowhound_data_logger.core.errors import (
 from shadowhound_data_logger.core.tls import causes, distrust, distrust_told
 
 REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, urllib3.HTTPError, OSError, ValueError)
-"""Everything a request through botocore can raise; ValueError comes of a header that broke off.
+"""Everything that a request through botocore can raise. ValueError is raised for a truncated header.
 
-urllib3's own come of an error whose body broke off, where a body was asked for: botocore then reads it outside its translation.
+urllib3's errors are raised if the body of an error response is truncated, because botocore reads it outside its translation.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What was asked of whom: the nouns of an error message."""
+    """A request, as error messages name it."""
 
     endpoint: str
     """URL without credentials."""
@@ -51,11 +51,11 @@ _KEYS = 'check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or the file of the p
 _SESSION = 'check AWS_SESSION_TOKEN; a server of your own needs none'
 _CLOCK = 'set the clock of this machine and of Tower: `timedatectl` on both'
 _REGION = 'set AWS_DEFAULT_REGION to the region of the server'
-_NAME = 'the object waits in quarantine'
-_WIRE = 'it is sent again; if this continues, suspect memory or the network'
-_AGAIN = 'it is tried again'
+_NAME = 'the object is in quarantine'
+_WIRE = 'it will be sent again; if this continues, check memory and network'
+_AGAIN = 'it will be retried'
 _POLICY = "the key pair is valid; is it this robot's own? It needs s3:PutObject and s3:GetObject on {bucket}"
-_SPACE = 'make room on Tower'
+_SPACE = 'free some space on Tower'
 _BUCKET = 'create it (`aws --endpoint-url {endpoint} s3 mb s3://{bucket}`), or let these credentials create buckets'
 _NOT_S3 = 'is this the port of the S3 server? `curl -i {endpoint}`'
 
@@ -81,7 +81,7 @@ _CODES: Final[dict[str, _Row]] = {
     'InvalidBucketName': (BucketMissing, 'Tower at {endpoint} allows no bucket of the name {bucket}',
                           'use 3 to 63 lower-case letters, digits and "-"'),
     'NoSuchKey': (ObjectRefused, 'there is no {bucket}/{key} on Tower at {endpoint}', ''),
-    'NoSuchUpload': (StoreUnavailable, 'somebody ended the upload of {bucket}/{key} to {endpoint}', _AGAIN),
+    'NoSuchUpload': (StoreUnavailable, 'another client ended the upload of {bucket}/{key} to {endpoint}', _AGAIN),
     'InvalidPart': (StoreUnavailable, 'Tower at {endpoint} lost a part of {bucket}/{key}', _AGAIN),
     'InvalidPartOrder': (StoreUnavailable, 'Tower at {endpoint} lost a part of {bucket}/{key}', _AGAIN),
     'EntityTooSmall': (StoreUnavailable, 'Tower at {endpoint} lost a part of {bucket}/{key}', _AGAIN),
@@ -92,10 +92,10 @@ _CODES: Final[dict[str, _Row]] = {
     'XMinioParentIsObject': (ObjectRefused, 'a folder of {bucket}/{key} is an object on Tower at {endpoint}', _NAME),
     'EntityTooLarge': (ObjectRefused, '{bucket}/{key} is too large for Tower at {endpoint}', ''),
     'InvalidArgument': (ObjectRefused, 'Tower at {endpoint} refuses a property of {bucket}/{key}', ''),
-    'BadDigest': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
-    'InvalidDigest': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
-    'XAmzContentChecksumMismatch': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
-    'XAmzContentSHA256Mismatch': (StoreUnavailable, '{bucket}/{key} was damaged on its way to {endpoint}', _WIRE),
+    'BadDigest': (StoreUnavailable, '{bucket}/{key} was damaged in transit to {endpoint}', _WIRE),
+    'InvalidDigest': (StoreUnavailable, '{bucket}/{key} was damaged in transit to {endpoint}', _WIRE),
+    'XAmzContentChecksumMismatch': (StoreUnavailable, '{bucket}/{key} was damaged in transit to {endpoint}', _WIRE),
+    'XAmzContentSHA256Mismatch': (StoreUnavailable, '{bucket}/{key} was damaged in transit to {endpoint}', _WIRE),
     'IncompleteBody': (StoreUnavailable, '{bucket}/{key} reached {endpoint} incompletely', _WIRE),
     'RequestTimeout': (StoreUnavailable, 'Tower at {endpoint} gave up waiting for the rest of {bucket}/{key}', _AGAIN),
     'SlowDown': (StoreUnavailable, 'Tower at {endpoint} is overloaded ({status} {code})', _AGAIN),
@@ -106,8 +106,8 @@ _CODES: Final[dict[str, _Row]] = {
     'OperationAborted': (StoreUnavailable, 'another request for {bucket} is under way on {endpoint}', _AGAIN),
     'XMinioStorageFull': (StoreUnavailable, 'the disk of Tower at {endpoint} is full', _SPACE),
     'XMinioAdminBucketQuotaExceeded': (StoreUnavailable, 'the quota of bucket {bucket} on {endpoint} is used up', _SPACE),
-    'XMinioBackendDown': (StoreUnavailable, 'the storage behind Tower at {endpoint} is down', 'look at the log of the server'),
-    'XMinioInsecureClientRequest': (StoreUnavailable, 'Tower at {endpoint} wants TLS', 'use https:// in AWS_ENDPOINT_URL'),
+    'XMinioBackendDown': (StoreUnavailable, 'the storage behind Tower at {endpoint} is down', 'check the log of the server'),
+    'XMinioInsecureClientRequest': (StoreUnavailable, 'Tower at {endpoint} requires TLS', 'use https:// in AWS_ENDPOINT_URL'),
 }  # fmt: skip
 
 _NO_KEYS: Final = (boto.NoCredentialsError, boto.PartialCredentialsError, boto.CredentialRetrievalError, boto.NoAuthTokenError,
@@ -125,26 +125,27 @@ _FAILURES: Final[tuple[tuple[type[BaseException] | tuple[type[BaseException], ..
                                  'no S3 request can carry {bucket}/{key}: its metadata or type is not plain text', '')),
     (ResponseParserError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
     (boto.SSLError, (StoreUnavailable, 'no TLS connection to Tower at {endpoint}',
-                     'does the server speak TLS there? else use http:// in AWS_ENDPOINT_URL')),
+                     'does the server speak TLS there? otherwise use http:// in AWS_ENDPOINT_URL')),
     (boto.ProxyConnectionError, _PROXY),
     (boto.ConnectTimeoutError, (StoreUnavailable, 'no connection to Tower at {endpoint} within {connect_timeout_s:g} s',
                                 'is Tower on, and the WiFi?')),
     (_SLOW, (StoreUnavailable, 'Tower at {endpoint} gave no answer within {read_timeout_s:g} s',
-             'does the server hang? look at its log')),
+             'does the server hang? check its log')),
     (ConnectionRefusedError, (StoreUnavailable, 'Tower at {endpoint} refused the connection',
                               'is the S3 server running? `curl -i {endpoint}`')),
     (socket.gaierror, (StoreUnavailable, 'the name of Tower at {endpoint} cannot be resolved',
                        'use its IP address in AWS_ENDPOINT_URL')),
-    (_BROKEN, (StoreUnavailable, 'Tower at {endpoint} broke the connection off', _AGAIN)),
-    (ValueError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),  # last: an SSL error is one, too
+    (_BROKEN, (StoreUnavailable, 'Tower at {endpoint} closed the connection', _AGAIN)),
+    # Last, because SSL errors are ValueErrors:
+    (ValueError, (StoreUnavailable, '{endpoint} does not answer like an S3 server', _NOT_S3)),
 )  # fmt: skip
-"""Failures without an answer; the first row of which the error or one of its causes is an instance."""
+"""Failures without an answer; the first row whose class matches the error or one of its causes counts."""
 
 
 def classify(error: Exception, request: Request) -> StoreError:
-    """The error of our tree for one of ``REQUEST_ERRORS``; transient or terminal is decided here and nowhere else.
+    """The StoreError for one of ``REQUEST_ERRORS``; only this table decides whether an error is transient or terminal.
 
-    What is not known is StoreUnavailable: an object that waits is better than one in quarantine for a fault not its own.
+    Unknown errors are StoreUnavailable: a waiting object is better than one in quarantine for a fault that is not its own.
     """
     if isinstance(error, boto.ClientError):
         return _answered(error, request)
@@ -154,19 +155,19 @@ def classify(error: Exception, request: Request) -> StoreError:
 
 
 def public_url(url: str) -> str:
-    """The URL without a user name or password that somebody put into it."""
+    """The URL without user name and password."""
     parts = urlsplit(url)
     return parts._replace(netloc=parts.netloc.rpartition('@')[2]).geturl()
 
 
 def code_of(error: boto.ClientError) -> str:
-    """The S3 error code; the HTTP status as text where the answer had no S3 body."""
+    """The S3 error code; the HTTP status as text if the answer has no S3 body."""
     code: str = error.response.get('Error', {}).get('Code', '')
     return code or str(status_of(error))
 
 
 def status_of(error: boto.ClientError) -> int:
-    """The HTTP status, 0 where there is none."""
+    """The HTTP status; 0 if there is none."""
     return error.response.get('ResponseMetadata', {}).get('HTTPStatusCode', 0)
 
 
@@ -176,24 +177,24 @@ def _answered(error: boto.ClientError, request: Request) -> StoreError:
 
 
 def refused(code: str, status: int, detail: str, request: Request, *, is_head: bool = False) -> StoreError:
-    """The same for an answer that another client told: S3 error code (else the HTTP status as text), HTTP status, message."""
+    """The same for another client's error: S3 error code (otherwise the HTTP status as text), HTTP status, message."""
     row = _CODES.get(code)
     if row is None and (status >= 500 or status in {408, 409, 425, 429, 499}):
-        row = (StoreUnavailable, 'Tower at {endpoint} answers with a server error ({status} {code})', 'look at its log')
+        row = (StoreUnavailable, 'Tower at {endpoint} answers with a server error ({status} {code})', 'check its log')
     elif row is None and not code.isdigit() and status in {401, 403}:
         row = (AccessDenied, 'Tower at {endpoint} denies these credentials {bucket}/{key} ({code})', _POLICY)
     elif row is None and not code.isdigit() and status >= 400:
         row = (ObjectRefused, 'Tower at {endpoint} refuses {bucket}/{key} ({status} {code}: {detail})', '')
     elif row is None and status == 403 and is_head:
         row = _CODES['AccessDenied']
-    elif row is None:  # a captive portal, a proxy, a web server on this port: nobody's object is at fault
+    elif row is None:  # a captive portal, a proxy or a web server on this port: not the object's fault
         row = (StoreUnavailable, '{endpoint} does not answer like an S3 server ({status} without an S3 error)', _NOT_S3)
     detail = detail[:200]
     return _error(*row, request, code=detail if code.isdigit() else code, status=status, detail=detail)
 
 
-def away(reason: str, request: Request, *, is_proxied: bool = False) -> StoreError:
-    """For a request that got no answer, by a client whose errors are only text."""
+def unreachable(reason: str, request: Request, *, is_proxied: bool = False) -> StoreError:
+    """The error for a request without an answer, by a client whose errors are only text."""
     untrusted = distrust_told(reason, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
     row = (StoreUntrusted, *untrusted) if untrusted else _PROXY if is_proxied else _SILENT
     return _error(*row, request, code='no answer')

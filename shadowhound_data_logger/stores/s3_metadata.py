@@ -1,4 +1,4 @@
-"""User metadata as S3 carries it: header text. Values that a header cannot hold unchanged are encoded as RFC 2047 words.
+"""User metadata in S3's headers. Values that would not survive a header unchanged are encoded as RFC 2047 words.
 
 S3 itself uses that form for such values; https://docs.aws.amazon.com/AmazonS3/latest/userguide/UsingMetadata.html
 """
@@ -16,7 +16,7 @@ from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores.content import object_metadata
 
 _PLAIN: Final = re.compile(r'(?!=\?)([!-~]+( [!-~]+)*)?')
-"""Printable ASCII. Blanks at the ends and in a row would not survive a header and its signature."""
+"""Printable ASCII. Spaces at the ends and repeated spaces would not survive a header and its signature."""
 
 
 def to_headers(item: SpooledObject) -> dict[str, str]:
@@ -25,7 +25,7 @@ def to_headers(item: SpooledObject) -> dict[str, str]:
 
 
 def from_headers(metadata: Mapping[str, str]) -> dict[str, str]:
-    """What ``to_headers`` was given, by its answer. Values that are not valid encoded words are returned unchanged."""
+    """The inverse of ``to_headers``. Values that are not valid encoded words are returned unchanged."""
     return {name: _decoded(value) if value.startswith('=?') else value for name, value in metadata.items()}
 
 
@@ -36,5 +36,5 @@ def _encoded(value: str) -> str:
 def _decoded(value: str) -> str:
     try:
         return str(make_header(decode_header(value)))
-    except (HeaderParseError, LookupError, UnicodeError, ValueError):  # another program's
+    except (HeaderParseError, LookupError, UnicodeError, ValueError):  # written by another program
         return value

@@ -1,9 +1,8 @@
-"""Puts large objects to an S3 server in parts: after an interruption the next try sends the parts that the server does not have.
+"""Puts large objects to an S3 server in parts: after an interruption, the next try sends only the missing parts.
 
-It keeps no state: which upload to take up, and what of it is there, is asked of the server. So it makes no difference
-whether a connection broke, the process was killed or the robot was without power. Each part is sent with its MD5, which the
-server verifies and tells again as the part's ETag (MinIO only where it was sent). That all parts together are the spooled
-content, by its SHA-256, is certain before the server is asked to make them the object.
+It keeps no state: it lists the unfinished uploads and their parts on the server, so it makes no difference whether a connection
+broke, the process was killed or the power failed. Each part is sent with its MD5, which the server verifies and returns as the
+part's ETag (MinIO only if the MD5 was sent). The SHA-256 of all parts together is verified before the upload is completed.
 """
 
 from __future__ import annotations
@@ -21,14 +20,15 @@ from botocore.exceptions import ClientError
 from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.stores.content import Part, check_content, opened, parts
+from shadowhound_data_logger.stores.s3_client import S3Client
 from shadowhound_data_logger.stores.s3_errors import code_of, status_of
 from shadowhound_data_logger.stores.s3_metadata import to_headers
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 MULTIPART_BYTES: Final = 16 << 20
-"""Larger objects are sent in parts: what is smaller is sent again as a whole after a broken connection."""
-_LOST: Final = frozenset({'InvalidPart', 'InvalidPartOrder', 'EntityTooSmall'})
-"""The server denies having parts that it confirmed: only a new upload helps."""
+"""Larger objects are sent in parts; smaller ones are sent again completely after a broken connection."""
+_LOST_PARTS: Final = frozenset({'InvalidPart', 'InvalidPartOrder', 'EntityTooSmall'})
+"""The server has lost parts that it confirmed: the upload must start again."""
 
 _log = logging.getLogger(__name__)
 
@@ -39,51 +39,51 @@ class HeldPart:
 
     size: int
     etag: str
-    """As it wrote it, in quotes; what is in them is the MD5 in hex, unless the server encrypts."""
+    """As the server returned it, in quotes; the MD5 in hex, unless the server encrypts."""
 
 
 class Multipart:
     """Puts large objects in parts, and continues interrupted uploads.
 
-    Thread-safe. Two that send one object at a time continue or abort each other's upload: neither does harm.
+    Thread-safe. Two clients that send the same object continue or abort each other's upload, which is harmless.
     """
 
-    def __init__(self, s3: S3Requests) -> None:
+    def __init__(self, client: S3Client, s3: S3Requests) -> None:
         self._s3 = s3
-        self._uploads = _Uploads(s3)
+        self._uploads = _Uploads(client)
 
     def put(self, item: SpooledObject, is_taken: Callable[[], bool]) -> bool:
-        """One try; True once the server confirmed the object, False where its key is taken by then.
+        """One try; True once the server has confirmed the object, False if its key is taken.
 
-        ``is_taken`` is asked right before the end as well, for a server that knows no condition there.
+        ``is_taken`` is also called immediately before the upload is completed, for servers that ignore the condition there.
         """
         with opened(item) as file:
-            check_content(item, os.fstat(file).st_size, item.sha256)  # its content is known at the end, but this at once
-            upload, held = self._taken_up(item, file)
+            check_content(item, os.fstat(file).st_size, item.sha256)  # the size is known now, the content only at the end
+            upload, held = self._resumed(item, file)
             try:
                 etags = self._send(item, file, upload, held)
             except ObjectRefused:
-                self._give_up(item, upload)
+                self._abort(item, upload)
                 raise
             return self._complete(item, upload, etags, is_taken)
 
-    def _taken_up(self, item: SpooledObject, file: int) -> tuple[str, Mapping[int, HeldPart]]:
-        """An upload of this very content with the parts that it has, or a new one. Others of the same key are aborted."""
+    def _resumed(self, item: SpooledObject, file: int) -> tuple[str, Mapping[int, HeldPart]]:
+        """An upload of the same content with its parts, or a new one; aborts other uploads of the key."""
         found: tuple[str, Mapping[int, HeldPart]] | None = None
-        for upload in self._under_way(item):
+        for upload in self._unfinished(item):
             held = {} if found else self._held(item, upload)
             if held and _is_of(held, file, item.size):
-                _log.debug('continuing the upload of %s/%s: %d parts are there', item.bucket, item.key, len(held))
+                _log.debug('continuing the upload of %s/%s, which has %d parts', item.bucket, item.key, len(held))
                 found = upload, held
             else:
-                self._give_up(item, upload)
+                self._abort(item, upload)
         return found or (self._uploads.begin(item), {})
 
-    def _under_way(self, item: SpooledObject) -> list[str]:
+    def _unfinished(self, item: SpooledObject) -> list[str]:
         try:
-            return self._uploads.of(item)
+            return self._uploads.unfinished(item)
         except AccessDenied:
-            return []  # credentials that may write only: a try that ended is left to the server's own clean-up
+            return []  # write-only credentials: the server's lifecycle rules must remove unfinished uploads
 
     def _held(self, item: SpooledObject, upload: str) -> Mapping[int, HeldPart]:
         try:
@@ -94,11 +94,11 @@ class Multipart:
             return {}
 
     def _send(self, item: SpooledObject, file: int, upload: str, held: Mapping[int, HeldPart]) -> dict[int, str]:
-        """Every part that is not there yet; returns the ETags of all. Raises ObjectRefused for a file that is another one."""
+        """Send the missing parts; returns the ETags of all parts. Raises ObjectRefused if the file is not the object's."""
         whole, size, etags = hashlib.sha256(), 0, dict[int, str]()
         for number, part in enumerate(parts(file, item.size, whole), 1):
-            there = held.get(number)
-            etags[number] = there.etag if there and _is_same(there, part) else self._s3.put_part(item, upload, number, part)
+            sent = held.get(number)
+            etags[number] = sent.etag if sent and _is_same(sent, part) else self._s3.put_part(item, upload, number, part)
             size += part.size
         check_content(item, size, whole.hexdigest())
         return etags
@@ -108,20 +108,20 @@ class Multipart:
             if not is_taken() and self._uploads.complete(item, upload, etags) is Sent.CREATED:
                 return True
         except StoreError as error:
-            if error.data.get('reason') in _LOST:
-                self._give_up(item, upload)
+            if error.data.get('reason') in _LOST_PARTS:
+                self._abort(item, upload)
             raise
-        self._give_up(item, upload)
+        self._abort(item, upload)
         return False
 
-    def _give_up(self, item: SpooledObject, upload: str) -> None:
-        """Its parts take room on the server until then. Where that fails the server's own clean-up has to."""
+    def _abort(self, item: SpooledObject, upload: str) -> None:
+        """Abort an upload, whose parts take space on the server; if that fails, the server's lifecycle rules must do it."""
         with suppress(StoreError):
             self._uploads.abort(item, upload)
 
 
 def _is_of(held: Mapping[int, HeldPart], file: int, size: int) -> bool:
-    """Whether the first part that is there is the file's: another content under the same key has another one."""
+    """Whether the first part on the server is the file's: uploads of other content under the same key differ."""
     first = min(held)
     for number, part in enumerate(parts(file, size, hashlib.sha256()), 1):
         if number == first:
@@ -134,39 +134,39 @@ def _is_same(held: HeldPart, part: Part) -> bool:
 
 
 class _Uploads:
-    """The single requests of an upload but for its parts: begin, list, complete, abort. Thread-safe; raises as S3Requests."""
+    """The requests of multipart uploads, except for parts: begin, list, complete, abort. Thread-safe; raises as S3Requests."""
 
-    def __init__(self, s3: S3Requests) -> None:
-        self._s3 = s3
+    def __init__(self, client: S3Client) -> None:
+        self._client = client
 
     def begin(self, item: SpooledObject) -> str:
-        """A new upload, with all that is to be known of the object; returns its id."""
-        with self._s3.asking(item.bucket, item.key) as client:
+        """Begin an upload with the object's metadata; returns its id."""
+        with self._client.requesting(item.bucket, item.key) as client:
             answer = client.create_multipart_upload(
                 Bucket=item.bucket, Key=item.key, ContentType=item.content_type, Metadata=to_headers(item)
             )
-        self._s3.confirm({'ETag': answer.get('UploadId')}, item.bucket, item.key)
+        self._client.confirm({'ETag': answer.get('UploadId')}, item.bucket, item.key)
         return str(answer['UploadId'])
 
-    def of(self, item: SpooledObject) -> list[str]:
-        """The ids of the uploads of its key that are under way."""
-        with self._s3.asking(item.bucket, item.key) as client:
+    def unfinished(self, item: SpooledObject) -> list[str]:
+        """The ids of the unfinished uploads of the object's key."""
+        with self._client.requesting(item.bucket, item.key) as client:
             answer = client.list_multipart_uploads(Bucket=item.bucket, Prefix=item.key)
         return [upload['UploadId'] for upload in answer.get('Uploads', ()) if upload['Key'] == item.key]
 
     def parts(self, item: SpooledObject, upload: str) -> dict[int, HeldPart]:
-        """Number -> part."""
+        """The parts of an upload, by number."""
         return {part['PartNumber']: HeldPart(part['Size'], part['ETag']) for part in self._pages(item, upload)}
 
     def complete(self, item: SpooledObject, upload: str, etags: Mapping[int, str]) -> Sent:
-        """Make it the object, unless there is one by then. Sent.CREATED only when the server confirmed it."""
+        """Complete the upload unless the key is taken. Returns Sent.CREATED only if the server confirmed it."""
         parts = {'Parts': [{'PartNumber': number, 'ETag': etag} for number, etag in sorted(etags.items())]}
         sent = self._complete(item, upload, parts, {'IfNoneMatch': '*'})
         return self._complete(item, upload, parts, {}) if sent is Sent.NOT_IMPLEMENTED else sent
 
     def abort(self, item: SpooledObject, upload: str) -> None:
-        """Returns also when there is no such upload."""
-        with self._s3.asking(item.bucket, item.key) as client:
+        """Abort an upload; a missing one is not an error."""
+        with self._client.requesting(item.bucket, item.key) as client:
             try:
                 client.abort_multipart_upload(Bucket=item.bucket, Key=item.key, UploadId=upload)
             except ClientError as error:
@@ -176,7 +176,7 @@ class _Uploads:
     def _pages(self, item: SpooledObject, upload: str) -> Iterator[Mapping[str, Any]]:
         after = 0
         while True:
-            with self._s3.asking(item.bucket, item.key) as client:
+            with self._client.requesting(item.bucket, item.key) as client:
                 page = client.list_parts(Bucket=item.bucket, Key=item.key, UploadId=upload, PartNumberMarker=after)
             yield from page.get('Parts', ())
             if not page.get('IsTruncated'):
@@ -184,7 +184,7 @@ class _Uploads:
             after = page['NextPartNumberMarker']
 
     def _complete(self, item: SpooledObject, upload: str, parts: Mapping[str, object], condition: Mapping[str, str]) -> Sent:
-        with self._s3.asking(item.bucket, item.key) as client:
+        with self._client.requesting(item.bucket, item.key) as client:
             try:
                 answer = client.complete_multipart_upload(
                     Bucket=item.bucket, Key=item.key, UploadId=upload, MultipartUpload=parts, **condition
@@ -195,5 +195,5 @@ class _Uploads:
                 if condition and status_of(error) == 501:
                     return Sent.NOT_IMPLEMENTED
                 raise
-        self._s3.confirm(answer, item.bucket, item.key)
+        self._client.confirm(answer, item.bucket, item.key)
         return Sent.CREATED

@@ -1,7 +1,7 @@
-"""An S3 server as a store for machines that read much: through obstore, at a quarter of botocore's CPU (docs/decisions/0013).
+"""An S3 server as a store for machines that read many objects: obstore, at a quarter of botocore's CPU (docs/decisions/0013).
 
-It comes with the extra ``lake``; no robot needs it. In the child of a process that used it and was forked it waits for
-ever: there ``S3Store`` reads (docs/decisions/0016).
+obstore is part of the extra ``lake`` and not needed on a robot. It hangs in forked children of a process that has used it; use
+``S3Store`` there (docs/decisions/0016).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from shadowhound_data_logger.core.errors import (
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.retry import steadily
-from shadowhound_data_logger.stores.base import Content, changed_meanwhile, joined
+from shadowhound_data_logger.stores.base import Content, has_changed, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read, paths, warn_of
 from shadowhound_data_logger.stores.s3_metadata import from_headers
 
@@ -41,31 +41,31 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.stores.bandwidth import Pace
     from shadowhound_data_logger.stores.s3 import S3Store
 
-_CONNECT: Final = timedelta(seconds=10)
-_SILENCE: Final = timedelta(seconds=60)
-"""Of a server in the middle of an answer."""
-_WHOLE: Final = timedelta(days=1)
-"""For one answer: a large object over WiFi takes its time."""
-_CLIENTS: Final = 16
-"""Buckets whose connections are kept: rows of a catalog can name any number."""
+_CONNECT_TIMEOUT: Final = timedelta(seconds=10)
+_READ_TIMEOUT: Final = timedelta(seconds=60)
+"""Between two pieces of an answer."""
+_TOTAL_TIMEOUT: Final = timedelta(days=1)
+"""For one answer: a large object may take long over WiFi."""
+_MAX_CLIENTS: Final = 16
+"""Buckets whose connections are kept open: a catalog may name any number of buckets."""
 _CODE: Final = re.compile(r'<Code>(\w+)</Code>|\(code: (\w+)\)')
 _MESSAGE: Final = re.compile(r'<Message>([^<]*)</Message>')
 _STATUS: Final = re.compile(r'non-2xx status code: (\d{3})')
 REPLACED: Final = '\N{REPLACEMENT CHARACTER}'
-NOTHING_THERE: Final = 416
-"""Behind the first byte that was asked for."""
+RANGE_NOT_SATISFIABLE: Final = 416
+"""The object ends before the first requested byte."""
 _HEADERS: Final = {
     'Content-Disposition', 'Content-Encoding', 'Content-Language', 'Content-Type', 'Cache-Control', 'Storage-Class',
 }  # fmt: skip
-"""What obstore has among the attributes beside the object's own."""
+"""Attributes in obstore's answers that are not the object's own metadata."""
 
 _Answer = TypeVar('_Answer')
 
 
 class ObstoreStore:
-    """Reads, lists and deletes by obstore; whatever else is asked goes to an S3Store.
+    """Reads, lists and deletes through obstore; an S3Store does everything else.
 
-    ``_lock`` guards the clients and that store, which is made when it is needed.
+    ``_lock`` guards the clients and the S3Store, which is opened when it is needed.
     """
 
     def __init__(self, settings: StoreSettings, upload: UploadSettings) -> None:
@@ -74,35 +74,35 @@ class ObstoreStore:
         self._endpoint = settings.endpoint_url or ''
         self._lock = threading.Lock()
         self._clients: dict[str, Client] = {}
-        self._other: S3Store | None = None
+        self._opened: S3Store | None = None
 
     def __repr__(self) -> str:
         return f'ObstoreStore({self.describe()!r})'
 
     @property
     def pace(self) -> Pace:
-        return self._plain.pace
+        return self._s3.pace
 
     def open(self) -> None:
-        """Raises SettingError for an endpoint that no request can be sent to."""
+        """Raises SettingError for an endpoint to which no request can be sent."""
         scheme, _, rest = self._endpoint.rpartition('://')
         endpoint_url(f'{scheme}://{rest.rpartition("@")[2]}')  # a user name is not sent
 
     def close(self) -> None:
         with self._lock:
-            other, self._other = self._other, None
+            opened, self._opened = self._opened, None
             self._clients.clear()
-        if other is not None:
-            other.close()
+        if opened is not None:
+            opened.close()
 
     def describe(self) -> str:
-        return f'the S3 server at {_shown(self._endpoint)}'
+        return f'the S3 server at {_without_password(self._endpoint)}'
 
     def put(self, item: SpooledObject) -> Put:
-        return self._plain.put(item)
+        return self._s3.put(item)
 
     def probe(self) -> None:
-        self._plain.probe()
+        self._s3.probe()
 
     def head(self, bucket: str, key: str) -> ObjectInfo | None:
         def head(client: Client) -> ObjectInfo | None:
@@ -110,13 +110,13 @@ class ObstoreStore:
                 return _info(bucket, key, obstore.get(client, key, options={'head': True}))
             except FileNotFoundError:
                 return None
-            except refused.PermissionDeniedError:  # an answer without a body: ask for the reason
+            except refused.PermissionDeniedError:  # HEAD has no body: request the reason
                 return _info(bucket, key, obstore.get(client, key, options={'range': (0, 1)}))
 
-        return self._ask(bucket, key, head)
+        return self._request(bucket, key, head)
 
-    def get(self, bucket: str, key: str, most: int | None = None) -> bytes:
-        return joined(self.content(bucket, key), most)
+    def get(self, bucket: str, key: str, max_bytes: int | None = None) -> bytes:
+        return joined(self.content(bucket, key), max_bytes)
 
     def ranges(self, bucket: str, key: str, spans: Sequence[tuple[int, int]]) -> Sequence[bytes]:
         if not all(begin < end for begin, end in spans):
@@ -127,17 +127,17 @@ class ObstoreStore:
             try:
                 return [bytes(each) for each in obstore.get_ranges(client, key, starts=begins, ends=ends)]
             except refused.BaseError as error:
-                if _said(error)[0] != NOTHING_THERE:
+                if _parse(error)[0] != RANGE_NOT_SATISFIABLE:
                     raise
             return [self.ranges(bucket, key, [span])[0] for span in spans] if len(spans) > 1 else [b'']
 
-        return self._ask(bucket, key, read)
+        return self._request(bucket, key, read)
 
-    def changed(self, bucket: str, key: str, version: str, most: int) -> tuple[bytes, str] | None:
-        return self._plain.changed(bucket, key, version, most)
+    def changed(self, bucket: str, key: str, version: str, max_bytes: int) -> tuple[bytes, str] | None:
+        return self._s3.changed(bucket, key, version, max_bytes)
 
     def replace(self, bucket: str, key: str, body: bytes, version: str) -> bool:
-        return self._plain.replace(bucket, key, body, version)
+        return self._s3.replace(bucket, key, body, version)
 
     def list(self, bucket: str, prefix: str = '', skipped: Callable[[str, str], None] = warn_of) -> Iterator[ObjectInfo]:
         try:
@@ -145,17 +145,17 @@ class ObstoreStore:
         except ObjectRefused as error:
             if error.data.get('reason') != 'name':
                 raise
-            found = None  # obstore refuses a whole page for one key that is not a path
+            found = None  # obstore refuses a whole page if one key is not a path
         if found is None or any(not each.size or REPLACED in each.key for each in found):
-            # obstore drops the slash of a folder's marker, and gets what XML cannot hold replaced
-            found = self._plain.list(bucket, prefix, skipped)
+            # obstore removes the trailing slash of folder markers, and characters that XML cannot contain arrive replaced
+            found = self._s3.list(bucket, prefix, skipped)
         yield from sorted(paths(found, skipped), key=attrgetter('key'))
 
     def _listed(self, bucket: str, prefix: str) -> Iterable[ObjectInfo]:
         folder, _, begin = prefix.rpartition('/')
         if not begin:
             return self._all(bucket, folder)
-        below = self._below(bucket, folder)  # S3 knows any prefix, obstore whole names alone
+        below = self._below(bucket, folder)  # S3 accepts any prefix, obstore only complete names
         found = [_entry(bucket, each) for each in below['objects'] if each['path'].startswith(prefix)]
         for each in below['common_prefixes']:
             if each.startswith(prefix):
@@ -168,30 +168,32 @@ class ObstoreStore:
         except ObjectRefused as error:
             if error.data.get('reason') != 'name':
                 raise
-            return self._plain.folders(bucket, prefix)
+            return self._s3.folders(bucket, prefix)
 
     def delete(self, bucket: str, key: str) -> None:
-        self._ask(bucket, key, lambda client: obstore.delete(client, key))
+        self._request(bucket, key, lambda client: obstore.delete(client, key))
 
     @property
-    def _plain(self) -> S3Store:
+    def _s3(self) -> S3Store:
         with self._lock:
-            if self._other is None:
-                from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - who only reads needs no botocore
+            if self._opened is None:
+                from shadowhound_data_logger.stores.s3 import S3Store  # noqa: PLC0415 - reading needs no botocore
 
-                other = S3Store(self._settings, self._upload)
-                other.open()
-                self._other = other
-            return self._other
+                opened = S3Store(self._settings, self._upload)
+                opened.open()
+                self._opened = opened
+            return self._opened
 
     def _below(self, bucket: str, prefix: str) -> Any:
         try:
-            return self._ask(bucket, prefix, lambda client: obstore.list_with_delimiter(client, prefix or None), is_listing=True)
+            return self._request(
+                bucket, prefix, lambda client: obstore.list_with_delimiter(client, prefix or None), is_listing=True
+            )
         except BucketMissing:
             return {'common_prefixes': [], 'objects': []}
 
     def _all(self, bucket: str, folder: str) -> Sequence[ObjectInfo]:
-        """A page that fails is not a reason to ask for those before it once more: after them it goes on."""
+        """All objects below a folder; after a failure, continues with the page that failed."""
         found: list[ObjectInfo] = []
 
         def read(client: Client) -> None:
@@ -202,9 +204,9 @@ class ObstoreStore:
             known = len(found)
             try:
                 if found:
-                    steadily(lambda: self._ask(bucket, folder, read, is_listing=True))
+                    steadily(lambda: self._request(bucket, folder, read, is_listing=True))
                 else:
-                    self._ask(bucket, folder, read, is_listing=True)
+                    self._request(bucket, folder, read, is_listing=True)
             except BucketMissing:
                 return found
             except StoreUnavailable:
@@ -216,58 +218,58 @@ class ObstoreStore:
     def content(self, bucket: str, key: str, start: int = 0, version: str = '') -> Content:
         check_read(bucket, key)
         options: Any = {**({'range': {'offset': start}} if start else {}), **({'if_match': version} if version else {})}
-        with self._asking(bucket, key):
+        with self._translating(bucket, key):
             try:
                 found = obstore.get(self._client(bucket), key, options=options or None)
             except refused.PreconditionError:
-                raise changed_meanwhile(bucket, key) from None
+                raise has_changed(bucket, key) from None
             except refused.BaseError as error:
-                if not start or _said(error)[0] != NOTHING_THERE or (info := self.head(bucket, key)) is None:
+                if not start or _parse(error)[0] != RANGE_NOT_SATISFIABLE or (info := self.head(bucket, key)) is None:
                     raise
-                return Content(info, iter(()))  # it ends before
+                return Content(info, iter(()))  # it ends before ``start``
             info = replace(_info(bucket, key, found), etag=found.meta['e_tag'] or '')
-            if version not in {'', info.etag}:  # of a server that does not know the condition
-                raise changed_meanwhile(bucket, key)
+            if version not in {'', info.etag}:  # the server ignores the condition
+                raise has_changed(bucket, key)
             return Content(info, self._pieces(bucket, key, found, is_small=not start))
 
     def _pieces(self, bucket: str, key: str, found: Any, *, is_small: bool) -> Iterator[bytes]:
-        with self._asking(bucket, key):
-            if is_small and found.meta['size'] <= CHUNK_BYTES:  # of a range it would take whatever is sent
+        with self._translating(bucket, key):
+            if is_small and found.meta['size'] <= CHUNK_BYTES:  # for a range, it would accept any number of bytes
                 yield found.bytes()
             else:
                 yield from found.stream(min_chunk_size=CHUNK_BYTES)
 
     def _client(self, bucket: str) -> Client:
-        """It holds the connections."""
+        """The client of a bucket, which keeps its connections."""
         with self._lock:
             client = self._clients.pop(bucket, None) or _client(self._settings, bucket)
-            self._clients[bucket] = client  # the last that was asked
-            if len(self._clients) > _CLIENTS:
+            self._clients[bucket] = client  # most recently used last
+            if len(self._clients) > _MAX_CLIENTS:
                 self._clients.pop(next(iter(self._clients)))
             return client
 
-    def _ask(self, bucket: str, key: str, ask: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
+    def _request(self, bucket: str, key: str, request: Callable[[Client], _Answer], *, is_listing: bool = False) -> _Answer:
         check_read(bucket, 'any' if is_listing else key)
-        with self._asking(bucket, key):
-            return ask(self._client(bucket))
+        with self._translating(bucket, key):
+            return request(self._client(bucket))
 
     @contextmanager
-    def _asking(self, bucket: str, key: str) -> Iterator[None]:
+    def _translating(self, bucket: str, key: str) -> Iterator[None]:
         try:
             yield
         except (refused.BaseError, FileNotFoundError, ValueError) as error:  # ValueError: a key with an unsafe part
-            raise _translated(error, self._endpoint, bucket, key) from None  # its text has the key id
+            raise _translated(error, self._endpoint, bucket, key) from None  # its text contains the key id
 
 
 def _client(settings: StoreSettings, bucket: str) -> Client:
-    """Without keys in hand it asks what boto3 would ask. Raises SettingError for certificates that are none."""
+    """A client that finds keys as boto3 does if the settings have none. Raises SettingError for invalid certificates."""
     given: dict[str, Any] = {'access_key_id': settings.access_key_id, 'secret_access_key': settings.secret_access_key}
     if settings.session_token:
         given['session_token'] = settings.session_token
     if not (settings.access_key_id and settings.secret_access_key):
         given = {'credential_provider': _provider(settings)}
-    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT, 'read_timeout': _SILENCE, 'timeout': _WHOLE,
-                    **proxy_options(settings.endpoint_url or '')}  # fmt: skip
+    options: Any = {'allow_http': True, 'connect_timeout': _CONNECT_TIMEOUT, 'read_timeout': _READ_TIMEOUT,
+                    'timeout': _TOTAL_TIMEOUT, **proxy_options(settings.endpoint_url or '')}  # fmt: skip
     if (authorities := _authorities(settings)) is not None:
         options['root_certificate'] = authorities
     return Client(
@@ -277,13 +279,13 @@ def _client(settings: StoreSettings, bucket: str) -> Client:
 
 
 def _provider(settings: StoreSettings) -> Any:
-    """What finds the keys of this machine. Raises SettingError for half a pair of keys, CredentialsRejected without any."""
-    from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - half a second that few need
+    """The provider of this machine's keys. Raises SettingError for half a pair of keys, CredentialsRejected without keys."""
+    from obstore.auth.boto3 import Boto3CredentialProvider  # noqa: PLC0415 - takes half a second, and is rarely needed
 
     from shadowhound_data_logger.stores.credentials import has_keys  # noqa: PLC0415
 
     if not has_keys(settings):
-        endpoint = _shown(settings.endpoint_url or '')
+        endpoint = _without_password(settings.endpoint_url or '')
         text = f'there are no credentials for Tower at {endpoint}'
         remedy = 'set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SHARED_CREDENTIALS_FILE to a file with them'
         raise CredentialsRejected(text, remedy=remedy, endpoint=endpoint)
@@ -291,9 +293,7 @@ def _provider(settings: StoreSettings) -> Any:
 
 
 def proxy_options(endpoint: str) -> dict[str, str]:
-    """Options of obstore and delta-rs for the proxy that botocore would use. By default they read ALL_PROXY and NO_PROXY by other
-    rules.
-    """
+    """Options of obstore and delta-rs for the proxy that botocore would use; their rules for ALL_PROXY and NO_PROXY differ."""
     url, proxies = urlsplit(endpoint), getproxies()
     if not proxies:
         return {}
@@ -303,7 +303,7 @@ def proxy_options(endpoint: str) -> dict[str, str]:
 
 
 def _authorities(settings: StoreSettings) -> bytes | None:
-    """Certificates (PEM) of those that delivery trusts (``AWS_CA_BUNDLE``), for rustls; None where the system's count."""
+    """The certificates (PEM) that uploads trust (``AWS_CA_BUNDLE``), for rustls; None for those of the system."""
     endpoint = settings.endpoint_url or ''
     if not endpoint.lower().startswith('https:'):
         return None
@@ -313,14 +313,13 @@ def _authorities(settings: StoreSettings) -> bytes | None:
     return Path(path).read_bytes() if isinstance(path, str) else None
 
 
-def _shown(endpoint: str) -> str:
-    """Without a password."""
+def _without_password(endpoint: str) -> str:
     scheme, _, rest = endpoint.rpartition('://')
     return f'{scheme}://{rest.rpartition("@")[2]}' if '@' in rest else endpoint
 
 
 def _info(bucket: str, key: str, found: Any) -> ObjectInfo:
-    """Metadata have lower-case names, as S3 has them."""
+    """The names of metadata are lower-case, as in S3."""
     attributes: Mapping[str, str] = found.attributes
     metadata = from_headers({name.lower(): value for name, value in attributes.items() if name not in _HEADERS})
     return ObjectInfo(bucket, key, found.meta['size'], metadata.get('sha256'), metadata, attributes.get('Content-Type', ''))
@@ -330,8 +329,8 @@ def _entry(bucket: str, found: Any) -> ObjectInfo:
     return ObjectInfo(bucket, found['path'], found['size'], None, etag=found['e_tag'] or '', modified=found['last_modified'])
 
 
-def _said(error: BaseException) -> tuple[int, str, str]:
-    """HTTP status (0: no answer), S3 error code and message of an answer that obstore tells in words."""
+def _parse(error: BaseException) -> tuple[int, str, str]:
+    """HTTP status (0: no answer), S3 error code and message, from the text of obstore's error."""
     text = str(error)
     status, code, message = _STATUS.search(text), _CODE.search(text), _MESSAGE.search(text)
     denied = 403 if code and not status else 0
@@ -339,10 +338,10 @@ def _said(error: BaseException) -> tuple[int, str, str]:
 
 
 def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> StoreError:
-    """What went wrong, by the table of all stores (s3_errors.py): obstore's own words repeat the request."""
+    """The error from the common table (s3_errors.py): obstore's messages quote the request."""
     from shadowhound_data_logger.stores import s3_errors  # noqa: PLC0415 - botocore takes a while
 
-    status, code, message = _said(error)
+    status, code, message = _parse(error)
     request = s3_errors.Request(s3_errors.public_url(endpoint), bucket, key)
     if status:
         return s3_errors.refused(code or str(status), status, message, request)
@@ -350,4 +349,4 @@ def _translated(error: BaseException, endpoint: str, bucket: str, key: str) -> S
         return s3_errors.refused('InvalidAccessKeyId', 401, message, request)
     if isinstance(error, (refused.InvalidPathError, ValueError)):
         return ObjectRefused(f'the key {bucket}/{key:.80} is not a path', reason='name', bucket=bucket, key=key)
-    return s3_errors.away(str(error), request, is_proxied=proxy_options(endpoint).keys() == {'proxy_url'})
+    return s3_errors.unreachable(str(error), request, is_proxied=proxy_options(endpoint).keys() == {'proxy_url'})

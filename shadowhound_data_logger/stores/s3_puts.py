@@ -21,6 +21,7 @@ from typing import IO, Final
 from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, ForeignObject, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.content import chunks, identical_or_foreign, opened
+from shadowhound_data_logger.stores.s3_client import S3Client
 from shadowhound_data_logger.stores.s3_multipart import MULTIPART_BYTES, Multipart
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
@@ -48,9 +49,9 @@ class ConditionalPuts:
     ``_lock`` guards ``_condition``. ``_has_rival`` is set once, when another writer's object was found under a key of ours.
     """
 
-    def __init__(self, s3: S3Requests) -> None:
+    def __init__(self, client: S3Client, s3: S3Requests) -> None:
         self._s3 = s3
-        self._multipart = Multipart(s3)
+        self._multipart = Multipart(client, s3)
         self._buckets = BucketCreation(s3)
         self._lock = threading.Lock()
         self._condition = _Condition.UNKNOWN

@@ -1,6 +1,6 @@
-"""Compares objects in a store with the size and the SHA-256 that they should have; every verification uses this.
+"""Compares objects in a store with their expected size and SHA-256; every verification uses this module.
 
-``compare`` needs only what the store reports of an object; ``check_object`` requests that, and can read the content.
+``compare`` uses an object's metadata; ``check_object`` requests them, and can also read the content.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ KINDS: Final = {
     MISSING: 'not in the store',
     SIZE: 'of another size',
     CHECKSUM: 'of other content',
-    FOREIGN: 'without a checksum, so written by somebody else; --deep compares the content',
-    DENIED: 'denied by the store: it may be there or not',
+    FOREIGN: 'without a checksum, so written by another program; --deep compares the content',
+    DENIED: 'denied by the store, so it may exist or not',
     UNREADABLE: 'refused by the store, such as an object that a client encrypted with its own key (SSE-C)',
 }
 """The kinds of findings, in words."""
@@ -35,7 +35,7 @@ KINDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One object that is not what it should be."""
+    """One object that does not match."""
 
     kind: str
     bucket: str
@@ -44,7 +44,7 @@ class Finding:
 
 
 def compare(held: ObjectInfo | None, size: int | None, sha256: str | None) -> str:
-    """The kind of the finding about an object by its metadata; empty if there is none. None stands for an unknown value."""
+    """The kind of finding about an object by its metadata; empty if it matches. None means that a value is unknown."""
     if held is None:
         return MISSING
     if size not in {None, held.size}:
@@ -56,7 +56,7 @@ def compare(held: ObjectInfo | None, size: int | None, sha256: str | None) -> st
 
 def check_object(store: ObjectStore, bucket: str, key: str, size: int | None, sha256: str | None, *, deep: bool = False,
                  pause: Callable[[float], object] = time.sleep) -> Finding | None:  # fmt: skip
-    """None if the store has the object as it was delivered; ``deep`` also reads its content.
+    """None if the object in the store matches its delivery; ``deep`` also reads its content.
 
     Raises StoreError if that cannot be determined.
     """
@@ -87,7 +87,7 @@ def check_object(store: ObjectStore, bucket: str, key: str, size: int | None, sh
 
 
 def _content_sha256(store: ObjectStore, bucket: str, key: str) -> str:
-    """In bounded memory: a slice has hundreds of megabytes."""
+    """The SHA-256 of an object, in bounded memory: a slice may have hundreds of megabytes."""
     digest = hashlib.sha256()
     with store.content(bucket, key) as content:
         for piece in content:

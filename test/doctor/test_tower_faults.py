@@ -29,6 +29,7 @@ from shadowhound_data_logger.core import mlflow_rest
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.doctor import mlflow, network, s3, s3_put, seaweedfs
 from shadowhound_data_logger.doctor.model import Result, Role, Severity
+from shadowhound_data_logger.stores.s3_client import S3Client
 from shadowhound_data_logger.stores.s3_requests import S3Requests
 
 pytestmark = pytest.mark.seaweedfs
@@ -41,11 +42,11 @@ SERVICES = ('s3', 'mlflow', 'seaweedfs')
 @pytest.fixture(scope='module')
 def servers(tower: Tower) -> Tower:
     """A Tower as it should be: the guide's buckets, a key pair of the least rights for Thor, one that reads for Spark."""
-    requests = S3Requests(tower.store_settings(), UploadSettings())
-    requests.open()
+    client = S3Client(tower.store_settings(), UploadSettings())
+    client.open()
     for bucket in BUCKETS:
-        requests.create_bucket(bucket)
-    requests.close()
+        S3Requests(client).create_bucket(bucket)
+    client.close()
     return tower
 
 
@@ -100,11 +101,11 @@ def test_probe_objects_do_not_pile_up(robot: Scene, servers: Tower) -> None:
         robot.role = role
         robot.environ |= servers.environment(user)
         assert robot.findings('s3') == []
-    requests = S3Requests(servers.store_settings(), UploadSettings())
-    requests.open()
-    assert [item.key for bucket in BUCKETS for item in requests.list(bucket, '') if '_doctor/' in item.key] == [
+    client = S3Client(servers.store_settings(), UploadSettings())
+    client.open()
+    assert [item.key for bucket in BUCKETS for item in S3Requests(client).list(bucket, '') if '_doctor/' in item.key] == [
         '_requests/_doctor/inbox.json', *['thor/_doctor/probe'] * 2]  # fmt: skip
-    requests.close()
+    client.close()
 
 
 def test_a_seaweedfs_without_keys_is_named(robot: Scene, tmp_path: Path) -> None:
@@ -272,13 +273,13 @@ def test_what_is_missing_on_tower(robot: Scene, servers: Tower) -> None:
     """Its own keys see all buckets; those of the guide that are not there are named, and can be made."""
     robot.role = Role.TOWER
     robot.environ |= servers.environment('tower')
-    admin = S3Requests(servers.store_settings(), UploadSettings())
+    admin = S3Client(servers.store_settings(), UploadSettings())
     admin.open()
     admin._client.delete_bucket(Bucket='lerobot')
     try:
         expect(robot.findings('s3'), 's3.bucket', 's3 mb s3://lerobot')
     finally:
-        admin.create_bucket('lerobot')
+        S3Requests(admin).create_bucket('lerobot')
         admin.close()
 
 

@@ -65,7 +65,7 @@ class Process:
         upload = UploadSettings(threads=rng.randint(1, MAX_THREADS))
         store = S3Store(StoreSettings(endpoint_url='http://simulated'), upload)
         parts: Any = store
-        parts._s3 = parts._puts._s3 = parts._puts._buckets._s3 = line
+        parts._client = parts._s3 = parts._puts._s3 = parts._puts._buckets._s3 = line
         parts._puts._buckets._creating = VirtualLock(time)
         self.uploader = Uploader(self.spool, store, upload, self._settle, monotonic=time, rng=rng)
         parts = self.uploader

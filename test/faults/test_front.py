@@ -25,10 +25,10 @@ pytestmark = pytest.mark.seaweedfs
 IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
 KINDS: dict[Fault, type[StoreError]] = {Fault.DENIED: AccessDenied}
 SAID = {
-    Fault.REFUSED: 'broke the connection off', Fault.RESET: 'broke the connection off', Fault.HUNG: 'gave no answer within 0.3 s',
+    Fault.REFUSED: 'closed the connection', Fault.RESET: 'closed the connection', Fault.HUNG: 'gave no answer within 0.3 s',
     Fault.SLOW: 'gave no answer within 0.3 s', Fault.ERROR_500: '500 InternalError', Fault.SLOW_DOWN: '503 SlowDown',
     Fault.DENIED: 'denies these credentials', Fault.SKEWED: 'differ too much', Fault.PORTAL: 'does not answer like an S3 server',
-    Fault.CUT: 'does not answer like an S3 server', Fault.ACK_LOST: 'broke the connection off',
+    Fault.CUT: 'does not answer like an S3 server', Fault.ACK_LOST: 'closed the connection',
 }  # fmt: skip
 BUCKET = 'faults'
 CONTENT = b'content' * 100

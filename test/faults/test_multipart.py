@@ -92,7 +92,7 @@ def delivered(store: S3Store, item: SpooledObject) -> Put:
 
 
 def left(store: S3Store) -> list[str]:
-    with store._s3.asking(BUCKET, '') as client:
+    with store._client.requesting(BUCKET, '') as client:
         return [upload['Key'] for upload in client.list_multipart_uploads(Bucket=BUCKET).get('Uploads', ())]
 
 

@@ -75,7 +75,7 @@ def store(request: pytest.FixtureRequest, tmp_path: Path, bucket: str) -> Iterat
     opened.close()
     if request.param in {'seaweed', 'obstore'}:  # a server has room for so many buckets
         with suppress(ClientError):
-            owner._s3._client.delete_bucket(Bucket=bucket)
+            owner._client._client.delete_bucket(Bucket=bucket)
 
 
 @pytest.fixture

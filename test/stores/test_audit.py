@@ -63,11 +63,11 @@ def overwrite(store: ObjectStore, item: SpooledObject, body: bytes, *, metadata:
     elif isinstance(store, DirectoryStore):
         store._path(item.bucket, item.key).write_bytes(body)
         if not metadata:
-            store._beside(item.bucket, item.key).unlink()
+            store._metadata_path(item.bucket, item.key).unlink()
     else:
-        plain = store._plain if isinstance(store, ObstoreStore) else store
+        plain = store._s3 if isinstance(store, ObstoreStore) else store
         assert isinstance(plain, S3Store)
-        plain._s3._client.put_object(Bucket=item.bucket, Key=item.key, Body=body, Metadata=said)
+        plain._client._client.put_object(Bucket=item.bucket, Key=item.key, Body=body, Metadata=said)
 
 
 def kinds(found: Audit) -> dict[str, list[str]]:

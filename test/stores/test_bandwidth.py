@@ -99,7 +99,7 @@ def test_the_most_important_body_goes_first_and_starves_nobody() -> None:
 def test_a_body_that_stands_back_goes_after_its_equals() -> None:
     """A part of a slice that was there first gets no more beside a live object than each fourth piece."""
     pace, log = Pace(4.0), list[str]()
-    part = Sender(pace.pieces(bytes(2_000_000), 5, stands_back=True), log, 'part')
+    part = Sender(pace.pieces(bytes(2_000_000), 5, is_background=True), log, 'part')
     part.start()
     until(lambda: log)
     live = Sender(pace.pieces(bytes(300_000), 5), log, 'live')

@@ -213,13 +213,13 @@ def test_a_put_goes_on_with_new_keys(
 def until_read(store: S3Store, key: str) -> None:
     """As if it had been refused before."""
     time_passes(store)
-    keys: Any = store._s3._keys
+    keys: Any = store._client._keys
     keys.renew(keys.generation)
     assert keys.get_frozen_credentials().access_key == key
 
 
 def time_passes(store: S3Store) -> None:
-    keys: Any = store._s3._keys
+    keys: Any = store._client._keys
     keys._read_s = float('-inf')
 
 
@@ -237,7 +237,7 @@ def test_every_refusal_of_keys_reads_them_again(
         server.requests.clear()
         began_s = time.monotonic()
         error_of(CredentialsRejected, lambda: store.put(spool('a', b'x')))
-        assert store._s3.generation == 1
+        assert store._client.generation == 1
         assert len(server.requests) <= 4, 'HEAD and GET for the reason, twice'
         assert time.monotonic() - began_s < 50
 

@@ -48,7 +48,7 @@ def server(request: pytest.FixtureRequest, opened: Callable[..., S3Store]) -> S3
 
 def under_way(store: S3Store, bucket: str) -> list[str]:
     """The keys of the uploads that are neither completed nor aborted."""
-    with store._s3.asking(bucket, '') as client:
+    with store._client.requesting(bucket, '') as client:
         return [upload['Key'] for upload in client.list_multipart_uploads(Bucket=bucket).get('Uploads', ())]
 
 

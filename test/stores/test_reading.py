@@ -75,10 +75,10 @@ def test_a_download_is_the_object(store: ObjectStore, spool: Spool, bucket: str,
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     path = tmp_path / 'out' / 'a.mcap'
-    found = download(store, wanted(bucket), path, tell=told.append)
+    found = download(store, wanted(bucket), path, on_progress=told.append)
     assert path.read_bytes() == CONTENT
     assert found.sha256 == found.info.sha256 == hashlib.sha256(CONTENT).hexdigest()
-    assert found.is_proved
+    assert found.is_verified
     assert sum(told) == len(CONTENT)
     assert list(path.parent.iterdir()) == [path]
 
@@ -88,7 +88,7 @@ def test_a_download_goes_on_where_it_broke_off(store: ObjectStore, spool: Spool,
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(CONTENT[: CHUNK_BYTES + 5])
     told: list[int] = []
-    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=told.append)
+    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=told.append)
     assert sum(told) == len(CONTENT) - CHUNK_BYTES - 5
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
 
@@ -101,7 +101,7 @@ def test_a_download_of_wrong_bytes_is_begun_anew(
     store.put(spool(KEY, CONTENT))
     (tmp_path / 'a.mcap.part').write_bytes(there)
     told = [len(there)]
-    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=told.append)
+    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=told.append)
     assert (tmp_path / 'a.mcap').read_bytes() == CONTENT
     assert sum(told) == len(CONTENT)
 
@@ -114,7 +114,7 @@ def test_what_is_not_what_was_asked_for_is_no_file(
     store.put(spool(KEY, CONTENT))
     told: list[int] = []
     with pytest.raises(ObjectRefused, match='does not match its metadata') as caught:
-        download(store, wanted(bucket, **how), tmp_path / 'a.mcap', tell=told.append)
+        download(store, wanted(bucket, **how), tmp_path / 'a.mcap', on_progress=told.append)
     assert caught.value.data['reason'] == 'damaged'
     assert list(tmp_path.glob('*.mcap*')) == []
     assert sum(told) == 0
@@ -155,7 +155,7 @@ def test_an_object_that_changes_on_its_way_is_begun_anew(store: ObjectStore, spo
             assert store.replace(bucket, KEY, after, known(store, bucket, KEY))
             raise StoreUnavailable('cut')
 
-    download(store, wanted(bucket), tmp_path / 'a.mcap', tell=tell, pause=lambda _: None)
+    download(store, wanted(bucket), tmp_path / 'a.mcap', on_progress=tell, pause=lambda _: None)
     assert (tmp_path / 'a.mcap').read_bytes() == after
     assert told[0] == -told[1] > 0
     assert sum(told) == len(CONTENT)
@@ -176,7 +176,7 @@ def test_a_download_that_ends_early_goes_on(tmp_path: Path) -> None:
     store, pauses = Short(), list[float]()
     found = download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', pause=pauses.append)
     assert (tmp_path / 'file').read_bytes() == b'0123456789'
-    assert (store.asked, len(pauses), found.is_proved) == (3, 2, False)
+    assert (store.asked, len(pauses), found.is_verified) == (3, 2, False)
 
 
 def test_a_store_that_stays_away_keeps_what_came(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from shadowhound_data_logger.core.errors import StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import Put
 from shadowhound_data_logger.stores import s3_puts
 from shadowhound_data_logger.stores.s3 import S3Store
+from shadowhound_data_logger.stores.s3_client import S3Client
 from shadowhound_data_logger.stores.s3_requests import S3Requests, Sent
 
 IMPATIENT = UploadSettings(connect_timeout_s=1.0, read_timeout_s=0.3)
@@ -29,10 +30,10 @@ Faulty = Callable[[], AbstractContextManager[str]]
 FAULTS: dict[str, tuple[Faulty, str]] = {
     'refused': (fake_s3.refused, 'refused the connection'),
     'hung': (fake_s3.hung, 'gave no answer within 0.3 s'),
-    'reset before the answer': (lambda: fake_s3.resetting(b''), 'broke the connection off'),
-    'reset in the answer': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Le'), 'broke the connection off'),
-    'reset in the body': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Length: 1\r\nETag: x\r\n\r\n'), 'broke the'),
-    'reset in an error': (lambda: fake_s3.resetting(b'HTTP/1.1 500 No\r\nContent-Length: 9\r\n\r\n<Error>'), 'broke the'),
+    'reset before the answer': (lambda: fake_s3.resetting(b''), 'closed the connection'),
+    'reset in the answer': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Le'), 'closed the connection'),
+    'reset in the body': (lambda: fake_s3.resetting(b'HTTP/1.1 200 OK\r\nContent-Length: 1\r\nETag: x\r\n\r\n'), 'closed the'),
+    'reset in an error': (lambda: fake_s3.resetting(b'HTTP/1.1 500 No\r\nContent-Length: 9\r\n\r\n<Error>'), 'closed the'),
 }
 
 
@@ -120,16 +121,17 @@ def test_a_large_object_is_streamed(
 @pytest.mark.seaweedfs
 def test_the_server_verifies_the_checksum(seaweed: Tower, spool: Spool, bucket: str) -> None:
     """A SHA-256 that is not the content's is refused by the server, is a reason to send again, and leaves nothing there."""
-    requests = S3Requests(seaweed.store_settings(), QUICK)
-    requests.open()
+    client = S3Client(seaweed.store_settings(), QUICK)
+    client.open()
+    requests = S3Requests(client)
     requests.create_bucket(bucket)
     with_room(lambda: requests.put(spool('first', b'first'), b'first', conditional=True))
     item = spool('a', b'content')
     message = error_of(StoreUnavailable, lambda: requests.put(item, b'CONTENT', conditional=True))
-    assert 'damaged on its way' in message
+    assert 'damaged in transit' in message
     assert requests.head(bucket, 'a') is None
     assert requests.put(item, b'content', conditional=True) is Sent.CREATED
-    requests.close()
+    client.close()
 
 
 def test_https_to_a_plain_port(opened: Callable[..., S3Store]) -> None:

@@ -74,7 +74,7 @@ def test_a_download_ends_where_more_comes_than_was_said(tmp_path: Path) -> None:
 
     store, told = Endless(), list[int]()
     with pytest.raises(ObjectRefused) as caught:
-        download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', tell=told.append)
+        download(store, ObjectInfo('b', 'k', 10, None), tmp_path / 'file', on_progress=told.append)
     assert caught.value.data['why'] == 'it has more than 10 bytes'
     assert (store.sent, sum(told), list(tmp_path.iterdir())) == (6, 0, [])
 

@@ -54,7 +54,7 @@ def test_a_file_that_goes_between_its_check_and_its_sending(
     monkeypatch.setattr(s3_puts, 'chunks', gone)
     with served(FakeS3()) as server:
         store = opened(StoreSettings(endpoint_url=server.url, access_key_id='KEYID', secret_access_key=SECRET))
-        assert 'it is gone' in error_of(ObjectRefused, lambda: store.put(item))
+        assert 'it is missing' in error_of(ObjectRefused, lambda: store.put(item))
 
 
 def test_no_credentials_at_all(
