@@ -92,7 +92,7 @@ class TopicAccount:
     stamps: StampReport | None = None
     """What is unusual about the stamps of its publishers now; None if all are close to the arrival."""
     corrected: Counter[str] = field(default_factory=Counter)
-    """Messages stored after a correction, by fault (``encode/payload``)."""
+    """Messages stored after a correction, by fault (``formats/payload.py``)."""
     publishers: dict[str, Span] = field(default_factory=dict)
     estimated: int = 0
     """Messages in ``received`` without sequence numbers that are covered by a rhythm."""

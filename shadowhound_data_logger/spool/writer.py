@@ -214,7 +214,8 @@ class SpoolWriter:
     def _groups(self, units: Sequence[_Unit], outcomes: Sequence[Outcome]) -> list[_Group]:
         """The groups to commit one by one: as few as possible if the disk has room.
 
-        Otherwise first the outcomes, because their commit frees files; then objects whose files exist and may be evicted; last those that must be written.
+        Otherwise first the outcomes, because their commit frees files; then objects whose files exist and may be evicted; last
+        those that must be written.
         """
         objects = [item for unit in units for item in unit.objects]
         if not objects or self.spool.fits(objects):
