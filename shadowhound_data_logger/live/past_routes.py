@@ -78,7 +78,7 @@ class PastRoutes:
     async def _past(self, request: web.Request) -> web.StreamResponse:
         do, robot = request.match_info['do'], request.query.get('robot', self._robot)
         if do == 'recent' and self._is_of_store:
-            return web.Response(body=b'\x02\0\0\0{}', content_type='application/octet-stream')  # its clock is not the robot's
+            return _nothing()  # its clock is not the robot's
         takes = {'timeline': ('from', 'to'), 'range': ('from', 'to'), 'kept': ('from', 'to'), 'moment': ('at',)}.get(do, ())
         try:
             times = {name: query_ms(request, name) for name in takes}
@@ -87,4 +87,10 @@ class PastRoutes:
         if not is_name(robot) or None in times.values():
             return problem(400, f'{do} takes {" and ".join(("robot", *takes))}')
         more = {name: request.query[name] for name in ('by', 'fit') if name in request.query}
-        return await self.ask(do, robot, {**times, **more})
+        found = await self.ask(do, robot, {**times, **more})
+        return _nothing() if do == 'recent' and found.status != 200 else found  # then the live view starts empty
+
+
+def _nothing() -> web.Response:
+    """A head without items."""
+    return web.Response(body=b'\x02\0\0\0{}', content_type='application/octet-stream')

@@ -80,7 +80,7 @@ class _View:
 
     def is_due(self, now_s: float) -> bool:
         """Whether to look: what would not be shown is left to the middleware, which keeps the newest."""
-        return self._is_each_shown or self._is_gathered or now_s >= self._next_s
+        return self._is_each_shown or now_s >= self._next_s
 
     def shown(self, taken: list[Taken], now_s: float) -> list[Taken]:
         """Those messages that are shown now, of these and of those before."""

@@ -29,7 +29,7 @@ export function Age({ kind, of = kind, children }) {
   const now = shared.link?.now();
   const age = at === undefined || now === null || now === undefined ? null : Math.max(0, now - at);
   if (age === null && of !== 'figures' && lacks(kind)) return children; // the panel says why
-  const isOld = age === null || age > (OLD_MS[kind] ?? Infinity);
+  const isOld = age === null ? OLD_MS[kind] !== undefined : age > (OLD_MS[kind] ?? Infinity); // a log may be silent
   return html`<span class=${`age ${isOld ? 'old' : ''}`} data-age=${of} data-ms=${age === null ? '' : Math.round(age)} title="How long ago the newest message came to the robot’s computer">${age === null ? 'nothing yet' : isOld || age >= 1e4 ? `${span(age / 1000)} old` : `${Math.round(age)} ms`}</span>${children}`;
 }
 
@@ -302,7 +302,7 @@ export function Diagnostics() {
   useItems('diagnostics', (head) => head.topic === chosen('diagnostics') && setRows(rowsOf(head)));
   const level = (row) => Math.min(3, Math.max(0, Number(row[1]) || 0));
   const sorted = [...rows].sort((a, b) => level(b) - level(a) || (String(a[0]) < String(b[0]) ? -1 : 1));
-  return html`<${Panel} title="Diagnostics" kind="diagnostics" className="list"><ul class="rows" data-list="diagnostics">${sorted.map((row) => {
+  return html`<${Panel} title="Diagnostics" kind="diagnostics" className="list"><ul class="rows" hidden=${!rows.length} data-list="diagnostics">${sorted.map((row) => {
     const [kind, word] = LEVELS[level(row)];
     return html`<li key=${String(row[0])}><details><summary><span class=${`mark ${kind}`} role="img" aria-label=${word} title=${word}>${CLASSES[level(row)]}</span> <b>${String(row[0])}</b> ${String(row[2])}</summary>
       <dl>${row[3] ? html`<dt>hardware</dt><dd>${String(row[3])}</dd>` : ''}${(Array.isArray(row[4]) ? row[4] : []).map(([key, value]) => html`<dt>${String(key)}</dt><dd>${String(value)}</dd>`)}</dl></details></li>`;
@@ -318,7 +318,7 @@ export function Log() {
   const now = present.value;
   const shown = rows.filter((row) => row[1] >= least).reverse();
   return html`<${Panel} title="Log" kind="rosout" className="list" tools=${html`<select aria-label="Least severity" title="Lines of this severity and above are shown" value=${least} onChange=${(event) => setLeast(Number(event.target.value))}>
-    ${SEVERITIES.map(([number, word]) => html`<option value=${number}>${word}</option>`)}</select>`}><ul class="rows" data-list="rosout">${shown.map((row) => {
+    ${SEVERITIES.map(([number, word]) => html`<option value=${number}>${word}</option>`)}</select>`}><ul class="rows" hidden=${!shown.length} data-list="rosout">${shown.map((row) => {
     const [, word, kind] = SEVERITIES.find(([number]) => number >= row[1]) ?? SEVERITIES[4];
     return html`<li><small class="when">${now === null ? '' : span(Math.max(0, now - row[0]) / 1000)}</small> <b class=${kind}>${word}</b> <b>${String(row[2])}</b> ${String(row[3])}</li>`;
   })}</ul>${!shown.length && html`<${Why} kind="rosout" also=${connection.value === 'connected' ? 'No line of this severity has come yet.' : ''} />`}</${Panel}>`;
