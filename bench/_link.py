@@ -47,7 +47,7 @@ def in_own_network() -> None:
         os.environ[_INSIDE] = 'yes'
         mapped = [] if os.geteuid() == 0 else ['--user', '--map-root-user']
         os.execvp('unshare', ['unshare', '--net', *mapped, sys.executable, *sys.argv])  # noqa: S606 - this very program
-    _ran('ip', 'link', 'set', 'lo', 'up', 'mtu', str(MTU), 'multicast', 'on')
+    _run('ip', 'link', 'set', 'lo', 'up', 'mtu', str(MTU), 'multicast', 'on')
 
 
 class ShapedLinks:
@@ -63,11 +63,11 @@ class ShapedLinks:
 
     def __enter__(self) -> Self:
         self._thread.start()
-        _ran('tc', 'qdisc', 'add', 'dev', 'lo', 'root', 'handle', '1:', 'htb')  # what has no class is not held back
+        _run('tc', 'qdisc', 'add', 'dev', 'lo', 'root', 'handle', '1:', 'htb')  # what has no class is not held back
         for place, mbps in enumerate(self._mbps, 16):
             port = asyncio.run_coroutine_threadsafe(self._listen(), self._loop).result(10)
             rate, own = f'{mbps}mbit', f'1:{place}'
-            _ran(
+            _run(
                 'tc',
                 'class',
                 'add',
@@ -85,8 +85,8 @@ class ShapedLinks:
                 'burst',
                 BURST,
             )
-            _ran('tc', 'qdisc', 'add', 'dev', 'lo', 'parent', own, 'pfifo', 'limit', str(QUEUE))
-            _ran('tc', 'filter', 'add', 'dev', 'lo', 'parent', '1:', 'protocol', 'ip', 'u32', 'match', 'ip', 'dport', str(port),
+            _run('tc', 'qdisc', 'add', 'dev', 'lo', 'parent', own, 'pfifo', 'limit', str(QUEUE))
+            _run('tc', 'filter', 'add', 'dev', 'lo', 'parent', '1:', 'protocol', 'ip', 'u32', 'match', 'ip', 'dport', str(port),
                  '0xffff', 'flowid', own)  # fmt: skip
             self.urls.append(f'http://127.0.0.1:{port}')
         return self
@@ -123,8 +123,8 @@ class LongWay:
         self.round_s = round_s
         self._device = os.open('/dev/net/tun', os.O_RDWR)
         fcntl.ioctl(self._device, _TUNSETIFF, struct.pack('16sH', FAR_DEVICE.encode(), _IFF_TUN | _IFF_NO_PI))
-        _ran('ip', 'addr', 'add', f'{NEAR}/24', 'dev', FAR_DEVICE)
-        _ran('ip', 'link', 'set', FAR_DEVICE, 'up', 'mtu', str(MTU), 'txqueuelen', '2000')
+        _run('ip', 'addr', 'add', f'{NEAR}/24', 'dev', FAR_DEVICE)
+        _run('ip', 'link', 'set', FAR_DEVICE, 'up', 'mtu', str(MTU), 'txqueuelen', '2000')
         self._packets: deque[tuple[float, bytearray]] = deque()
         self._some = threading.Event()
         for work in (self._take, self._give):
@@ -157,7 +157,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
         writer.close()
 
 
-def _ran(*command: str) -> None:
+def _run(*command: str) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f'{" ".join(command)} failed: {done.stderr.strip()}')

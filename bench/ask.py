@@ -37,7 +37,7 @@ from shadowhound_data_logger.formats.statistics import FieldStatistics, numbers_
 from shadowhound_data_logger.lake import search, values
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import tend
+from shadowhound_data_logger.lake.ingest import maintain
 from shadowhound_data_logger.lake.select import wanted
 from shadowhound_data_logger.lake.tables import TABLES, Tables, arrow_schema
 from shadowhound_data_logger.stores import open_store
@@ -80,7 +80,7 @@ def fill(settings: StoreSettings, store: ObjectStore, folder: Path, objects: int
             dated = made.add_column(0, 'date', pa.array([date] * len(made))).cast(table.schema)
             tables.append(tables.open(table), table, dated)
         progress(f'{min(start + DAY, objects):,} objects')
-    tend(source, tables, Findings())
+    maintain(source, tables, Findings())
     sizes = [pa.table(tables.open(TABLES[of.folder]).get_add_actions(flatten=True))['size_bytes'] for of in (OBJECTS, STATISTICS)]
     return sum(sizes[0].to_pylist()), sum(sizes[1].to_pylist())
 

@@ -40,7 +40,7 @@ from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.ingest import ingest, maintain
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, Tables
 
 DAY_NS: Final = 1_790_812_800 * SECOND
@@ -165,12 +165,12 @@ def _ingested(source: Bucket, tables: Tables) -> dict[str, Any]:
     figures['ingester_peak_mb'] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000)
     progress(f'ingested {found.rows:,} rows in {seconds} s')
     figures |= _files(tables, 'ingested_')
-    figures['merge_s'], tended = _timed(lambda: tend(source, tables, Findings()))
+    figures['merge_s'], tended = _timed(lambda: maintain(source, tables, Findings()))
     figures['merged_files'] = tended.merged
     figures |= _files(tables, 'merged_')
     progress(f'merged {tended.merged:,} files in {figures["merge_s"]} s')
     later = datetime.now(timezone.utc) + timedelta(days=1)
-    figures['expire_s'], tended = _timed(lambda: tend(source, tables, Findings(), now=later))
+    figures['expire_s'], tended = _timed(lambda: maintain(source, tables, Findings(), now=later))
     figures['expired_row_files'] = tended.expired
     progress(f'{tended.expired:,} row files expired in {figures["expire_s"]} s')
     return figures

@@ -159,7 +159,7 @@ def _pull(source: Bucket, arrivals: Arrivals, seconds: float) -> tuple[float, fl
     now_ns = time.time_ns()
     want = KeptFilter(sensor='camera', since_ns=now_ns - ASKED_S * SECOND, until_ns=now_ns)
     began_s = time.monotonic()
-    request = pull.ask(store, source, ROBOT, want, by='bench')
+    request = pull.put_request(store, source, ROBOT, want, by='bench')
     until(lambda: source.list(f'{ROBOT}/camera/'), 'the first second of the video', seconds=300.0)
     begin_s, arrived_s = time.monotonic() - began_s, None
     while time.monotonic() - began_s < seconds and arrived_s is None:

@@ -40,7 +40,7 @@ from shadowhound_data_logger.lake import fetch as fetching
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.ingest import ingest, maintain
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, Tables
 from shadowhound_data_logger.stores import open_reader
 
@@ -171,7 +171,7 @@ def questions(settings: StoreSettings, days: int) -> tuple[list[Bar], dict[str, 
     figures['ingest_s'] = round(time.perf_counter() - began, 1)
     figures['ingested_rows_per_s'] = round(done.rows / figures['ingest_s'])
     began = time.perf_counter()
-    tend(source, tables, Findings())
+    maintain(source, tables, Findings())
     figures['merge_s'] = round(time.perf_counter() - began, 1)
     files = pa.table(tables.open(OBJECT_ROWS).get_add_actions(flatten=True))
     figures['table_bytes'] = sum(files['size_bytes'].to_pylist())

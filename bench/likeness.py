@@ -40,10 +40,10 @@ class Numbers:
 
     name, digest = 'drawn numbers', hashlib.sha256(b'drawn').hexdigest()
 
-    def of_pictures(self, pictures: Any) -> Vectors:
+    def embed_images(self, pictures: Any) -> Vectors:
         raise NotImplementedError
 
-    def of_text(self, text: str) -> Vectors:
+    def embed_text(self, text: str) -> Vectors:
         raise NotImplementedError
 
 

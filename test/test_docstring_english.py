@@ -17,6 +17,7 @@ DONE = (
     'bags/*.py',
     'cli/*.py',
     'formats/**/*.py',
+    'lake/*.py',
     'missions/*.py',
     'policies/*.py',
     'shipping/*.py',

@@ -56,9 +56,11 @@ def main(robot: str, output: str, name: str, count: int, threads: int, seed: int
             if there and not is_blind:
                 since_ns = there[int(place * len(there))] - length_ns // 2
             want = KeptFilter(sensor=sensor, since_ns=since_ns, until_ns=since_ns + length_ns)
-            seen = [row['key'] for row in kept if pull.takes(want, row)]
+            seen = [row['key'] for row in kept if pull.matches(want, row)]
             expiry_ns = SHORT_S * SECOND if is_short else 3600 * SECOND
-            asked = pull.ask(store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns)
+            asked = pull.put_request(
+                store, source, robot, want, by=f'{name}-{number % 3}', priority=priority, expiry_ns=expiry_ns
+            )
             write({'id': asked.id, 'by': asked.by, 'made_ns': asked.made_ns, 'keys': seen})
             if is_cancelled:
                 pull.cancel(store, source, robot, asked.id, by=name)

@@ -275,7 +275,7 @@ class Campaign:
         seen = pull.kept(self._source, ROBOT, want, Findings(lambda _: None))['key'].to_pylist()
         with closing(S3Store(self._tower.store_settings(), UploadSettings())) as store:
             store.open()
-            asked = pull.ask(store, self._source, ROBOT, want, by='here', priority=0, expiry_ns=expiry_ns)
+            asked = pull.put_request(store, self._source, ROBOT, want, by='here', priority=0, expiry_ns=expiry_ns)
         with self._said.open('a', encoding='utf-8') as file:
             file.write(json.dumps({'id': asked.id, 'by': 'here', 'made_ns': asked.made_ns, 'keys': seen}) + '\n')
         return asked.id

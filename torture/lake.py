@@ -50,7 +50,7 @@ import sys, time
 from datetime import timedelta
 from shadowhound_data_logger.lake.bucket import default_source
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.ingest import ingest, maintain
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, Tables, answer, engine
 from shadowhound_data_logger.core.errors import DataLoggerError
 source = default_source()
@@ -58,7 +58,7 @@ while True:
     try:
         tables = Tables.for_ingest(source)
         ingest(source, tables, Findings())
-        tend(source, tables, Findings(), grace=timedelta(seconds=float(sys.argv[1])))
+        maintain(source, tables, Findings(), grace=timedelta(seconds=float(sys.argv[1])))
     except DataLoggerError as error:
         print(error, file=sys.stderr)
         time.sleep(0.5)

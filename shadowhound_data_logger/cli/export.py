@@ -117,7 +117,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, confi
         from shadowhound_data_logger.datasets.transfer import DatasetPlace, catch_up, upload  # noqa: PLC0415
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
         from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
-        from shadowhound_data_logger.lake.pull import bring  # noqa: PLC0415
+        from shadowhound_data_logger.lake.pull import request_and_wait  # noqa: PLC0415
 
         check_name(name, 'the name of the dataset')
         file = export_file.read(config) if config else export_file.ExportFile()
@@ -139,7 +139,7 @@ def export_lerobot(*, name: str, flags: Mapping[str, Any], to: str | None, confi
         source = default_source(the_store_settings())
         if pull and not dry_run:
             with exporting():
-                bring(source, flags, say=bar.say, findings=left_out)
+                request_and_wait(source, flags, say=bar.say, findings=left_out)
         result = library.export(
             folder, source, flags, options, workers=workers, cluster=cluster, wait=wait, is_dry=dry_run,
             findings=left_out, say=bar.say,

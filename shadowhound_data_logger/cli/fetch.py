@@ -75,30 +75,30 @@ def fetch(*, prefix: str | None, flags: Mapping[str, Any], limit: int | None, to
         begun_s = time.monotonic()
         left_out = quietly()
         rows = [] if prefix is not None else _asked(flags, limit, left_out)
-        wishes = list(dict.fromkeys(lake.FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
+        requests = list(dict.fromkeys(lake.FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows))
         if prefix is not None:
-            wishes = lake.under(Bucket(store, bucket), prefix)
-    size = sum(wish.size for wish in wishes)
-    with closing(open_reader(store)) as source, progress(f'0 of {number(len(wishes))} objects', size, of='bytes') as bar:
+            requests = lake.under(Bucket(store, bucket), prefix)
+    size = sum(request.size for request in requests)
+    with closing(open_reader(store)) as source, progress(f'0 of {number(len(requests))} objects', size, of='bytes') as bar:
         here = 0
 
         def tell(size: int, objects: int) -> None:
             nonlocal here
             here += objects
             bar.have(size)
-            bar.say(f'{number(here)} of {number(len(wishes))} objects')
+            bar.say(f'{number(here)} of {number(len(requests))} objects')
 
-        found = lake.fetch(wishes, to, source, verify=deep, threads=THREADS, tell=tell)
+        found = lake.fetch(requests, to, source, verify=deep, threads=THREADS, tell=tell)
         keep_rows(to, [row for row in rows if f'{row["bucket"]}/{row["key"]}' not in found.failed])
     took_s = time.monotonic() - begun_s
     if as_json:
-        told = {'to': str(to), 'asked': len(wishes), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
+        told = {'to': str(to), 'asked': len(requests), 'moved': found.moved, 'present': found.present, 'bytes': found.bytes,
                 'unverified': found.unverified, 'failed': found.failed, 'left_out': [asdict(one) for one in left_out],
                 'took_s': round(took_s, 3)}  # fmt: skip
         print_json(told)
     else:
         where = f'{"" if prefix is None else f"under {prefix} "}in {Bucket(store, bucket).describe()}'
-        print_lines(*_report(found, len(wishes), took_s, to, where))
+        print_lines(*_report(found, len(requests), took_s, to, where))
         report_skipped(left_out)
     return exit_code(finding=found.failed or len(left_out))
 

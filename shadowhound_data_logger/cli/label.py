@@ -205,7 +205,7 @@ def _add(found: Sequence[Label], user: str | None, *, is_json: bool) -> ExitCode
     left_out, source = quietly(), default_source(the_store_settings())
     with asking():
         _check(source, (), robots={each.robot for each in found})
-        kept, absent = labels.timed(source, found, left_out)
+        kept, absent = labels.with_times(source, found, left_out)
         checked = [each.checked() for each in kept]
         with the_store() as store:
             keys = [labels.write(store, robot, some, by=user or _me()) for robot, some in labels.by_robot(checked)]

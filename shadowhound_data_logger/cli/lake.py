@@ -117,7 +117,7 @@ def lake_ingest(*, follow: bool, interval: float, delete_after: int | None, as_j
         try:
             with asking():
                 done = library.ingest(source, tables, left_out)
-                tended = library.tend(source, tables, left_out, grace=grace)
+                tended = library.maintain(source, tables, left_out, grace=grace)
         except StoreUnavailable as error:
             if not follow:
                 raise

@@ -245,7 +245,7 @@ def _said(rows: Rows, found: Audit, lacking: list[Any], earlier: int, *, deep: b
         piled[UNLISTED] = {'count': len(first), 'first': first}
     return {
         'deep': deep, 'known': len(rows), 'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
-        'unproved': rows.unproved(),
+        'unproved': rows.unverified(),
         'findings': piled, 'unreachable': None if found.away is None else str(found.away),
         'ok': found.away is None and not piled and len(rows) > 0,
     }  # fmt: skip

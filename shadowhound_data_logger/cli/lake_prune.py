@@ -73,7 +73,7 @@ def lake_prune(
         from shadowhound_data_logger.lake.row_files import robots  # noqa: PLC0415
 
         keep = library.keep_rules(rules, now_ns)
-        how: dict[str, Any] = {'robot': robot, 'most_bytes': most, 'is_forced': force}
+        how: dict[str, Any] = {'robot': robot, 'max_bytes': most, 'is_forced': force}
     source, left_out = default_source(the_store_settings()), quietly()
     with progress('looking at what there is') as bar:
         made = library.plan(source, keep, exported=_exported(bar.say), findings=left_out, tell=bar.say, **how)
@@ -99,11 +99,11 @@ def lake_prune(
     with the_store(THREADS) as target, progress() as bar:
         done = library.apply(source, target, made, now_ns=now_ns, findings=left_out, tell=bar.say)
     if as_json:
-        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'mended': done.mended})
+        print_json({**_prune_told(made), 'deleted': done.objects, 'deleted_bytes': done.bytes, 'mended': done.resumed})
     else:
         click.echo(f'{number(done.objects)} objects ({volume(done.bytes)}) are deleted.')
-        if done.mended:
-            click.echo(f'So are {number(done.mended)} that an earlier run did not come to.')
+        if done.resumed:
+            click.echo(f'So are {number(done.resumed)} that an earlier run did not come to.')
     return exit_code(finding=made.over_bytes or report_skipped(left_out))
 
 

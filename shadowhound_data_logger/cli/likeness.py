@@ -86,9 +86,9 @@ def most_similar(source: Any, like: Path | None, text: str | None, folder: Path 
     try:
         if like is not None:
             with open_image(like) as opened:
-                wanted = model.of_pictures([opened])[0]
+                wanted = model.embed_images([opened])[0]
         else:
-            wanted = model.of_text(text or '')
+            wanted = model.embed_text(text or '')
     except (OSError, ValueError, SyntaxError) as error:
         raise BadUsage(f'{like or "the text"} cannot be compared: {error}', 'a JPEG, PNG or TIFF is a picture') from error
     found = likeness.like(source, model, wanted, limit=limit, findings=left_out, **flags)

@@ -113,7 +113,7 @@ def pull(*, flags: Mapping[str, Any], bag: str | None, priority: int, expires: i
             answer: RequestAnswer | None = None
             request_id = None
             if not dry_run and offered.objects:
-                request = lake.ask(store, source, robot, want, by=name, priority=priority, expiry_ns=expires)
+                request = lake.put_request(store, source, robot, want, by=name, priority=priority, expiry_ns=expires)
                 request_id = request.id
                 if not as_json:
                     click.echo(f'Requested: request {request.id}.')
@@ -196,7 +196,7 @@ def _want(source: Any, robot: str, flags: Mapping[str, Any], bag: str | None, le
                 f'--bag {bag!r} is not the name of a bag, or another sensor is requested', '`shadowhound-data bag list`'
             )
         sensor, patterns = BAG_SENSOR, (f'{robot}/rosbags/{bag}/*',)
-    asked = labels.labelled(source, asked, left_out)
+    asked = labels.with_label_resolved(source, asked, left_out)
     want = KeptFilter(
         sensor=sensor, topic=asked.topic, since_ns=asked.since_ns, until_ns=asked.until_ns, near=asked.near,
         near_gps=asked.near_gps, mission=asked.mission, mission_type=asked.mission_type, patterns=patterns,

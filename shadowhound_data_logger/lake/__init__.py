@@ -1,9 +1,9 @@
-"""The lake: what is stored, as Delta tables made of the rows that robots write, and how to query it (docs/lake.md).
+"""The lake: Delta tables of all stored objects, built from the rows that robots write, and queries over them (docs/lake.md).
 
-``lake.objects(sensor='camera', since='yesterday')`` is a pyarrow table, ``lake.MissionDataset`` what to train on,
-``lake.known('thor', '/imu', '2h')`` what is there of a time, what is not and why, and what is unknown;
-``lake.log_dataset(run, DIR)`` records in MLflow what a model was trained on.
-The names below load deltalake when they are used: a robot, which writes the rows, needs none of it.
+``lake.objects(sensor='camera', since='yesterday')`` returns a pyarrow table; ``lake.MissionDataset`` is a dataset to train on;
+``lake.known('thor', '/imu', '2h')`` returns what is stored of a time, what is missing and why, and what is unknown;
+``lake.log_dataset(run, DIR)`` records in MLflow which dataset a model was trained on.
+These names load deltalake on first use: a robot, which writes the rows, does not need it.
 """
 
 from __future__ import annotations

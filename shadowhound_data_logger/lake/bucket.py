@@ -1,4 +1,4 @@
-"""The bucket with the data of robots: reads it, as a value that can be passed to another process, and puts row files into it."""
+"""The bucket with the data of robots: a value that reads it and can be passed to other processes. Also uploads row files."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import warn_of
 
 THREADS: Final = 16
-"""Requests at a time; each spends most of its time waiting for the server."""
+"""Concurrent requests; each spends most of its time waiting for the server."""
 _Answer = TypeVar('_Answer')
 
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """Reads and lists one bucket with the calls of ``stores/base.py``, each with some tries.
+    """Reads and lists one bucket with the calls of ``stores/base.py``, each with retries.
 
-    Thread-safe; its repr shows no secret. Raises only StoreError, or SettingError for settings that no request can be sent with.
+    Thread-safe; its repr shows no secret. Raises only StoreError, or SettingError for unusable settings.
     """
 
     settings: StoreSettings = field(repr=False)
     name: str
 
     def describe(self) -> str:
-        """Where it is, for a message; contains no secret."""
+        """The location of the bucket, for messages; contains no secret."""
         return f'the bucket {self.name} {"of" if self.settings.endpoint_url else "in"} {_reader(self.settings).describe()}'
 
     def folders(self, prefix: str) -> Sequence[str]:
@@ -72,9 +72,9 @@ def default_source(settings: StoreSettings | None = None) -> Bucket:
 
 
 def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -> None:
-    """Put a row file into the store; returns when it is there. Raises StoreError.
+    """Upload a row file; returns when it is stored. Raises StoreError.
 
-    Its key follows from its rows: a file that is there already has the same rows, and is not overwritten.
+    The key is derived from the rows: a file that already exists has the same rows, and is not overwritten.
     """
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
         path = Path(folder, 'part')
@@ -84,11 +84,11 @@ def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -
             id=0, bucket=BUCKET, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
             content_type=CONTENT_TYPE, metadata=metadata, priority=5, created_ns=time.time_ns(),
         )  # fmt: skip
-        with suppress(ForeignObject):  # written by another version of the library, or in another order
+        with suppress(ForeignObject):  # the same rows, written by another version of the library or in another order
             store.put(item)
 
 
 @lru_cache(maxsize=16)
 def _reader(settings: StoreSettings) -> ObjectStore:
-    """One per process: it holds the connections."""
+    """One reader per process, because it owns the connections."""
     return open_reader(settings)

@@ -1,7 +1,7 @@
-"""What robots stored as a data set to train on: aligned samples of numpy arrays, by number or streamed, from a store or a folder.
+"""Datasets of what robots stored, to train on: aligned samples of numpy arrays, by index or streamed, from a store or a folder.
 
-It works with ``torch.utils.data.DataLoader`` and does not import torch. The catalogue is asked once, when a data set is made;
-then any number of processes, forked or spawned, read objects and nothing else.
+Works with ``torch.utils.data.DataLoader`` without importing torch. The catalog is queried once, when a dataset is created; after
+that, any number of processes, forked or spawned, only read objects.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.bucket import Bucket
 
 THREADS: Final = 8
-"""Requests on their way at a time, in each process."""
-AHEAD_BYTES: Final = 32 << 20
-"""Of objects that were asked for before they are needed, in each process."""
-AHEAD: Final = 64
-"""Objects likewise."""
-KEEP_BYTES: Final = 32 << 20
-"""Of contents that were needed and may be once more, in each process."""
+"""Concurrent requests per process."""
+PREFETCH_BYTES: Final = 32 << 20
+"""Limit for prefetched objects per process."""
+PREFETCH_OBJECTS: Final = 64
+"""The same limit in objects."""
+CACHE_BYTES: Final = 32 << 20
+"""Contents per process that are kept after use, because they may be needed again."""
 
 
 class MissionDataset:
@@ -45,7 +45,7 @@ class MissionDataset:
     (x, y, yaw), ``battery_pct``; for each aligned sensor NAME its values, ``NAME_ok`` (whether there is one; for a window one per
     row) and ``NAME_dt_s`` (how much later than the anchor it was). Missing values are NaN, a missing cloud has no points.
 
-    It can be pickled for the workers of a DataLoader: no socket, thread or content goes with it.
+    It can be pickled for the workers of a DataLoader, without sockets, threads and contents.
     """
 
     def __init__(
@@ -76,16 +76,16 @@ class MissionDataset:
 
         if 'sensor' in flags:
             raise SettingError('sensor', flags['sensor'], 'anchor="camera" instead')
-        self.aligned = {name: _way(name, how, causal=causal) for name, how in (align or {}).items()}
+        self.aligned = {name: _alignment(name, how, causal=causal) for name, how in (align or {}).items()}
         self._place, asked = selecting.place(source)
         self._lake = asked
-        self.left_out = Findings()
+        self.skipped = Findings()
         """Rows and files of the catalog that were skipped because they are invalid. Empty in a worker process."""
         if pull:
-            selecting.pull(asked, source, (anchor, *self.aligned), flags, self.left_out)
-        self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.left_out)
+            selecting.pull(asked, source, (anchor, *self.aligned), flags, self.skipped)
+        self._selection = selecting.select(asked, anchor, self.aligned, size, flags, self.skipped)
         self._drop_incomplete = drop_incomplete
-        self._chosen = [self._complete(track) for track in self._selection.anchors]
+        self._chosen = [self._complete_objects(track) for track in self._selection.anchors]
         counts = [track.count[chosen] for track, chosen in zip(self._selection.anchors, self._chosen, strict=True)]
         self._ends = np.cumsum(np.concatenate([np.empty(0, np.int64), *counts]))
         self._reading: tuple[int, Prefetch, Samples] | None = None
@@ -94,11 +94,11 @@ class MissionDataset:
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __getitem__(self, index: int) -> AlignedSample:
-        return self._samples().sample(*self._at(self._reference(index)))
+        return self._samples().sample(*self._location(self._reference(index)))
 
     def __getitems__(self, indices: Sequence[int]) -> list[AlignedSample]:
         """Several at once, whose objects are read at the same time; torch's DataLoader asks for whole batches so."""
-        wanted = [self._at(self._reference(index)) for index in indices]
+        wanted = [self._location(self._reference(index)) for index in indices]
         objects = [each for track, number, _ in wanted for each in self._selection.needed(track, number)]
         samples = self._samples()
         assert self._reading is not None
@@ -143,7 +143,7 @@ class MissionDataset:
 
         tracks = zip(self._selection.anchors, self._chosen, strict=True)
         return selecting.labels_of(
-            self._lake, [(track, int(number)) for track, chosen in tracks for number in chosen], self.left_out
+            self._lake, [(track, int(number)) for track, chosen in tracks for number in chosen], self.skipped
         )
 
     def stream(self, *, shuffle: bool = False, seed: int = 0, rank: int = 0, ranks: int = 1) -> MissionStream:
@@ -160,31 +160,31 @@ class MissionDataset:
     def streamed(self, share: tuple[int, int], seed: int | None, epoch: int) -> Iterator[AlignedSample]:
         """One share (number, total) of one epoch; ``MissionStream`` calls it."""
         references = shards.order(self._selection.anchors, self._chosen, share=share, seed=seed, epoch=epoch)
-        with Prefetch(self._place.read, KEEP_BYTES, THREADS) as prefetch:
+        with Prefetch(self._place.read, CACHE_BYTES, THREADS) as prefetch:
             samples = Samples(self._selection, prefetch)
             waiting: deque[tuple[shards.Reference, tuple[Object, ...]]] = deque()
             while True:
-                self._go_ahead(references, waiting, prefetch)
+                self._prefetch(references, waiting, prefetch)
                 if not waiting:
                     return
                 reference, objects = waiting.popleft()
-                sample = samples.sample(*self._at(reference))
+                sample = samples.sample(*self._location(reference))
                 if not waiting or waiting[0][0][:2] != reference[:2]:
                     prefetch.settle(objects)
                 if not self._drop_incomplete or is_complete(sample, self.aligned):
                     yield sample
 
-    def _go_ahead(self, references: Iterator[shards.Reference], waiting: deque[tuple[shards.Reference, tuple[Object, ...]]],
+    def _prefetch(self, references: Iterator[shards.Reference], waiting: deque[tuple[shards.Reference, tuple[Object, ...]]],
                   prefetch: Prefetch) -> None:  # fmt: skip
-        """At least one reference waits afterwards, if there are any."""
-        while not waiting or (len(waiting) < AHEAD and prefetch.waiting_bytes < AHEAD_BYTES):
+        """Request objects in advance; at least one reference waits afterwards, unless there are no more."""
+        while not waiting or (len(waiting) < PREFETCH_OBJECTS and prefetch.waiting_bytes < PREFETCH_BYTES):
             reference = next(references, None)
             if reference is None:
                 return
             if waiting and waiting[-1][0][:2] == reference[:2]:
                 objects = waiting[-1][1]
             else:
-                objects = tuple(self._selection.needed(*self._at(reference)[:2]))
+                objects = tuple(self._selection.needed(*self._location(reference)[:2]))
             prefetch.ahead(objects)
             waiting.append((reference, objects))
 
@@ -194,11 +194,11 @@ class MissionDataset:
             self._reading[1].close()
             self._reading = None
 
-    def _complete(self, track: Track) -> NDArray[np.intp]:
+    def _complete_objects(self, track: Track) -> NDArray[np.intp]:
         every = np.arange(len(track))
         if not self._drop_incomplete:
             return every
-        return np.array([number for number in every if self._selection.can_be_complete(track, int(number))], np.intp)
+        return np.array([number for number in every if self._selection.has_aligned_data(track, int(number))], np.intp)
 
     def _reference(self, index: int) -> shards.Reference:
         if not -len(self) <= index < len(self):
@@ -212,13 +212,13 @@ class MissionDataset:
             place -= len(chosen)
         raise AssertionError('unreachable')
 
-    def _at(self, reference: shards.Reference) -> tuple[Track, int, int]:
+    def _location(self, reference: shards.Reference) -> tuple[Track, int, int]:
         return self._selection.anchors[reference.track], reference.number, reference.member
 
     def _samples(self) -> Samples:
-        """Of this process: what a parent had is useless in its child."""
+        """The reader of this process: a child cannot use its parent's."""
         if self._reading is None or self._reading[0] != os.getpid():
-            prefetch = Prefetch(self._place.read, KEEP_BYTES, THREADS)
+            prefetch = Prefetch(self._place.read, CACHE_BYTES, THREADS)
             self._reading = os.getpid(), prefetch, Samples(self._selection, prefetch)
         return self._reading[2]
 
@@ -234,7 +234,7 @@ class MissionStream:
         self._seed = seed
         self._part = part
         self._epoch = 0
-        _be_iterable()
+        _register_as_iterable()
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next iteration.
@@ -250,16 +250,16 @@ class MissionStream:
         return self._dataset.streamed(share, self._seed, epoch)
 
 
-def _way(name: str, how: float | Near | Window, *, causal: bool) -> Near | Window:
-    """Raises SettingError for a window into the future of a causal data set."""
+def _alignment(name: str, how: float | Near | Window, *, causal: bool) -> Near | Window:
+    """Raises SettingError for a window into the future of a causal dataset."""
     found = how if isinstance(how, (Near, Window)) else Near(float(how))
     if causal and isinstance(found, Window) and found.after_s > 0:
-        raise SettingError(f'align[{name!r}]', how, 'a window with after_s=0 in a causal data set')
+        raise SettingError(f'align[{name!r}]', how, 'a window with after_s=0 in a causal dataset')
     return replace(found, is_causal=True) if causal and isinstance(found, Near) else found
 
 
-def _be_iterable() -> None:
-    """A DataLoader asks what something is by torch's class; where torch is loaded, ours is one of those."""
+def _register_as_iterable() -> None:
+    """A DataLoader recognizes iterable datasets by torch's class: register ours if torch is loaded."""
     loading = sys.modules.get('torch.utils.data')
     if loading is not None:
         loading.IterableDataset.register(MissionStream)

@@ -1,6 +1,6 @@
-"""The contents of objects as numpy arrays: images, clouds, archives and the numbers of JSON, in the formats of docs/formats.md.
+"""Decodes objects to numpy arrays: images, clouds, archives and the numbers in JSON, in the formats of docs/formats.md.
 
-Whatever cannot be read is a LakeError; nothing is unpacked to the disk.
+Invalid content raises LakeError. Nothing is unpacked to disk.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ POINT: Final = ('x', 'y', 'z', 'intensity')
 _ZIP_ENTRY: Final = b'PK\x01\x02'
 _JPEG: Final = b'\xff\xd8'
 _DATA: Final = b'\nDATA '
-_MOST_HEADER: Final = 1 << 16
-_MOST_POINTS: Final = 1 << 22
-"""Of a cloud; a lidar of the Go2 has some 20,000."""
-_MOST_JSON_BYTES: Final = 32 << 20
-"""A batch is closed after 4 MiB of messages; as objects of Python it is 24 times as large."""
+_MAX_HEADER: Final = 1 << 16
+_MAX_POINTS: Final = 1 << 22
+"""Per cloud; the Go2's lidar has about 20,000."""
+_MAX_JSON_BYTES: Final = 32 << 20
+"""A batch is closed after 4 MiB of messages; as Python objects it is 24 times as large."""
 _BROKEN: Final = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, tarfile.TarError, zipfile.BadZipFile,
                   NotImplementedError, RuntimeError, zlib.error, ArithmeticError, MemoryError, SyntaxError)  # fmt: skip
-"""What the readers raise for content that is no such thing; RuntimeError is a zip with a password, SyntaxError Pillow's."""
+"""What the readers raise for invalid content: RuntimeError for a zip with a password, SyntaxError by Pillow."""
 
 _POSE: Final = (*(f'position.{axis}' for axis in 'xyz'), *(f'orientation.{axis}' for axis in 'xyzw'))
 _TWIST: Final = ('linear', 'angular')
 ODOMETRY: Final = (*_POSE, *(f'{kind}_velocity.{axis}' for kind in _TWIST for axis in 'xyz'))
-"""13: metres, quaternion, m/s, rad/s; of the short document, which names them so, and of the whole message alike."""
+"""13 fields: meters, quaternion, m/s, rad/s. These are the names in the short document; they also work for the full message."""
 _WHOLE_ODOMETRY: Final = (
     *(f'pose.pose.{name}' for name in _POSE),
     *(f'twist.twist.{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
@@ -62,7 +62,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     'go2_interfaces/msg/LowState': ('bms_state.soc', 'power_v', 'power_a'),
     'geometry_msgs/msg/Twist': tuple(f'{kind}.{axis}' for kind in _TWIST for axis in 'xyz'),
 }  # fmt: skip
-"""Type -> fields where none are asked for; of other types all numbers. An IMU is rad/s, m/s^2 and the quaternion w x y z."""
+"""Type -> default fields; for other types all numbers. An IMU has rad/s, m/s^2 and the quaternion w x y z."""
 _UNKNOWN: Final[Mapping[str, Mapping[str, str]]] = {
     'sensor_msgs/msg/Imu': {
         name: f'{name}_covariance' for name in ('orientation', 'angular_velocity', 'linear_acceleration')
@@ -73,7 +73,7 @@ _UNKNOWN: Final[Mapping[str, Mapping[str, str]]] = {
 
 
 STEADY_NS: Final = SECOND // 10
-"""In an object whose first and last message have offsets that differ by less, the offset is constant."""
+"""If the offsets of an object's first and last message differ by less, the offset is constant."""
 
 
 class ArchiveMember(NamedTuple):
@@ -86,7 +86,7 @@ class ArchiveMember(NamedTuple):
 
 
 def extension_of(key: str) -> str:
-    """Of a key or a member, in lower case, without the dot."""
+    """The extension of a key or member, in lower case, without the dot."""
     return key.rpartition('/')[2].rpartition('.')[2].lower()
 
 
@@ -103,7 +103,7 @@ def image(body: bytes, size: tuple[int, int] | None = None) -> NDArray[Any]:
     try:
         return _jpeg(body, size) if body.startswith(_JPEG) else _pillow(body, size)
     except _BROKEN as error:
-        raise LakeError(f'this is not an image that can be read: {error}') from error
+        raise LakeError(f'the image cannot be read: {error}') from error
 
 
 def _jpeg(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
@@ -117,25 +117,25 @@ def _jpeg(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
 
 
 def _resized(pixels: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
-    from PIL import Image  # noqa: PLC0415 - only for sizes that a JPEG does not come in
+    from PIL import Image  # noqa: PLC0415 - only for sizes to which a JPEG cannot be decoded directly
 
     return np.array(Image.fromarray(pixels).resize(size[::-1], Image.Resampling.BOX))
 
 
 def _pillow(body: bytes, size: tuple[int, int] | None) -> NDArray[Any]:
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # of a damaged file Pillow warns before it raises
+        warnings.simplefilter('ignore')  # for a damaged file Pillow warns before it raises
         with open_image(body) as opened:
             plain = opened.mode in {'I;16', 'I', 'F'}
             pixels = np.array(opened if plain else opened.convert('RGB'))
-            if opened.mode == 'I':  # what older Pillows make of 16 bits
+            if opened.mode == 'I':  # older Pillows open 16-bit images in this mode
                 pixels = pixels.astype(np.uint16)
     if size is None or pixels.shape[:2] == size:
         return pixels
     if not plain:
         return _resized(pixels, size)
-    rows, columns = (np.arange(wish) * have // wish for wish, have in zip(size, pixels.shape[:2], strict=True))
-    return np.array(pixels[rows][:, columns])  # a mean of depths lies on neither surface
+    rows, columns = (np.arange(wanted) * have // wanted for wanted, have in zip(size, pixels.shape[:2], strict=True))
+    return np.array(pixels[rows][:, columns])  # not averaged: a mean of two depths is on neither surface
 
 
 def cloud(body: bytes) -> NDArray[np.float32]:
@@ -156,14 +156,14 @@ def cloud_points(body: bytes) -> NDArray[Any]:
 
 
 def _points(body: bytes) -> NDArray[Any]:
-    at = body.index(_DATA, 0, _MOST_HEADER) + len(_DATA)
+    at = body.index(_DATA, 0, _MAX_HEADER) + len(_DATA)
     end = body.index(b'\n', at, at + 64)
     if body[at:end].strip() != b'binary':
-        raise ValueError(f'its data are {body[at:end][:30]!r}, not binary')
+        raise ValueError(f'its data is {body[at:end][:30]!r}, not binary')
     lines = (line.split() for line in body[:at].decode('ascii').splitlines() if not line.startswith('#'))
     header = {line[0]: line[1:] for line in lines if line}
     points = int(header['POINTS'][0])
-    if not 0 <= points <= _MOST_POINTS:
+    if not 0 <= points <= _MAX_POINTS:
         raise ValueError(f'it claims {points:,} points')
     fields = zip(
         header['FIELDS'], header['TYPE'], header['SIZE'], header.get('COUNT', ['1'] * len(header['FIELDS'])), strict=True
@@ -185,14 +185,14 @@ def _cloud(body: bytes) -> NDArray[np.float32]:
 def records(body: bytes) -> list[dict[str, Any]]:
     """The messages of a JSON object: the samples of a batch, or its one document as a list. Raises LakeError."""
     try:
-        check_size(len(body), _MOST_JSON_BYTES)
+        check_size(len(body), _MAX_JSON_BYTES)
         document = shallow(orjson.loads(body))
         found = document.get('samples', [document])
         if not all(isinstance(each, dict) and _is_stamp(each['stamp_ns']) for each in found):
             raise ValueError('a sample has no stamp')
         return list(found)
     except (*_BROKEN, AttributeError) as error:
-        raise LakeError(f'this is not JSON of a sensor: {error}') from error
+        raise LakeError(f"this is not a sensor's JSON: {error}") from error
 
 
 def members(body: bytes, extension: str) -> list[ArchiveMember]:
@@ -200,18 +200,18 @@ def members(body: bytes, extension: str) -> list[ArchiveMember]:
     try:
         return list(_members(dict(_tar(body) if extension == 'tar' else _zip(body))))
     except _BROKEN as error:
-        raise LakeError(f'this is no {extension} that can be read: {error}') from error
+        raise LakeError(f'the {extension} cannot be read: {error}') from error
 
 
 def _members(files: dict[str, bytes]) -> Iterator[ArchiveMember]:
     contents = {name.partition('.')[0]: name for name in files if not name.endswith('.json')}
     for name, body in files.items():
         if name.endswith('.json'):
-            told = shallow(orjson.loads(body))
-            if not isinstance(told, dict) or not _is_stamp(told['stamp_ns']):
+            info = shallow(orjson.loads(body))
+            if not isinstance(info, dict) or not _is_stamp(info['stamp_ns']):
                 raise ValueError(f'{name} has no stamp')
-            holder = told.get('repeat_of') or contents[name[:-5]]
-            yield ArchiveMember(told['stamp_ns'], files[holder], extension_of(holder))
+            content = info.get('repeat_of') or contents[name[:-5]]
+            yield ArchiveMember(info['stamp_ns'], files[content], extension_of(content))
 
 
 def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:
@@ -220,7 +220,7 @@ def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:
         for number, entry in enumerate(packed):
             left -= entry.size if entry.isreg() else 0
             if number >= MOST_MEMBERS or left < 0:
-                raise ValueError('it claims more files, or larger ones, than there is room for in it')
+                raise ValueError('it claims more or larger files than it has bytes for')
             content = packed.extractfile(entry) if entry.isreg() else None
             if content is not None:
                 yield entry.name, content.read()
@@ -232,7 +232,7 @@ def _zip(body: bytes) -> Iterator[tuple[str, bytes]]:
     with zipfile.ZipFile(BytesIO(body)) as packed:
         entries = packed.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-            raise ValueError('its files are packed; those of a robot are stored as they are')
+            raise ValueError('its files are compressed; a robot stores them uncompressed')
         check_size(sum(entry.file_size for entry in entries), len(body))
         for entry in entries:
             yield entry.filename, packed.read(entry)
@@ -261,11 +261,11 @@ class Table:
 
 
 def arrivals(times_ns: NDArray[np.int64], first_ns: int, last_ns: int) -> NDArray[np.int64]:
-    """When the messages of an object arrived, in their stored order, if the first and the last of them arrived at these times.
+    """The arrival times of an object's messages, in stored order, from those of the first and the last message.
 
-    ``times_ns`` are their stamps, all moved by as much as the first arrived later. If that fits the last one, they are their
-    arrivals; otherwise the offset changed (a stamp is stuck, a queue was held up), and the arrivals are evenly spread. Where the
-    two are the same, the last one is unknown.
+    ``times_ns`` are the stamps, shifted by the delay of the first message. If the last one matches its arrival, they are the
+    arrivals; otherwise the delay changed (a stuck stamp, a blocked queue), and the arrivals are spread evenly. If first and last
+    are equal, the last arrival is unknown.
     """
     if len(times_ns) < 2 or last_ns <= first_ns or abs(int(times_ns.max()) - last_ns) <= STEADY_NS:
         return times_ns
@@ -304,12 +304,12 @@ def table(samples: Sequence[Mapping[str, Any]], kind: str, fields: Sequence[str]
 
 
 def marker_of(kind: str, field: str) -> str | None:
-    """The field of which the first element is -1 where this one has no value; None if the type has no such mark."""
+    """The field whose first element is -1 if the given field has no value; None if the type has no such mark."""
     return _UNKNOWN.get(kind, {}).get(field.partition('.')[0])
 
 
 def whole_odometry(fields: Sequence[str]) -> tuple[str, ...]:
-    """Fields of the short document of odometry (``ODOMETRY``) as the whole message names them; others as they are."""
+    """Translate fields of the short odometry document (``ODOMETRY``) to those of the full message; others are unchanged."""
     return tuple(_WHOLE.get(name, name) for name in fields)
 
 
@@ -320,7 +320,7 @@ def _of_type(samples: Sequence[Mapping[str, Any]], kind: str) -> tuple[str, ...]
 
 
 def _numbers(path: str, value: Any) -> Iterator[str]:
-    """The paths of all numbers of a message, in its order; of texts, and of lists that are not numbers, none."""
+    """The paths of all numbers in a message, in its order, without texts and lists of other values."""
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if not (path or name not in {'stamp_ns', 'header', 'robot', 'non_finite'}):
@@ -336,7 +336,7 @@ def _numbers(path: str, value: Any) -> Iterator[str]:
 
 
 def _is_number(value: Any) -> bool:
-    """Of JSON: null is NaN, and infinities are texts."""
+    """Whether a JSON value is a number: null is NaN, and infinities are texts."""
     return value is None or isinstance(value, (int, float)) or (isinstance(value, str) and value in INFINITE)
 
 

@@ -1,6 +1,7 @@
-"""Downloads objects into a folder: in parallel, each verified by its SHA-256; a file is complete or absent, and is moved once.
+"""Downloads objects into a folder in parallel, each verified by its SHA-256. A file is complete or absent.
 
-It can be killed at any moment and continues there. The path of a file is its key: ``DIR/thor/camera/20261121/120000_front.jpg``.
+It can be killed at any moment; the next run continues. The path of a file is its key:
+``DIR/thor/camera/20261121/120000_front.jpg``.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from shadowhound_data_logger.stores.download import download
 THREADS: Final = 16
 AHEAD: Final = 8
 """Objects queued per thread: enough to keep it busy, few enough to stop promptly on an interrupt."""
-NOTE_S: Final = 1.0
-"""At most so much is hashed again after a kill."""
+RECORD_INTERVAL_S: Final = 1.0
+"""After a kill, only the downloads of this time are hashed again."""
 _NO_DISK: Final = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
-AWAY: Final = 8
-"""Consecutive objects for which the store does not answer: it is unreachable, and the others are not tried."""
+MAX_UNANSWERED: Final = 8
+"""After this many consecutive failures the store counts as unreachable, and the other objects are not tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,54 +45,55 @@ class FetchRequest:
     key: str
     size: int
     sha256: str | None = None
-    """From its row; None: that of the object's metadata."""
+    """From the object's row; None: use that of the object's metadata."""
     etag: str = ''
     """From a listing."""
 
 
 @dataclass(slots=True)
 class FetchResult:
-    """The outcome of the requests so far: each is in one of the first three."""
+    """The result of the requests so far: each counts in one of the first three."""
 
     moved: int = 0
     present: int = 0
-    """They were complete already."""
+    """Objects that were already complete in the folder."""
     failed: dict[str, str] = field(default_factory=dict)
     """``bucket/key`` -> why."""
     bytes: int = 0
-    """Of the objects that were moved."""
+    """Bytes of the downloaded objects."""
     unverified: int = 0
-    """Moved objects whose SHA-256 is unknown: only their sizes were compared."""
+    """Downloaded objects whose SHA-256 is unknown: only their sizes were compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Done:
     file: Verified
     moved: bool
-    proved: bool
+    verified: bool
 
 
 def under(source: Bucket, prefix: str) -> list[FetchRequest]:
-    """All objects whose keys start with the prefix, also those whose keys are not paths. Raises StoreError."""
+    """All objects whose keys start with the prefix, including those whose keys are not paths. Raises StoreError."""
     odd: list[FetchRequest] = []
     found = source.list(prefix, lambda bucket, key: odd.append(FetchRequest(bucket, key, 0)))
     return [*(FetchRequest(source.name, entry.key, entry.size, etag=entry.etag) for entry in found), *odd]
 
 
 def fetch(
-    wishes: Sequence[FetchRequest], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
+    requests: Sequence[FetchRequest], folder: Path, store: ObjectStore, *, verify: bool = False, threads: int = THREADS,
     tell: Callable[[int, int], None] = lambda _bytes, _objects: None,
 ) -> FetchResult:  # fmt: skip
-    """Download them; ``verify`` also reads the files that are there already. ``tell`` is called with the result, from any thread.
+    """Download objects; ``verify`` also reads the files that are already in the folder.
 
-    Raises StoreError if the store rejects all requests or is unreachable, LakeError if the folder cannot be written.
+    The callback receives the progress since its last call, in bytes and objects, from any thread. Raises StoreError if the store
+    rejects all requests or is unreachable, LakeError if the folder cannot be written.
     """
     with Fetched(folder) as fetched, ThreadPoolExecutor(threads, 'fetch') as pool:
-        return _Fetch(fetched, store, tell, verify=verify).run(wishes, pool, threads * AHEAD)
+        return _Fetch(fetched, store, tell, verify=verify).run(requests, pool, threads * AHEAD)
 
 
 class _Fetch:
-    """One run. The calling thread decides and records; the pool downloads."""
+    """One run. The calling thread decides and records; the threads of the pool download."""
 
     def __init__(self, fetched: Fetched, store: ObjectStore, tell: Callable[[int, int], None], *,
                  verify: bool) -> None:  # fmt: skip
@@ -101,17 +103,18 @@ class _Fetch:
         self._verify = verify
         self._numbers = count()
         self._over = threading.Event()
-        self._fresh: list[Verified] = []
-        self._noted_s = time.monotonic()
-        self._silent = 0
+        self._unrecorded: list[Verified] = []
+        self._recorded_s = time.monotonic()
+        self._unanswered = 0
         self.result = FetchResult()
 
-    def run(self, wishes: Sequence[FetchRequest], pool: ThreadPoolExecutor, ahead: int) -> FetchResult:
+    def run(self, requests: Sequence[FetchRequest], pool: ThreadPoolExecutor, ahead: int) -> FetchResult:
         done: SimpleQueue[tuple[FetchRequest, Future[_Done]]] = SimpleQueue()
         under_way = 0
         try:
-            for wish in self._wanting(wishes):
-                pool.submit(self._download, wish).add_done_callback(lambda future, wish=wish: done.put((wish, future)))  # type: ignore[misc]
+            for request in self._missing(requests):
+                pending = pool.submit(self._download, request)
+                pending.add_done_callback(lambda future, request=request: done.put((request, future)))  # type: ignore[misc]
                 under_way += 1
                 while under_way >= ahead:
                     self._settle(*done.get())
@@ -121,49 +124,49 @@ class _Fetch:
         finally:
             self._over.set()
             pool.shutdown(cancel_futures=True)
-            self._note()
+            self._record()
         return self.result
 
-    def _wanting(self, wishes: Sequence[FetchRequest]) -> Iterator[FetchRequest]:
-        """Those that are not known to be in the folder."""
+    def _missing(self, requests: Sequence[FetchRequest]) -> Iterator[FetchRequest]:
+        """The requests whose objects are not known to be in the folder."""
         seen: set[str] = set()
-        for wish in dict.fromkeys(wishes):  # the rows of repeats name one object
-            if (refusal := _refusal(wish)) or wish.key in seen:
-                self._fail(wish, refusal or 'another bucket has the same key: fetch it elsewhere')
+        for request in dict.fromkeys(requests):  # the rows of repeats name one object
+            if (refusal := _refusal(request)) or request.key in seen:
+                self._fail(request, refusal or 'another bucket has the same key: fetch it into another folder')
                 continue
-            seen.add(wish.key)
-            known = None if self._verify else self._fetched.verified(wish.key)
-            if known is not None and _is(known, wish):
+            seen.add(request.key)
+            known = None if self._verify else self._fetched.verified(request.key)
+            if known is not None and _is(known, request):
                 self.result.present += 1
-                self._tell(wish.size, 1)
+                self._tell(request.size, 1)
             else:
-                yield wish
+                yield request
 
-    def _settle(self, wish: FetchRequest, future: Future[_Done]) -> None:
-        """Count one. Raises errors that concern all of them."""
+    def _settle(self, request: FetchRequest, future: Future[_Done]) -> None:
+        """Count one result. Raises errors that affect all requests."""
         try:
             self._count(future.result())
         except (ObjectRefused, AccessDenied, BucketMissing) as error:
-            self._fail(wish, error.data.get('why') or str(error))
+            self._fail(request, error.data.get('why') or str(error))
         except StoreUnavailable as error:
-            self._silent += 1
-            if self._silent >= AWAY:
+            self._unanswered += 1
+            if self._unanswered >= MAX_UNANSWERED:
                 raise
-            self._fail(wish, str(error))
+            self._fail(request, str(error))
         except OSError as error:
             if error.errno in _NO_DISK:
                 raise LakeError(f'{self._fetched.folder} cannot be written: {error.strerror}', remedy=UNWRITABLE) from error
-            self._fail(wish, error.strerror or type(error).__name__)
-        if time.monotonic() - self._noted_s > NOTE_S:
-            self._note()
+            self._fail(request, error.strerror or type(error).__name__)
+        if time.monotonic() - self._recorded_s > RECORD_INTERVAL_S:
+            self._record()
 
-    def _fail(self, wish: FetchRequest, why: str) -> None:
-        self.result.failed[f'{wish.bucket}/{wish.key}'] = why
+    def _fail(self, request: FetchRequest, why: str) -> None:
+        self.result.failed[f'{request.bucket}/{request.key}'] = why
 
     def _count(self, done: _Done) -> None:
-        self._silent = 0
-        if done.proved:
-            self._fresh.append(done.file)
+        self._unanswered = 0
+        if done.verified:
+            self._unrecorded.append(done.file)
         else:
             self.result.unverified += 1
         if done.moved:
@@ -172,70 +175,74 @@ class _Fetch:
         else:
             self.result.present += 1
 
-    def _note(self) -> None:
-        self._fetched.note(self._fresh)
-        self._fresh = []
-        self._noted_s = time.monotonic()
+    def _record(self) -> None:
+        self._fetched.record(self._unrecorded)
+        self._unrecorded = []
+        self._recorded_s = time.monotonic()
 
     # -- on the threads of the pool --------------------------------------------------------------------------------
 
-    def _download(self, wish: FetchRequest) -> _Done:
-        path = self._fetched.path(wish.key)
-        held = self._held(wish, path)
+    def _download(self, request: FetchRequest) -> _Done:
+        path = self._fetched.path(request.key)
+        held = self._held(request, path)
         if held is None:
-            return self._move(wish, path)
-        self._tell(wish.size, 1)
+            return self._move(request, path)
+        self._tell(request.size, 1)
         return held
 
-    def _held(self, wish: FetchRequest, path: Path) -> _Done | None:
-        """The file that is there already, if its content is the object's: from a run that was killed, or from another program."""
-        if not path.is_file() or path.stat().st_size != wish.size:
+    def _held(self, request: FetchRequest, path: Path) -> _Done | None:
+        """An existing file with the object's content, left by a run that was killed or by another program."""
+        if not path.is_file() or path.stat().st_size != request.size:
             return None
-        info = None if wish.sha256 else steadily(lambda: self._store.head(wish.bucket, wish.key), pause=self._pause)
-        expected = wish.sha256 or (info and info.sha256)
+        info = None if request.sha256 else steadily(lambda: self._store.head(request.bucket, request.key), pause=self._pause)
+        expected = request.sha256 or (info and info.sha256)
         seen = path.stat()
         if expected is None or fingerprint(path)[1] != expected:
             return None
-        return _Done(Verified(wish.key, wish.bucket, wish.size, seen.st_mtime_ns, expected, wish.etag), moved=False, proved=True)
+        return _Done(
+            Verified(request.key, request.bucket, request.size, seen.st_mtime_ns, expected, request.etag),
+            moved=False,
+            verified=True,
+        )
 
-    def _move(self, wish: FetchRequest, path: Path) -> _Done:
+    def _move(self, request: FetchRequest, path: Path) -> _Done:
         part = self._fetched.parts / str(next(self._numbers))
-        moved = 0
+        moved = 0  # bytes so far
 
         def tell(size: int) -> None:
             nonlocal moved
             if self._over.is_set():
-                raise LakeError('the fetch was broken off')
+                raise LakeError('the fetch was interrupted')
             moved += size
             self._tell(size, 0)
 
         try:
-            wanted = ObjectInfo(wish.bucket, wish.key, wish.size, wish.sha256)
+            wanted = ObjectInfo(request.bucket, request.key, request.size, request.sha256)
             found = download(self._store, wanted, path, part=part, is_synced=False, on_progress=tell, pause=self._pause)
         except BaseException:
             self._tell(-moved, 0)
             part.unlink(missing_ok=True)
             raise
         self._tell(0, 1)
-        file = Verified(wish.key, wish.bucket, wish.size, path.stat().st_mtime_ns, found.sha256, wish.etag)
-        return _Done(file, moved=True, proved=found.is_verified)
+        file = Verified(request.key, request.bucket, request.size, path.stat().st_mtime_ns, found.sha256, request.etag)
+        return _Done(file, moved=True, verified=found.is_verified)
 
     def _pause(self, seconds: float) -> None:
-        """Wait between two tries. Raises LakeError if the run has ended."""
+        """Wait between two attempts. Raises LakeError if the run has ended."""
         if self._over.wait(seconds):
-            raise LakeError('the fetch was broken off')
+            raise LakeError('the fetch was interrupted')
 
 
-def _refusal(wish: FetchRequest) -> str:
-    """Why an object cannot be a file below the folder; empty if it can. The bucket may contain hostile keys."""
-    if not is_path(wish.key):
+def _refusal(request: FetchRequest) -> str:
+    """Why an object must not become a file below the folder; empty if it can. The bucket may contain hostile keys."""
+    if not is_path(request.key):
         return 'its key is not a path'
-    return 'its key is ours' if wish.key.split('/', maxsplit=1)[0] == FOLDER else ''
+    return f'its key is in {FOLDER}/, which is reserved' if request.key.split('/', maxsplit=1)[0] == FOLDER else ''
 
 
-def _is(known: Verified, wish: FetchRequest) -> bool:
-    """Whether a file that matches its record is the requested object."""
-    same = (known.bucket, known.size) == (wish.bucket, wish.size)
-    if wish.sha256 is not None:
-        return same and known.sha256 == wish.sha256
-    return same and (not wish.etag or not known.etag or known.etag == wish.etag)
+def _is(known: Verified, request: FetchRequest) -> bool:
+    """Whether the recorded file is the requested object."""
+    same = (known.bucket, known.size) == (request.bucket, request.size)
+    if request.sha256 is not None:
+        return same and known.sha256 == request.sha256
+    return same and (not request.etag or not known.etag or known.etag == request.etag)

@@ -1,7 +1,7 @@
-"""A folder of fetched objects: files that were verified, which a second run skips, and their rows.
+"""A folder of fetched objects: verified files, which a second run skips, and their rows.
 
-``DIR/.fetch/`` contains a SQLite file, a lock that admits one fetch at a time, and incomplete files. The row files have the same
-places as in the bucket, so the folder can be queried like a store: ``MissionDataset('DIR')``.
+``DIR/.fetch/`` contains a SQLite file, a lock that allows one fetch at a time, and incomplete files. The row files have the same
+paths as in the bucket, so the folder can be queried like a store: ``MissionDataset('DIR')``.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from shadowhound_data_logger.formats.rows.schema import COLUMNS
 from shadowhound_data_logger.lake.row_files import backfilled_key
 
 FOLDER: Final = '.fetch'
-UNWRITABLE: Final = 'name a folder of yours, on a disk that has room'
+UNWRITABLE: Final = 'choose a folder that you can write to, on a disk with free space'
 PARTS: Final = f'{FOLDER}/parts'
-"""Of incomplete files."""
+"""The folder of incomplete files."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS files (
     key TEXT PRIMARY KEY, bucket TEXT NOT NULL, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sha256 TEXT NOT NULL,
@@ -45,7 +45,7 @@ CREATE TABLE IF NOT EXISTS files (
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """A file when its content was compared with the checksum of the object."""
+    """A file whose content was compared with the checksum of the object."""
 
     key: str
     bucket: str
@@ -56,12 +56,12 @@ class Verified:
 
 
 class Fetched:
-    """Which files of a folder are known to be complete.
+    """Records which files of a folder are complete.
 
-    Lifecycle: enter once, exit once, on one thread. A file whose size or time differs from its record is unknown.
+    Lifecycle: enter once, exit once, on one thread. A file whose size or time differs from its record counts as unknown.
 
-    Files are not synced one by one, which would take longer than downloading them. Records that were not synced, because the
-    process was killed, are trusted until the next boot; then the files are read again, because a power cut may have damaged them.
+    Files are not synced one by one, which would take longer than downloading them. If the process is killed before they are
+    synced, their records are trusted until the next boot; then the files are read again, because a power cut may damage them.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -104,7 +104,7 @@ class Fetched:
 
     def _claim(self, file: IO[bytes]) -> None:
         if not lock(file, wait=False):
-            raise LakeError(f'another fetch is writing to {self.folder}', remedy='wait for it, or name another folder')
+            raise LakeError(f'another fetch is writing to {self.folder}', remedy='wait for it, or choose another folder')
 
     def _release(self) -> None:
         if self._lock is not None:
@@ -114,7 +114,7 @@ class Fetched:
         return self.folder / key
 
     def verified(self, key: str) -> Verified | None:
-        """The record of the file of this key, if the file has not changed since."""
+        """The record of this key's file, if the file has not changed since."""
         known = self._known.get(key)
         if known is None:
             return None
@@ -124,14 +124,15 @@ class Fetched:
             return None
         return known if (seen.st_size, seen.st_mtime_ns) == (known.size, known.mtime_ns) else None
 
-    def note(self, files: Iterable[Verified]) -> None:
+    def record(self, files: Iterable[Verified]) -> None:
+        """Record that these files are complete."""
         assert self._db is not None
         rows = [(file.key, file.bucket, file.size, file.mtime_ns, file.sha256, file.etag, self._boot) for file in files]
         with self._db:
             self._db.executemany('INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?, ?, ?, ?)', rows)
 
     def _opened(self, path: Path) -> sqlite3.Connection:
-        """A file that SQLite cannot read is replaced: it is only a cache."""
+        """Open the records; a file that SQLite cannot read is replaced, because it is only a cache."""
         for attempt in range(2):
             db = sqlite3.connect(path)
             try:
@@ -152,9 +153,9 @@ class Fetched:
 
 
 def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write one row file per robot and date. Raises LakeError if it cannot be written.
+    """Write one row file per robot and date. Raises LakeError if that fails.
 
-    Rows whose robot is not a valid name are ignored: the name becomes that of a folder.
+    Rows whose robot is not a valid name are skipped, because the name becomes that of a folder.
     """
     plain = [
         {**{name: row[name] for name in COLUMNS}, **{name: _micros(row, name) for name in ('t_start', 't_end')}} for row in rows
@@ -167,7 +168,7 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         if path.is_file():
             continue
         try:
-            part = folder / PARTS / f'rows-{os.getpid()}'  # the next fetch deletes what is left there after a kill
+            part = folder / PARTS / f'rows-{os.getpid()}'  # after a kill, the next fetch deletes it
             for place in (part.parent, path.parent):
                 place.mkdir(parents=True, exist_ok=True)
             with replacing(path, part=part) as file:
@@ -177,5 +178,5 @@ def keep_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _micros(row: Mapping[str, Any], name: str) -> int | None:
-    """As in row files; None for an object without a date."""
+    """A time in microseconds, as in row files; None for an object without a date."""
     return None if row[name] is None else int(row[f'{name}_ns']) // 1000

@@ -1,4 +1,4 @@
-"""What an answer lacks: invalid row files, and rows that were rejected."""
+"""Invalid row files and rejected rows, which query results lack."""
 
 from __future__ import annotations
 
@@ -13,33 +13,34 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class LeftOut:
-    """A row file, or a folder of them, that an answer lacks."""
+class SkippedFile:
+    """A row file, or a folder of them, that was skipped completely or in part."""
 
     key: str
     why: str
     rows: int | None = None
-    """How many of its rows; None: all of them."""
+    """How many of its rows were skipped; None: all."""
 
     def __str__(self) -> str:
-        return f'{visible(self.key)} is left out: {visible(self.why)}'
+        return f'{visible(self.key)} is skipped: {visible(self.why)}'
 
 
-def warn(one: LeftOut) -> None:
-    """In the log of this process."""
+def warn(one: SkippedFile) -> None:
+    """Log a warning."""
     log.warning('%s', one)
 
 
 class Findings:
-    """Collects what an answer lacks.
+    """Collects skipped files.
 
-    Each is reported once, in however many queries it occurs. Thread-safe. In another process it starts empty, and warns.
+    Each file is reported only once, even if several queries skip it. Thread-safe. A copy in another process starts empty, and
+    logs warnings.
     """
 
-    def __init__(self, tell: Callable[[LeftOut], None] = warn) -> None:
+    def __init__(self, tell: Callable[[SkippedFile], None] = warn) -> None:
         self._tell = tell
         self._lock = threading.Lock()
-        self._found: dict[str, LeftOut] = {}
+        self._found: dict[str, SkippedFile] = {}
 
     def __reduce__(self) -> tuple[type[Findings], tuple[()]]:
         return Findings, ()
@@ -47,13 +48,14 @@ class Findings:
     def __len__(self) -> int:
         return len(self._found)
 
-    def __iter__(self) -> Iterator[LeftOut]:
-        """By key."""
+    def __iter__(self) -> Iterator[SkippedFile]:
+        """Ordered by key."""
         with self._lock:
             return iter(sorted(self._found.values(), key=lambda one: one.key))
 
     def add(self, key: str, why: str, rows: int | None = None) -> None:
-        one = LeftOut(key, why, rows)
+        """Report a file that was skipped, or so many of its rows."""
+        one = SkippedFile(key, why, rows)
         with self._lock:
             if key in self._found:
                 return

@@ -1,7 +1,7 @@
-"""What is known about a topic between two times: what is stored, what was lost and why, and for which times losses are unknown.
+"""Reports what is known about a topic between two times: what is stored, what was lost and why, and where losses are unknown.
 
-Everything that shows data or trains on it calls ``known``. It reads the statements of the gap journal (formats/rows/gaps.py), of
-which the newest about each gap counts. Only within a watermark does the absence of a gap mean that nothing was lost; while a
+All code that shows data or trains on it calls ``known``. It reads the statements of the gap journal (formats/rows/gaps.py); the
+newest statement about each gap counts. Only within a watermark does the absence of a gap mean that nothing was lost: while a
 robot is off or unreachable, losses are unknown until it reports.
 """
 
@@ -35,17 +35,18 @@ SINKS: Final = (OBJECTS, BAGS, EVENTS)
 """Where messages are stored; each has its own gaps."""
 HOUR_NS: Final = 3600 * SECOND
 OTHER_TYPE: Final = 'wrong_type'
-"""Rejected messages of another type than the topic's: no message of the topic itself is missing."""
+"""Rejected messages whose type differs from the topic's: no message of the topic itself is missing."""
 RECEIVED_ONLY: Final = 'received-only'
-MOST_CAUSES: Final = 64
-"""Of a topic, by name; others are counted as ``MORE_CAUSES``. The node has about 20; a hostile file can have one per row."""
+MAX_CAUSES: Final = 64
+"""Causes per topic that are listed by name; others are counted as ``MORE_CAUSES``. The node has about 20, but a hostile file can
+have one per row."""
 MORE_CAUSES: Final = '(more)'
 _NEWEST: Final = (
     f'SELECT {", ".join(map(quoted, GAPS.columns))} FROM (SELECT *, row_number() OVER (PARTITION BY robot, id '  # noqa: S608
     'ORDER BY revision DESC, what ASC, to_ns DESC, from_ns DESC) AS _place FROM all_gaps WHERE {}) WHERE _place = 1 '
     'ORDER BY robot, id'
 )
-"""The newest statement of each; a gap before a withdrawal of the same revision, which moved it to another day."""
+"""The newest statement about each gap. A gap precedes a withdrawal with the same revision, which moved it to another day."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ class Known:
             low, high = max(each.begin_ns, begin_ns), min(each.end_ns, end_ns)
             if low < high:
                 found.append(each._replace(begin_ns=low, end_ns=high))
-        gaps = tuple(gap for gap in self.gaps if _reaches(gap.from_ns, gap.to_ns, begin_ns, end_ns))
+        gaps = tuple(gap for gap in self.gaps if _overlaps(gap.from_ns, gap.to_ns, begin_ns, end_ns))
         return Known(self.robot, self.sink, self.topic, begin_ns, end_ns, tuple(found), gaps, self.untimed)
 
 
@@ -174,9 +175,9 @@ def moment_ns(name: str, given: str | datetime | int, now_ns: int) -> int:
 
 def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str | None = None, sink: str | None = None,
            since_ns: int | None = None, findings: Findings | None = None, by: str = BY_STAMP) -> pa.Table:  # fmt: skip
-    """The statements that count, about times from then on or unknown ones, with the columns of ``GAPS``.
+    """The newest statements about times from ``since_ns`` or unknown times, with the columns of ``GAPS``.
 
-    With ``by`` ``received``, ``from_ns``, ``to_ns``, ``t_from`` and ``t_to`` are times of arrival, null where these are unknown.
+    If ``by`` is ``received``, ``from_ns``, ``to_ns``, ``t_from`` and ``t_to`` are arrival times, null if unknown.
 
     Raises StoreError, LakeError.
     """
@@ -192,18 +193,18 @@ def newest(source: Bucket | None = None, *, robot: str | None = None, topic: str
 
 
 def of_rows(robot: str, sink: str, topic: str, begin_ns: int, end_ns: int, rows: Iterable[Mapping[str, Any]]) -> Known:
-    """As ``known``, from the newest statements of that robot, sink and topic."""
+    """Like ``known``, from the newest statements of that robot, sink and topic."""
     rows = list(rows)
-    told = [_gap(row) for row in rows if row['what'] == GAP]
-    gaps = sorted((gap for gap in told if _reaches(gap.from_ns, gap.to_ns, begin_ns, end_ns)), key=_by_time)
-    untimed = tuple(gap for gap in told if _is_untimed(gap))
+    stated = [_gap(row) for row in rows if row['what'] == GAP]
+    gaps = sorted((gap for gap in stated if _overlaps(gap.from_ns, gap.to_ns, begin_ns, end_ns)), key=_by_time)
+    untimed = tuple(gap for gap in stated if _is_untimed(gap))
     marks = [(row['from_ns'], row['to_ns'], row['grade']) for row in watermarks(rows) if row['grade'] != RECEIVED_ONLY]
     stretches = _stretches(begin_ns, end_ns, marks, [gap for gap in gaps if gap.cause != OTHER_TYPE and not _is_untimed(gap)])
     return Known(robot, sink, topic, begin_ns, end_ns, tuple(stretches), tuple(gaps), untimed)
 
 
 def watermarks(rows: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The newest ``complete`` statement of each session, sink and topic: it covers ``from_ns`` to ``to_ns``."""
+    """The newest ``complete`` statement of each session, sink and topic; it covers ``from_ns`` to ``to_ns``."""
     best: dict[tuple[Any, ...], Mapping[str, Any]] = {}
     for row in rows:
         if row['what'] == COMPLETE and row['from_ns'] is not None and row['to_ns'] is not None and row['clock'] != 'unset':
@@ -226,20 +227,20 @@ def _by_time(gap: StatedGap) -> tuple[int, int, str]:
     return gap.from_ns or 0, gap.to_ns or 0, gap.cause or ''
 
 
-def _reaches(from_ns: int | None, to_ns: int | None, begin_ns: int, end_ns: int) -> bool:
+def _overlaps(from_ns: int | None, to_ns: int | None, begin_ns: int, end_ns: int) -> bool:
     return from_ns is not None and to_ns is not None and from_ns < end_ns and (to_ns > begin_ns or from_ns >= begin_ns)
 
 
 def _stretches(
     begin_ns: int, end_ns: int, marks: Sequence[tuple[int, int, str | None]], gaps: Sequence[StatedGap]
 ) -> Iterator[Stretch]:
-    """One pass over all times at which the state changes."""
+    """The stretches, in one pass over all times at which the state changes."""
     changes: defaultdict[int, list[tuple[Counter[str], str, int]]] = defaultdict(list)
     causes, grades = Counter[str](), Counter[str]()
     words: dict[str, str] = {}
     for gap in gaps:
         word = gap.cause or gap.kind or '?'
-        words.setdefault(word, word if len(words) < MOST_CAUSES else MORE_CAUSES)
+        words.setdefault(word, word if len(words) < MAX_CAUSES else MORE_CAUSES)
     spans_of = [(gap.from_ns, gap.to_ns, words[gap.cause or gap.kind or '?']) for gap in gaps]
     for active, spans in ((causes, spans_of), (grades, marks)):
         for from_ns, to_ns, name in spans:
@@ -282,13 +283,13 @@ class Coverage:
     A time with several causes counts for the first of them by name.
     """
     downsampled: tuple[tuple[int, int], ...]
-    """Times of which messages were skipped on purpose, because the sensor's rate is lower than the topic's."""
+    """Times in which messages were skipped on purpose, because the sensor's rate is lower than the topic's."""
 
 
 def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: str | None = None,  # noqa: PLR0913 - as above
              sink: str = OBJECTS, source: Bucket | None = None, findings: Findings | None = None,
              by: str = BY_STAMP) -> list[Coverage]:  # fmt: skip
-    """Of each robot and topic with statements, or of the named one. Raises StoreError."""
+    """The coverage of each robot and topic with statements, or of the given one. Raises StoreError."""
     found = newest(source, robot=robot, topic=topic, sink=sink, since_ns=since_ns, findings=findings, by=by)
     grouped: defaultdict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in found.to_pylist():
@@ -304,14 +305,14 @@ def coverage(since_ns: int, until_ns: int, *, robot: str | None = None, topic: s
 
 
 def downsampled_times(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, int]]:
-    """Times between two watermarks of a session between which messages were skipped."""
+    """The times between two watermarks of a session between which messages were skipped."""
     sessions: defaultdict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         if row['what'] == COMPLETE and row['from_ns'] is not None and row['to_ns'] is not None:
             sessions[row['session'], row['from_ns']].append(row)
-    for told in sessions.values():
-        at_ns, skipped = told[0]['from_ns'], 0
-        for row in sorted(told, key=lambda row: row['to_ns']):
+    for marks in sessions.values():
+        at_ns, skipped = marks[0]['from_ns'], 0
+        for row in sorted(marks, key=lambda row: row['to_ns']):
             if (row['skipped'] or 0) > skipped:
                 yield at_ns, row['to_ns']
             at_ns, skipped = row['to_ns'], row['skipped'] or 0

@@ -1,8 +1,8 @@
-"""What makes a vector of a picture, or of a text: a pair of ONNX models that the user supplies, or a perceptual hash without any.
+"""Embeds images and texts as vectors, with a pair of ONNX models that the user supplies, or without one by a perceptual hash.
 
-The layout of a folder is that in which Hugging Face exports CLIP and SigLIP, such as Xenova/clip-vit-base-patch32:
-``vision_model.onnx`` and, for questions in words, ``text_model.onnx``, beside them or one folder up ``preprocessor_config.json``
-and ``tokenizer.json``. A model is known by the SHA-256 over these files: vectors of one are never compared with those of another.
+The layout of a model's folder is that of Hugging Face's exports of CLIP and SigLIP, such as Xenova/clip-vit-base-patch32:
+``vision_model.onnx`` and, for queries in words, ``text_model.onnx``; next to them or one folder up ``preprocessor_config.json``
+and ``tokenizer.json``. A model is identified by the SHA-256 over these files; vectors of different models are never compared.
 """
 
 from __future__ import annotations
@@ -27,47 +27,47 @@ TEXT_MODELS: Final = ('text_model.onnx', 'text.onnx')
 FOLDERS: Final = ('.', 'onnx')
 PREPROCESSOR, TOKENIZER = 'preprocessor_config.json', 'tokenizer.json'
 DHASH: Final = 'dhash1'
-MOST_NUMBERS: Final = 4096
-"""Of a vector."""
-MOST_SIDE: Final = 2048
+MAX_DIMENSIONS: Final = 4096
+"""Numbers in a vector."""
+MAX_SIDE: Final = 2048
 """Pixels of a model's input."""
-MOST_TOKENS: Final = 512
+MAX_TOKENS: Final = 512
 LAYOUT: Final = (
-    'a folder with vision_model.onnx (or image.onnx) and, for questions in words, text_model.onnx and tokenizer.json, as Hugging '
+    'a folder with vision_model.onnx (or image.onnx) and, for queries in words, text_model.onnx and tokenizer.json, as Hugging '
     'Face exports CLIP and SigLIP'
 )
 EXTRA: Final = "pip install 'shadowhound_data_logger[likeness]'"
 
 
 class ImageModel(Protocol):
-    """Makes vectors of length 1; that of two pictures which look alike to it is nearly the same."""
+    """Computes vectors of length 1; similar images have similar vectors."""
 
     @property
     def name(self) -> str:
-        """For people."""
+        """The name for messages."""
 
     @property
     def digest(self) -> str:
-        """Names the model: of one and the same, the same."""
+        """Identifies the model."""
 
-    def of_pictures(self, pictures: Sequence[Any]) -> Vectors:
-        """(n, d) of n pictures of Pillow's. Raises LakeError, ValueError."""
+    def embed_images(self, pictures: Sequence[Any]) -> Vectors:
+        """Vectors (n, d) of n Pillow images. Raises LakeError, ValueError."""
 
-    def of_text(self, text: str) -> Vectors:
-        """(d,). Raises LakeError where it knows no words."""
+    def embed_text(self, text: str) -> Vectors:
+        """The vector (d,) of a text. Raises LakeError if the model has no text model."""
 
 
 class DifferenceHash:
-    """The perceptual hash dHash: where the picture, shrunk to 9 x 8 greys, gets brighter from one pixel to the next.
+    """The perceptual hash dHash: whether each pixel of the image, scaled to 9 x 8 gray values, is brighter than its neighbor.
 
-    As a vector of 64 numbers, each 1/8 or -1/8: the likeness of two is 1 - 2 h / 64 for h bits that differ.
+    It is a vector of 64 numbers, each 1/8 or -1/8: the similarity of two is 1 - 2 h / 64 if h bits differ.
     Source: Neal Krawetz, "Kind of Like That" (hackerfactor.com, 2013).
     """
 
     name = 'the perceptual hash dHash'
     digest = DHASH
 
-    def of_pictures(self, pictures: Sequence[Any]) -> Vectors:
+    def embed_images(self, pictures: Sequence[Any]) -> Vectors:
         from PIL import Image  # noqa: PLC0415
 
         small = [np.asarray(each.convert('L').resize((9, 8), Image.Resampling.LANCZOS), np.int16) for each in pictures]
@@ -75,33 +75,33 @@ class DifferenceHash:
         found: Vectors = np.where(bits.reshape(len(small), 64), np.float32(0.125), np.float32(-0.125))
         return found
 
-    def of_text(self, text: str) -> Vectors:  # noqa: ARG002
-        raise LakeError('a question in words needs a text model', remedy=f'--model DIR: {LAYOUT}')
+    def embed_text(self, text: str) -> Vectors:  # noqa: ARG002
+        raise LakeError('a query in words requires a text model', remedy=f'--model DIR: {LAYOUT}')
 
 
 @dataclass(frozen=True, slots=True)
 class _Preparation:
-    """How a picture becomes the model's input (``preprocessor_config.json``)."""
+    """How an image is converted to the model's input (``preprocessor_config.json``)."""
 
     size: tuple[int, int]
     """Height and width of the input."""
     shortest: int | None = None
-    """Where the picture is first resized so that its shorter side has so many pixels, and then cropped."""
+    """If set, the image is first resized so that its shorter side has this many pixels, and then cropped."""
     scale: float = 1 / 255
     mean: tuple[float, ...] = (0.0, 0.0, 0.0)
     std: tuple[float, ...] = (1.0, 1.0, 1.0)
     resample: int = 3
 
     def input(self, picture: Any) -> Vectors:
-        """(3, height, width)."""
+        """Convert an image to (3, height, width)."""
         rgb = picture.convert('RGB')
         height, width = self.size
         if self.shortest is None:
             rgb = rgb.resize((width, height), self.resample)
         else:
             ratio = self.shortest / min(rgb.size)
-            if max(rgb.size) * ratio > 8 * MOST_SIDE:
-                raise ValueError(f'a picture of {rgb.width} x {rgb.height} is too long for the model')
+            if max(rgb.size) * ratio > 8 * MAX_SIDE:
+                raise ValueError(f'an image of {rgb.width} x {rgb.height} is too elongated for the model')
             rgb = rgb.resize((max(width, round(rgb.width * ratio)), max(height, round(rgb.height * ratio))), self.resample)
             left, top = (rgb.width - width) // 2, (rgb.height - height) // 2
             rgb = rgb.crop((left, top, left + width, top + height))
@@ -113,7 +113,7 @@ class _Preparation:
 
 @dataclass(slots=True)
 class OnnxPair:
-    """A vision model and, where it is there, the text model that goes with it. Not thread-safe."""
+    """A vision model and, if present, its text model. Not thread-safe."""
 
     folder: Path
     _files: dict[str, Path]
@@ -127,22 +127,22 @@ class OnnxPair:
 
     @classmethod
     def open(cls, folder: Path) -> OnnxPair:
-        """Raises LakeError for a folder that is none, or whose files refer to others."""
+        """Open a model's folder. Raises LakeError if it has no model, or if its files refer to other files."""
         folder = folder.absolute()
-        files = {role: path for role, names in (('image', IMAGE_MODELS), ('text', TEXT_MODELS), ('said', (PREPROCESSOR,)),
+        files = {role: path for role, names in (('image', IMAGE_MODELS), ('text', TEXT_MODELS), ('preprocessor', (PREPROCESSOR,)),
                                                 ('tokenizer', (TOKENIZER,))) if (path := _find(folder, names))}  # fmt: skip
         if 'image' not in files:
             raise LakeError(f'{folder} has no image model', remedy=f'--model is {LAYOUT}')
-        told = hashlib.sha256()
+        digest = hashlib.sha256()
         try:
             for role, path in sorted(files.items()):
                 check_content(path, path.name)
-                told.update(f'{role} {fingerprint(path)[1]}\n'.encode())
+                digest.update(f'{role} {fingerprint(path)[1]}\n'.encode())
         except (PolicyRefused, OSError) as error:
             raise LakeError(f'the model in {folder} is refused: {error}', remedy=f'--model is {LAYOUT}') from error
-        return cls(folder, files, told.hexdigest())
+        return cls(folder, files, digest.hexdigest())
 
-    def of_pictures(self, pictures: Sequence[Any]) -> Vectors:
+    def embed_images(self, pictures: Sequence[Any]) -> Vectors:
         session = self._session('image')
         preparation = self._preparation or self._prepare(session)
         self._preparation = preparation
@@ -150,11 +150,11 @@ class OnnxPair:
         is_single = session.get_inputs()[0].shape[0] == 1
         pieces = [batch[i : i + 1] for i in range(len(batch))] if is_single else [batch]
         name = session.get_inputs()[0].name
-        return _unit(np.concatenate([self._ran('image', {name: piece}) for piece in pieces]), self.name)
+        return _unit(np.concatenate([self._run('image', {name: piece}) for piece in pieces]), self.name)
 
-    def of_text(self, text: str) -> Vectors:
+    def embed_text(self, text: str) -> Vectors:
         if 'text' not in self._files or 'tokenizer' not in self._files:
-            raise LakeError(f'{self.folder} has no text model', remedy=f'for questions in words --model is {LAYOUT}')
+            raise LakeError(f'{self.folder} has no text model', remedy=f'for queries in words --model is {LAYOUT}')
         try:
             from tokenizers import Tokenizer  # type: ignore[import-not-found, unused-ignore] # noqa: PLC0415 - of the extra
         except ModuleNotFoundError as error:
@@ -162,14 +162,14 @@ class OnnxPair:
         try:
             tokens = Tokenizer.from_str(self._files['tokenizer'].read_text('utf-8')).encode(text)
         except Exception as error:
-            raise LakeError(f'{self._files["tokenizer"]} is no tokenizer: {error}') from error
-        ids = np.array([tokens.ids[:MOST_TOKENS]], np.int64)
-        values = {'input_ids': ids, 'attention_mask': np.array([tokens.attention_mask[:MOST_TOKENS]], np.int64),
+            raise LakeError(f'{self._files["tokenizer"]} is not a tokenizer: {error}') from error
+        ids = np.array([tokens.ids[:MAX_TOKENS]], np.int64)
+        values = {'input_ids': ids, 'attention_mask': np.array([tokens.attention_mask[:MAX_TOKENS]], np.int64),
                   'token_type_ids': np.zeros_like(ids)}  # fmt: skip
         names = {each.name for each in self._session('text').get_inputs()}
         if not names <= values.keys():
-            raise LakeError(f'the text model of {self.folder} asks for {", ".join(sorted(names - values.keys()))}')
-        found: Vectors = _unit(self._ran('text', {name: values[name] for name in names}), self.name)[0]
+            raise LakeError(f'the text model of {self.folder} has unsupported inputs: {", ".join(sorted(names - values.keys()))}')
+        found: Vectors = _unit(self._run('text', {name: values[name] for name in names}), self.name)[0]
         return found
 
     def _session(self, role: str) -> Any:
@@ -192,21 +192,21 @@ class OnnxPair:
         shape = list(inputs[0].shape) if len(inputs) == 1 else []
         if len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != 3):
             raise LakeError(
-                f'the image model of {self.folder} does not take pictures', remedy='its one input is (n, 3, height, width)'
+                f'the image model of {self.folder} does not accept images', remedy='its only input must be (n, 3, height, width)'
             )
-        sides = tuple(side if isinstance(side, int) and 0 < side <= MOST_SIDE else None for side in shape[2:])
-        said: Mapping[str, Any] = {}
+        sides = tuple(side if isinstance(side, int) and 0 < side <= MAX_SIDE else None for side in shape[2:])
+        config: Mapping[str, Any] = {}
         try:
-            if 'said' in self._files:
-                path = self._files['said']
+            if 'preprocessor' in self._files:
+                path = self._files['preprocessor']
                 check_size(path.stat().st_size, MOST_DOCUMENT_BYTES)
-                said = from_json(path.read_bytes())
-            return _preparation(said, sides)
+                config = from_json(path.read_bytes())
+            return _preparation(config, sides)
         except (ValueError, TypeError, KeyError, AttributeError, OSError) as error:
-            raise LakeError(f'{self.folder} does not say how a picture is prepared: {error}',
+            raise LakeError(f'{self.folder} does not define how images are prepared: {error}',
                             remedy=f'{PREPROCESSOR} as Hugging Face exports it') from error  # fmt: skip
 
-    def _ran(self, role: str, values: Mapping[str, Any]) -> Vectors:
+    def _run(self, role: str, values: Mapping[str, Any]) -> Vectors:
         session = self._session(role)
         outputs = [each.name for each in session.get_outputs()]
         wanted = next((name for name in outputs if name in {f'{role}_embeds', 'embeds', 'pooler_output'}), outputs[0])
@@ -214,13 +214,15 @@ class OnnxPair:
             found = np.asarray(session.run([wanted], dict(values))[0], np.float32)
         except Exception as error:
             raise LakeError(f'{self._files[role]} cannot be run: {_short(error)}') from error
-        if found.ndim != 2 or not 0 < found.shape[1] <= MOST_NUMBERS:
-            raise LakeError(f'{wanted} of {self._files[role]} has the shape {found.shape}, and not (n, up to {MOST_NUMBERS:,})')
+        if found.ndim != 2 or not 0 < found.shape[1] <= MAX_DIMENSIONS:
+            raise LakeError(
+                f'{wanted} of {self._files[role]} has the shape {found.shape}, expected (n, up to {MAX_DIMENSIONS:,})'
+            )
         return found
 
 
 def open_model(folder: Path | None) -> ImageModel:
-    """The model in a folder; without one the perceptual hash. Raises LakeError."""
+    """Open the model in a folder, or without a folder the perceptual hash. Raises LakeError."""
     return OnnxPair.open(folder) if folder is not None else DifferenceHash()
 
 
@@ -230,12 +232,12 @@ def _find(folder: Path, names: Sequence[str]) -> Path | None:
     return next((path for path in (*places, *above) if path.is_file()), None)
 
 
-def _preparation(said: Mapping[str, Any], sides: Sequence[int | None]) -> _Preparation:
-    """Raises ValueError and its kind for what is no such document, or leaves the size open."""
-    size, crop = said.get('size'), said.get('crop_size')
-    shortest = size.get('shortest_edge') if isinstance(size, dict) else size if said.get('do_center_crop') else None
-    if shortest is not None and not said.get('do_center_crop', crop is not None):
-        raise ValueError('a picture is resized by its shorter side, and not cropped')
+def _preparation(config: Mapping[str, Any], sides: Sequence[int | None]) -> _Preparation:
+    """Raises ValueError, TypeError or KeyError for an invalid document, or one without the size."""
+    size, crop = config.get('size'), config.get('crop_size')
+    shortest = size.get('shortest_edge') if isinstance(size, dict) else size if config.get('do_center_crop') else None
+    if shortest is not None and not config.get('do_center_crop', crop is not None):
+        raise ValueError('images are resized by their shorter side but not cropped')
     whole = crop if shortest is not None else size
     if isinstance(whole, dict):
         height, width = whole['height'], whole['width']
@@ -244,14 +246,14 @@ def _preparation(said: Mapping[str, Any], sides: Sequence[int | None]) -> _Prepa
     else:
         height, width = sides
     for side in (height, width, *([shortest] if shortest is not None else [])):
-        if type(side) is not int or not 0 < side <= MOST_SIDE:
-            raise ValueError(f'a side of {side!r} pixels')
+        if type(side) is not int or not 0 < side <= MAX_SIDE:
+            raise ValueError(f'a side has {side!r} pixels, allowed are 1 to {MAX_SIDE}')
     if any(own not in {None, side} for own, side in zip(sides, (height, width), strict=True)):
-        raise ValueError(f'pictures of {height} x {width}, and the model takes {sides[0]} x {sides[1]}')
-    scale = float(said.get('rescale_factor', 1 / 255)) if said.get('do_rescale', True) else 1.0
-    mean, std = (tuple(map(float, said[name])) if said.get('do_normalize', name in said) and name in said else default
+        raise ValueError(f'images are {height} x {width}, but the model expects {sides[0]} x {sides[1]}')
+    scale = float(config.get('rescale_factor', 1 / 255)) if config.get('do_rescale', True) else 1.0
+    mean, std = (tuple(map(float, config[name])) if config.get('do_normalize', name in config) and name in config else default
                  for name, default in (('image_mean', (0.0,) * 3), ('image_std', (1.0,) * 3)))  # fmt: skip
-    resample = said.get('resample', 3)
+    resample = config.get('resample', 3)
     if (
         len(mean) != 3
         or len(std) != 3
@@ -259,14 +261,14 @@ def _preparation(said: Mapping[str, Any], sides: Sequence[int | None]) -> _Prepa
         or resample not in range(6)
         or (shortest is not None and shortest < max(height, width))
     ):
-        raise ValueError('mean, standard deviation or size make no sense')
+        raise ValueError('mean, standard deviation or size is invalid')
     return _Preparation((height, width), shortest, scale, mean, std, resample)
 
 
-def _unit(found: Vectors, whose: str) -> Vectors:
+def _unit(found: Vectors, model: str) -> Vectors:
     lengths = np.linalg.norm(found, axis=1, keepdims=True)
     if not np.isfinite(lengths).all() or not lengths.all():
-        raise ValueError(f'{whose} makes a vector that is not finite, or zero')
+        raise ValueError(f'{model} returned a vector that is zero or not finite')
     unit: Vectors = found / lengths
     return unit
 

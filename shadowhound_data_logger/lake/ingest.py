@@ -1,12 +1,12 @@
-"""From the row files of robots to the tables of the lake: each row once, whatever is killed and whoever else ingests.
+"""Ingests the row files of robots into the tables of the lake: each row exactly once, despite kills and concurrent ingesters.
 
-A row file is read, checked and committed to its table; then a row in the table ``ingested`` records it. A row that its table
-already has is not added again, so a file may be read twice: after a kill between the two commits, or by two ingesters at a time.
-Commits that add rows carry a Delta application transaction: of two ingesters that start from the same version one fails, opens
-the table again and adds what is still missing.
+A row file is read, checked and committed to its table; then a row in the table ``ingested`` records it. Rows that a table already
+has are not added again, so a file may be read twice: after a kill between the two commits, or by two ingesters at the same time.
+Commits that add rows carry a Delta application transaction: of two ingesters that start from the same version, one fails, reopens
+the table and adds the rows that are still missing.
 
-On a shared lake row files are deleted once they have been in the tables for a grace period. A reader opens the tables first and
-lists the row files afterwards, so what it does not find in a file is in its version of the tables.
+On a shared lake, row files are deleted after a grace period in the tables. A reader lists the row files before it opens the
+tables, so a file that is deleted in between is in its version of the tables.
 """
 
 from __future__ import annotations
@@ -52,30 +52,30 @@ from shadowhound_data_logger.lake.tables import (
 )
 
 GRACE: Final = timedelta(hours=1)
-"""For so long row files stay after their commit: longer than any query runs."""
+"""How long row files are kept after their commit: longer than any query runs."""
 BATCH_FILES: Final = 2000
 BATCH_BYTES: Final = 16 << 20
-"""Of row files that are committed together; they unpack to some ten times as much."""
+"""Row files committed together; decompressed they take about ten times as much."""
 ROWS_AT_A_TIME: Final = 8192
 FEW_FILES: Final = 8
-"""In a partition of a day that has not ended; with more they are merged."""
+"""In a partition of the current day; more files are merged."""
 TRIES: Final = 20
-"""Of a commit that other ingesters get in the way of."""
+"""Attempts to commit while other ingesters do the same."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Ingested:
-    """What one run did."""
+    """The result of one run."""
 
     files: int = 0
     rows: int = 0
-    """Rows that the tables did not have."""
+    """Rows that were added."""
     repeated: int = 0
-    """Rows that they already had."""
+    """Rows that the tables already had."""
     rejected: int = 0
     unknown: int = 0
-    """Rows with columns that this version does not know and ignored."""
+    """Rows with columns that this version does not know; the columns were ignored."""
 
     def __add__(self, other: Ingested) -> Ingested:
         return Ingested(*map(sum, zip(astuple(self), astuple(other), strict=True)))
@@ -84,7 +84,9 @@ class Ingested:
 def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[RowFile] | None = None) -> Ingested:
     """Commit these row files, or all that are not in the tables yet. Raises StoreError, LakeError."""
     if files is None:
-        listed = row_files(source, findings, Scope())  # first: what is ingested during the listing is found in the tables
+        listed = row_files(
+            source, findings, Scope()
+        )  # before the tables are opened: they have what is ingested during the listing
         files = pending(tables.open(INGESTED), listed)
     done = Ingested()
     for batch in _batched(files):
@@ -93,7 +95,7 @@ def ingest(source: Bucket, tables: Tables, findings: Findings, files: Sequence[R
 
 
 def pending(opened: DeltaTable, files: Sequence[RowFile]) -> list[RowFile]:
-    """Of these row files those that a version of ``ingested`` does not name. Raises LakeError."""
+    """The row files that are not in this version of ``ingested``. Raises LakeError."""
     dates = {file.date for file in files}
     return unknown_of(files, known_files(opened, Scope(has_date=dates.__contains__)) if files else ())
 
@@ -105,7 +107,7 @@ class KnownFile(NamedTuple):
     """Its key."""
     etag: str
     rejected: int
-    """Rows that were rejected; 1 for a file that is not one."""
+    """Rows that were rejected; 1 for a file that is not a row file."""
     why: str | None
 
 
@@ -116,7 +118,7 @@ def unknown_of(files: Sequence[RowFile], known: Iterable[KnownFile]) -> list[Row
 
 
 def known_files(opened: DeltaTable, scope: Scope, where: str = 'true') -> list[KnownFile]:
-    """The row files of a scope that a version of ``ingested`` names. Raises LakeError."""
+    """The row files of a scope that are in this version of ``ingested``. Raises LakeError."""
     conditions = [where]
     if scope.has_date is not None:
         conditions.append(among(DATE, filter(scope.has_date, {each[DATE] for each in opened.partitions()})))
@@ -131,13 +133,13 @@ def known_files(opened: DeltaTable, scope: Scope, where: str = 'true') -> list[K
 
 
 def fresh(source: Bucket, files: Sequence[RowFile], opened: DeltaTable, of: TableSchema, findings: Findings) -> pa.Table:
-    """The rows of these files that an opened table does not have yet. Raises StoreError, LakeError."""
+    """The rows of these files that the opened table does not have yet. Raises StoreError, LakeError."""
     files = [file for file in files if file.of is of]
     return missing(opened, TABLES[of.folder], pa.concat_tables(_tables(of, read(source, files, findings), [])))
 
 
 def _tables(of: TableSchema, found: Iterable[RowsOfFile], records: list[Row]) -> Iterator[pa.Table]:
-    """The rows of files, some thousand at a time: in Arrow they take a tenth of the memory. Adds a record of each file."""
+    """The rows of files as tables of some thousand rows, which take a tenth of the memory. Appends a record of each file."""
     rows: list[Row] = []
     for file, of_file, rejected, why, unknown in found:
         records.append({
@@ -165,7 +167,7 @@ def _batched(files: Iterable[RowFile]) -> Iterator[list[RowFile]]:
 
 
 def _commit(source: Bucket, tables: Tables, files: Sequence[RowFile], findings: Findings) -> Ingested:
-    """The rows first, then the record that they are in the tables."""
+    """Commit the rows first, then the record that they are in the tables."""
     done, records = Ingested(files=len(files)), list[Row]()
     for of in dict.fromkeys(file.of for file in files):
         found = read(source, [file for file in files if file.of is of], findings)
@@ -181,7 +183,7 @@ def _commit(source: Bucket, tables: Tables, files: Sequence[RowFile], findings: 
 
 
 def _add_missions(source: Bucket, tables: Tables, rows: pa.Table) -> None:
-    """How the missions ended that these rows of objects name, as far as that is known."""
+    """Add how the missions ended whose runs these rows of objects name, if it is known."""
     named = rows.filter(pc.is_valid(rows['run_id'])).group_by([ROBOT, 'run_id']).aggregate([])
     runs = {*zip(named[ROBOT].to_pylist(), named['run_id'].to_pylist(), strict=True)}
     if runs:
@@ -191,14 +193,14 @@ def _add_missions(source: Bucket, tables: Tables, rows: pa.Table) -> None:
 
 
 def _add(tables: Tables, table: Table, rows: pa.Table) -> int:
-    """Add what the table lacks; how many rows that were. Raises LakeError."""
+    """Add the rows that the table lacks; returns their number. Raises LakeError."""
     for _ in range(TRIES):
         opened = tables.open(table)
         new = missing(opened, table, rows)
         try:
             tables.append(opened, table, new)
         except Conflict:
-            log.debug('another process added rows to %s: looking again', table.name)
+            log.debug('another process added rows to %s: trying again', table.name)
         else:
             return len(new)
     raise LakeError(f'other ingesters kept adding rows to {table.name}', remedy='try again')
@@ -209,7 +211,7 @@ def _add(tables: Tables, table: Table, rows: pa.Table) -> int:
 
 @dataclass(slots=True)
 class RobotState:
-    """What the tables have of one robot."""
+    """What the tables contain about one robot."""
 
     robot: str
     days: int = 0
@@ -217,17 +219,17 @@ class RobotState:
     first: str | None = None
     last: str | None = None
     objects: int = 0
-    """Rows of the table ``objects``; those of deleted objects are among them."""
+    """Rows of the table ``objects``, including those of deleted objects."""
     rows: int = 0
-    """Of all tables."""
+    """Rows of all tables."""
     waiting: int = 0
     """Row files that are not in the tables yet."""
     rejected: int = 0
-    """Rows that were rejected, of files that are still there."""
+    """Rejected rows of files that still exist."""
 
 
 def states(source: Bucket, findings: Findings, robot: str | None = None) -> list[RobotState]:
-    """The state of one robot or of all, by name. Reads the tables' logs, not their rows. Raises StoreError, LakeError."""
+    """The state of one robot or of all, by name. Reads only the tables' logs, not their rows. Raises StoreError, LakeError."""
     tables = Tables.of(source)
     listed = row_files(source, findings, Scope(robot=robot))
     found: dict[str, RobotState] = {}
@@ -254,7 +256,7 @@ def states(source: Bucket, findings: Findings, robot: str | None = None) -> list
 
 
 def _counted(tables: Tables) -> Iterator[tuple[str, set[str], int, Table]]:
-    """(robot, dates other than that of undated rows, rows, table), from the statistics of the tables' files."""
+    """(robot, dates without that of undated rows, rows, table), from the statistics of the tables' files."""
     for table in TABLES.values():
         files = pa.table(tables.open(table).get_add_actions(flatten=True))
         robots: dict[str, tuple[set[str], int]] = {}
@@ -270,34 +272,34 @@ def _counted(tables: Tables) -> Iterator[tuple[str, set[str], int, Table]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Tended:
-    """What one round of upkeep did."""
+class Upkeep:
+    """The result of one round of upkeep."""
 
     merged: int = 0
-    """Files of tables that became parts of larger ones."""
+    """Files of tables that were merged into larger ones."""
     expired: int = 0
     """Row files deleted."""
     denied: int = 0
-    """Row files that the credentials may not delete."""
+    """Row files that the credentials must not delete."""
     vacuumed: int = 0
-    """Files of tables deleted that no version still kept has."""
+    """Deleted files of tables that no kept version uses."""
 
 
-def tend(
+def maintain(
     source: Bucket, tables: Tables, findings: Findings, *, grace: timedelta | None = GRACE, now: datetime | None = None
-) -> Tended:
-    """Merge and order the files of tables, expire row files, delete files of old versions. Raises StoreError, LakeError."""
+) -> Upkeep:
+    """Merge and sort the files of tables, expire row files, and delete files of old versions. Raises StoreError, LakeError."""
     now = now or datetime.now(timezone.utc)
     merged = sum(_merge(tables, table, f'{utc(time.time_ns()):%Y-%m-%d}') for table in (*TABLES.values(), INGESTED))
     expired, denied = (0, 0)
     if tables.is_shared and grace is not None:
         expired, denied = _expire(source, tables, findings, now - grace)
     vacuumed = sum(len(tables.open(table).vacuum(dry_run=False)) for table in (*TABLES.values(), INGESTED))
-    return Tended(merged, expired, denied, vacuumed)
+    return Upkeep(merged, expired, denied, vacuumed)
 
 
 def _merge(tables: Tables, table: Table, today: str) -> int:
-    """Of a day that has ended, all files of a partition become one, in the order of time; of today's only when there are many."""
+    """Merge all files of a partition into one, ordered by time, if its day has ended; otherwise only if there are many."""
     opened = tables.open(table)
     files = pa.table(opened.get_add_actions(flatten=True))
     names = [f'partition.{name}' for name in table.partitions]
@@ -317,16 +319,16 @@ def _merge(tables: Tables, table: Table, today: str) -> int:
                     fresh_table.optimize.z_order([table.time], partition_filters=filters, writer_properties=writer())
                 else:
                     fresh_table.optimize.compact(partition_filters=filters, writer_properties=writer())
-        except Conflict:  # prune deleted rows of it; the next round merges it
+        except Conflict:  # prune deleted rows of this partition; the next round merges it
             continue
         merged += each['path_count']
     return merged
 
 
 def _expire(source: Bucket, tables: Tables, findings: Findings, before: datetime) -> tuple[int, int]:
-    """Delete row files that are in the tables completely, since before then: how many were, and how many could not be.
+    """Delete row files that were completely ingested before this time; returns how many were and could not be deleted.
 
-    Those of deleted objects stay: ``lake prune`` finds there what it has not finished.
+    Keeps the row files about deleted objects: from them, ``lake prune`` continues an unfinished deletion.
     """
     listed = row_files(source, findings, Scope(tuple(of for of in SCHEMAS.values() if of is not FORGOTTEN)))
     stamp = literal(before.strftime('%Y-%m-%dT%H:%M:%S.%fZ'))

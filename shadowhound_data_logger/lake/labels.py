@@ -1,8 +1,8 @@
-"""Labels that people give to a time, to an object, or to a box in an image, in layers that are never changed.
+"""Labels that people give to a time, an object, or a box in an image. They are stored in immutable layers.
 
-A layer is a row file, ``<robot>/_labels/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<digest>.jsonl.zst``; the date is that of its
-creation, UTC. Each of its rows adds a label or removes one. The ``id`` of a label is a hash of its content, so that the same
-label exists once however often it is imported. The newest row about a label counts: a removal is a row, too.
+A layer is a row file, ``<robot>/_labels/date=YYYY-MM-DD/<robot>_<YYYYMMDDTHHMMSS>_<digest>.jsonl.zst``, with the date (UTC) of
+its creation. Each row adds or removes a label. The ``id`` of a label is a hash of its content, so that a label that is imported
+repeatedly exists once. The newest row about a label counts.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from shadowhound_data_logger.lake.select import TimeSpan, Wanted, within
 from shadowhound_data_logger.lake.views import rows_of
 from shadowhound_data_logger.stores.base import ObjectStore
 
-MOST_IN_LAYER: Final = 50_000
+MAX_LABELS_PER_LAYER: Final = 50_000
 _BOX: Final = ('x', 'y', 'width', 'height')
 _CSV: Final = frozenset({'label', 'since', 'until', 'robot', 'bucket', 'key', 'note', *_BOX})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """A label of a time of a robot, both ends included; of an object if it has a key; of a box in it, in pixels."""
+    """A label of a time of one robot (both ends inclusive), of an object if it has a key, or of a box in an image, in pixels."""
 
     robot: str
     label: str
@@ -50,29 +50,29 @@ class Label:
     key: str | None = None
     x: float | None = None
     y: float | None = None
-    """Of the upper left corner, from that of the image."""
+    """Position of the box's upper left corner, from that of the image."""
     width: float | None = None
     height: float | None = None
     note: str = ''
     by: str = ''
     made_ns: int = 0
     id: str = ''
-    """A hash of the label, without its author, time and note."""
+    """A hash of the label without its author, creation time and note."""
 
     @property
     def box(self) -> tuple[float, float, float, float] | None:
-        """x, y, width and height; None if it is about the whole object."""
+        """x, y, width and height; None for a label of a whole object."""
         if self.x is None or self.y is None or self.width is None or self.height is None:
             return None
         return self.x, self.y, self.width, self.height
 
     def checked(self) -> Label:
-        """With its id. Raises SettingError, NameRefused for an invalid label."""
+        """The label with its id. Raises SettingError, NameRefused if it is invalid."""
         check_name(self.robot, 'the robot name')
         if not self.label.strip() or len(self.label) > MAX_TEXT or not self.label.isprintable():
-            raise SettingError('label', self.label[:80], f'a text on one line, of at most {MAX_TEXT} letters')
+            raise SettingError('label', self.label[:80], f'a text on one line, of at most {MAX_TEXT} characters')
         if len(self.note) > 10 * MAX_TEXT:
-            raise SettingError('note', self.note[:80], f'a text of at most {10 * MAX_TEXT:,} letters')
+            raise SettingError('note', self.note[:80], f'a text of at most {10 * MAX_TEXT:,} characters')
         if not 0 <= self.since_ns <= self.until_ns < 1 << 63:
             raise SettingError('until', self.until_ns, f'a time after since, which is {self.since_ns}')
         box = [getattr(self, name) for name in _BOX]
@@ -82,7 +82,7 @@ class Label:
         if self.key is not None and not (
             is_path(self.key) and self.key.startswith(f'{self.robot}/') and is_name(self.bucket or '')
         ):
-            raise SettingError('key', self.key[:200], f'the key of an object of {self.robot}, which begins with {self.robot}/')
+            raise SettingError('key', self.key[:200], f'the key of an object of {self.robot}, which starts with {self.robot}/')
         said = [self.robot, self.label, self.since_ns, self.until_ns, self.bucket, self.key, *box]
         return replace(self, id=hashlib.blake2b('\0'.join(map(str, said)).encode(), digest_size=8).hexdigest())
 
@@ -92,9 +92,9 @@ FIELDS: Final = tuple(each.name for each in fields(Label))
 
 
 def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is_removal: bool = False) -> str:
-    """Put a layer that adds these labels of one robot, or removes them; returns its key. Raises SettingError, StoreError."""
-    if not 0 < len(found) <= MOST_IN_LAYER:
-        raise SettingError('labels', len(found), f'1 to {MOST_IN_LAYER:,} at a time')
+    """Upload a layer that adds or removes these labels of one robot; returns its key. Raises SettingError, StoreError."""
+    if not 0 < len(found) <= MAX_LABELS_PER_LAYER:
+        raise SettingError('labels', len(found), f'1 to {MAX_LABELS_PER_LAYER:,} at a time')
     made_ns = time.time_ns()
     rows: list[Row] = []
     for each in found:
@@ -111,7 +111,7 @@ def write(store: ObjectStore, robot: str, found: Sequence[Label], *, by: str, is
 
 
 def read(source: Bucket, robot: str | None = None, *, label: str | None = None, findings: Findings | None = None) -> list[Label]:
-    """The labels that were not removed, of one robot or of all, in the order of their times. Raises StoreError."""
+    """The labels of one robot or of all that were not removed, ordered by time. Raises StoreError."""
     findings = Findings() if findings is None else findings
     newest: dict[tuple[str, str], Row] = {}
     for row in rows_of(source, LABELS, findings, robot=robot).to_pylist():
@@ -134,8 +134,8 @@ def spans(found: Iterable[Label]) -> tuple[list[TimeSpan], list[tuple[str, str]]
     return times, keys
 
 
-def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
-    """The query with the times and objects that have its label, instead of the label. Raises StoreError."""
+def with_label_resolved(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
+    """Replace the label in a query by the times and objects that have it. Raises StoreError."""
     if asked.label is None:
         return asked
     found = read(source, asked.robot, label=asked.label, findings=findings)
@@ -145,9 +145,9 @@ def labelled(source: Bucket, asked: Wanted, findings: Findings) -> Wanted:
 
 
 def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
-    """For each row the labels of its object: those of its key, and of times that it overlaps.
+    """The labels of each row's object: those of its key, and those of times that it overlaps.
 
-    It needs the columns ``robot bucket key t_start_ns t_end_ns``.
+    The rows need the columns ``robot bucket key t_start_ns t_end_ns``.
     """
     of_keys: dict[tuple[str, str], set[str]] = {}
     said: list[set[str]] = [set() for _ in range(len(rows))]
@@ -169,7 +169,7 @@ def column(rows: pa.Table, found: Sequence[Label]) -> list[list[str]]:
 
 
 def with_column(rows: pa.Table, found: Sequence[Label]) -> pa.Table:
-    """The rows with a column ``labels``."""
+    """The rows with an additional column ``labels``."""
     return rows.append_column('labels', pa.array(column(rows, found), pa.list_(pa.string())))
 
 
@@ -177,9 +177,9 @@ def with_column(rows: pa.Table, found: Sequence[Label]) -> pa.Table:
 
 
 def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
-    """Rows with the columns ``label since until`` and optionally ``robot bucket key x y width height note``.
+    """Read a CSV with the columns ``label since until`` and optionally ``robot bucket key x y width height note``.
 
-    Times are written as for ``query``; those of a row with a key can be empty: ``timed`` adds them. Raises LakeError.
+    Times are written as in ``query``; those of a row with a key may be empty: ``with_times`` adds them. Raises LakeError.
     """
     try:
         check_size(len(body), MOST_DOCUMENT_BYTES)
@@ -194,13 +194,13 @@ def _check_columns(names: Iterable[str]) -> None:
     names = [*names]
     if 'label' not in names or set(names) - _CSV or len(set(names)) != len(names):
         raise ValueError(
-            f'its first line has to name the columns, each once: label, and any of {" ".join(sorted(_CSV - {"label"}))}'
+            f'its first line must name the columns, each once: label, and any of {" ".join(sorted(_CSV - {"label"}))}'
         )
 
 
 def _of_csv(row: Mapping[str, str], robot: str, now_ns: int) -> Label:
     if '' in row:
-        raise ValueError(f'the label {row["label"]!r} has more cells than there are columns')
+        raise ValueError(f'the row of the label {row["label"]!r} has more cells than the first line')
     key = row.get('key') or None
     if key is None and not (row.get('since') and row.get('until')):
         raise ValueError(f'the label {row["label"]!r} has neither since and until nor a key')
@@ -212,16 +212,16 @@ def _of_csv(row: Mapping[str, str], robot: str, now_ns: int) -> Label:
 
 
 def from_coco(body: bytes, robot: str) -> list[Label]:
-    """The boxes of a COCO file whose ``file_name`` are keys, as ``fetch`` arranges images; without times. Raises LakeError.
+    """Read the boxes of a COCO file, without times. Each ``file_name`` is a key, as ``fetch`` names images. Raises LakeError.
 
     https://cocodataset.org/#format-data: ``bbox`` is x, y, width, height from the upper left corner, in pixels.
     """
     try:
-        told = from_json(body)
-        names = {one['id']: str(one['name']) for one in told['categories']}
-        keys = {one['id']: str(one['file_name']) for one in told['images']}
+        document = from_json(body)
+        names = {one['id']: str(one['name']) for one in document['categories']}
+        keys = {one['id']: str(one['file_name']) for one in document['images']}
         found = []
-        for one in told['annotations']:
+        for one in document['annotations']:
             x, y, width, height = (float(side) for side in one['bbox'])
             key = keys[one['image_id']]
             found.append(Label(robot=robot or key.partition('/')[0], label=names[one['category_id']], since_ns=0, until_ns=0,
@@ -233,9 +233,9 @@ def from_coco(body: bytes, robot: str) -> list[Label]:
     return found
 
 
-def timed(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[list[Label], list[str]]:
-    """Labels of objects with the times of these objects, and the keys of objects without a row. Raises StoreError."""
-    from shadowhound_data_logger.lake import query  # noqa: PLC0415 - which asks for labels, too
+def with_times(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[list[Label], list[str]]:
+    """The labels, with the times of labeled objects; and the keys of objects without a row. Raises StoreError."""
+    from shadowhound_data_logger.lake import query  # noqa: PLC0415 - imports labels
 
     wanted_keys = {(each.bucket, each.key) for each in found if each.key is not None}
     if not wanted_keys:
@@ -263,10 +263,10 @@ def timed(source: Bucket, found: Sequence[Label], findings: Findings) -> tuple[l
 
 
 def by_robot(found: Iterable[Label]) -> Iterator[tuple[str, list[Label]]]:
-    """The labels of each robot, at most ``MOST_IN_LAYER`` at a time."""
+    """The labels of each robot, in groups of at most ``MAX_LABELS_PER_LAYER``."""
     grouped: dict[str, list[Label]] = {}
     for each in found:
         grouped.setdefault(each.robot, []).append(each)
     for robot, some in grouped.items():
-        for start in range(0, len(some), MOST_IN_LAYER):
-            yield robot, some[start : start + MOST_IN_LAYER]
+        for start in range(0, len(some), MAX_LABELS_PER_LAYER):
+            yield robot, some[start : start + MAX_LABELS_PER_LAYER]

@@ -1,9 +1,9 @@
-"""Likeness: vectors of pictures, kept as Parquet beside the catalogue, and the search of those nearest to one.
+"""Image similarity: stores vectors of images as Parquet next to the catalog, and searches for those nearest to a given vector.
 
-A part is at ``_vectors/<model>/<robot>/date=YYYY-MM-DD/<robot>_<random>.parquet`` in the bucket of the catalogue, where robots
-may not write; ``<model>`` is the first 16 characters of its digest. A row has two columns of fixed size, uncompressed and without
-nulls: ``sha256`` (32 bytes), the content that was looked at, and ``vector``, little-endian float16 numbers. So a part is as large
-as what it claims to hold. A part that is none is left out and named, and so is a vector that is not of length 1.
+A file is ``_vectors/<model>/<robot>/date=YYYY-MM-DD/<robot>_<random>.parquet`` in the catalog's bucket, where robots must not
+write; ``<model>`` is the first 16 characters of the model's digest. It has two columns of fixed size, uncompressed and without
+nulls, so that its size bounds its content: ``sha256`` (32 bytes), the image's content, and ``vector``, little-endian float16
+numbers. Invalid files, and vectors whose length is not 1, are skipped and reported.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, is_path, o
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.image_models import MOST_NUMBERS, ImageModel, Vectors
+from shadowhound_data_logger.lake.image_models import MAX_DIMENSIONS, ImageModel, Vectors
 from shadowhound_data_logger.lake.pictures import IMAGES
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -40,46 +40,46 @@ ABOUT: Final = b'shadowhound.vectors'
 MODEL: Final = b'shadowhound.model'
 DIGEST_BYTES: Final = 32
 PART_ROWS: Final = 1024
-"""Of a part that is written: what a death loses is at most so many, of each robot and day."""
-MOST_PART_BYTES: Final = 256 << 20
+"""Rows per file: a kill loses at most this many vectors per robot and day."""
+MAX_PART_BYTES: Final = 256 << 20
 BATCH: Final = 16
-"""Pictures that a model sees at a time."""
+"""Images that a model processes at a time."""
 CHUNK: Final = 8192
-"""Vectors that are made float32 at a time: 16 MB of 512 numbers."""
+"""Vectors that are converted to float32 at a time: 16 MB if they have 512 numbers."""
 LENGTH_ERROR: Final = 0.02
-"""By which the length of a vector may differ from 1: a float16 has 11 bits."""
+"""Allowed difference of a vector's length from 1: a float16 has a precision of 11 bits."""
 _SHA256: Final = r'^[0-9a-f]{64}$'
 
 
 @dataclass(slots=True)
 class Embedded:
-    """What became of the pictures of an answer."""
+    """The result of ``embed``."""
 
     pictures: int = 0
     known: int = 0
-    """Had a vector of this model already, as did other pictures of the same content."""
+    """Images that already had a vector of this model, including images with the same content."""
     made: int = 0
     refused: Counter[str] = field(default_factory=Counter)
-    """Reason -> pictures without one: ``missing`` ``too_large`` ``changed`` ``unreadable``."""
+    """Reason -> images without a vector: ``missing`` ``too_large`` ``changed`` ``unreadable``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """The pictures of an answer, by how like they are."""
+    """The images of a query, ordered by similarity."""
 
     rows: pa.Table
-    """Those of the catalogue, the most similar first, with a column ``likeness``: the cosine between the vectors, -1 to 1."""
+    """Rows of the catalog, the most similar first, with a column ``likeness``: the cosine of the vectors' angle, -1 to 1."""
     pictures: int
     without: int
-    """So many of them have no vector of this model."""
+    """How many of the images have no vector of this model."""
 
 
 def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Findings | None = None,
           progress: ProgressListener | None = None, **flags: Any) -> Embedded:  # fmt: skip
-    """Make vectors of all pictures that the flags choose (``query.objects``) and that have none of this model.
+    """Compute the missing vectors of all images that the flags select (``query.objects``).
 
-    It may die anywhere, run again or run twice at once: whole parts are put, and a picture that has a vector is not looked at.
-    Raises LakeError, StoreError.
+    It can be killed, repeated, and run twice at the same time: files are uploaded atomically, and images with a vector are
+    skipped. Raises LakeError, StoreError.
     """
     findings, progress = Findings() if findings is None else findings, progress or ProgressListener()
     rows = pictures(query.objects(source, findings=findings, **flags))
@@ -97,7 +97,7 @@ def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Fi
     progress.begin(len(todo))
     for some in _opened(source, todo, found, progress):
         try:
-            vectors = [*model.of_pictures([picture for _, picture in some]).astype('<f2')] if some else []
+            vectors = [*model.embed_images([picture for _, picture in some]).astype('<f2')] if some else []
         except ValueError:
             vectors = _one_by_one(model, some, found)
         for (row, _), vector in zip(some, vectors, strict=True):
@@ -114,12 +114,12 @@ def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Fi
 
 def like(source: Bucket, model: ImageModel, wanted: Vectors, *, limit: int, findings: Findings | None = None,
          **flags: Any) -> Likeness:  # fmt: skip
-    """Of the pictures that the flags choose, those with the vectors nearest to a wanted one (d,). Raises as ``embed``."""
+    """The images that the flags select, by the similarity of their vectors to a given one (d,). Raises LakeError, StoreError."""
     findings = Findings() if findings is None else findings
     rows = pictures(query.objects(source, findings=findings, **flags))
     digests, vectors = _collected(_parts(source, model, rows, findings))
     if len(vectors) and vectors.shape[1] != len(wanted):
-        raise LakeError(f'{model.name} makes vectors of {len(wanted)} numbers, and those in the store have {vectors.shape[1]}')
+        raise LakeError(f'{model.name} computes vectors of {len(wanted)} numbers, but those in the store have {vectors.shape[1]}')
     at = {digest: place for place, digest in enumerate(digests)}
     places = np.array([at.get(bytes.fromhex(each), -1) for each in rows['sha256'].to_pylist()], np.intp)
     have = np.flatnonzero(places >= 0)
@@ -130,22 +130,22 @@ def like(source: Bucket, model: ImageModel, wanted: Vectors, *, limit: int, find
 
 
 def nearest(vectors: NDArray[np.float16], wanted: Vectors, limit: int) -> tuple[NDArray[np.intp], Vectors]:
-    """The ``limit`` vectors (n, d) with the greatest products with a wanted one (d,), in that order, equal ones as they stand.
+    """The indices and dot products of the ``limit`` vectors (n, d) most similar to a given one (d,), in descending order.
 
-    Exact: each is multiplied, in float32.
+    Exact: all products are computed, in float32. The sort is stable.
     """
     scores = np.empty(len(vectors), np.float32)
     for start in range(0, len(vectors), CHUNK):
         scores[start : start + CHUNK] = vectors[start : start + CHUNK].astype(np.float32) @ wanted
     count = min(limit, len(scores))
-    least = np.partition(scores, -count)[-count] if count else np.inf
-    candidates = np.flatnonzero(scores >= least)
+    threshold = np.partition(scores, -count)[-count] if count else np.inf
+    candidates = np.flatnonzero(scores >= threshold)
     order = candidates[np.argsort(-scores[candidates], kind='stable')][:count]
     return order, scores[order]
 
 
 def pictures(rows: pa.Table) -> pa.Table:
-    """The rows of pictures whose content is known."""
+    """The rows of images whose SHA-256 is known."""
     lower = pc.utf8_lower(rows['key'])
     is_image = pc.match_substring_regex(lower, '(' + '|'.join(IMAGES).replace('.', r'\.') + ')$')
     is_known = pc.fill_null(pc.match_substring_regex(rows['sha256'], _SHA256), fill_value=False)
@@ -159,7 +159,7 @@ def pictures(rows: pa.Table) -> pa.Table:
 def _opened(
     source: Bucket, rows: Sequence[Mapping[str, Any]], found: Embedded, progress: ProgressListener
 ) -> Iterator[list[tuple[Mapping[str, Any], Any]]]:
-    """Some pictures at a time, decoded, each with its row; those that are none are counted."""
+    """Batches of decoded images with their rows; unreadable ones are counted."""
 
     def body(row: Mapping[str, Any]) -> bytes | str:
         try:
@@ -187,11 +187,11 @@ def _opened(
 
 
 def _one_by_one(model: ImageModel, some: Sequence[tuple[Mapping[str, Any], Any]], found: Embedded) -> list[Any]:
-    """A picture that a model cannot take costs no other one its vector."""
+    """Embed images one by one, so that an invalid one does not affect the others; None for an invalid one."""
     made: list[Any] = []
     for _, picture in some:
         try:
-            made.append(model.of_pictures([picture]).astype('<f2')[0])
+            made.append(model.embed_images([picture]).astype('<f2')[0])
         except ValueError:
             found.refused['unreadable'] += 1
             made.append(None)
@@ -201,7 +201,7 @@ def _one_by_one(model: ImageModel, some: Sequence[tuple[Mapping[str, Any], Any]]
 def put_vectors(
     store: ObjectStore, model: ImageModel, robot: str, date: str, rows: Sequence[tuple[bytes, NDArray[np.float16]]]
 ) -> None:
-    """A part with vectors of one model, each with the SHA-256 of its picture; returns when it is there. Raises StoreError."""
+    """Upload a file with vectors of one model and the SHA-256 of their images; returns when it is stored. Raises StoreError."""
     digests = b''.join(digest for digest, _ in rows)
     vectors = np.stack([vector for _, vector in rows])
     width = 2 * vectors.shape[1]
@@ -211,7 +211,7 @@ def put_vectors(
                for kind, content in ((pa.binary(DIGEST_BYTES), digests), (pa.binary(width), vectors.tobytes()))]  # fmt: skip
     out = io.BytesIO()
     pq.write_table(pa.table(columns, schema=schema), out, compression='none', use_dictionary=False, write_statistics=False)
-    name = secrets.token_hex(8)  # a part that was damaged keeps its name, and others take its place
+    name = secrets.token_hex(8)  # a damaged file is not overwritten but replaced by new ones
     put_part(store, f'{_prefix(model, robot)}date={date}/{robot}_{name}.parquet', robot, out.getvalue(), len(rows))
 
 
@@ -233,13 +233,13 @@ class _VectorPart:
 
 
 def _parts(source: Bucket, model: ImageModel, rows: pa.Table, findings: Findings) -> Iterator[_VectorPart]:
-    """All parts of the robots and days of these rows. Raises StoreError."""
+    """All files of vectors for the robots and days of these rows. Raises StoreError."""
     days = set(
         zip(rows['robot'].to_pylist(), (f'{utc(each or 0):%Y-%m-%d}' for each in rows['t_start_ns'].to_pylist()), strict=True)
     )
 
     def read(entry: Any) -> tuple[Any, bytes | str]:
-        if entry.size > MOST_PART_BYTES or not is_path(entry.key):
+        if entry.size > MAX_PART_BYTES or not is_path(entry.key):
             return entry, 'it is too large, or its name is not a path'
         try:
             return entry, source.get(entry.key, entry.size)
@@ -256,23 +256,23 @@ def _parts(source: Bucket, model: ImageModel, rows: pa.Table, findings: Findings
                 try:
                     part = _decoded(body, model)
                 except (pa.ArrowException, OSError, ValueError, MemoryError, LookupError, TypeError, OverflowError) as error:
-                    findings.add(entry.key, f'it is no part of vectors ({" ".join(str(error).split())[:200]})')
+                    findings.add(entry.key, f'it is not a file of vectors ({" ".join(str(error).split())[:200]})')
                     continue
                 yield _checked(part, entry.key, findings)
 
 
 def _decoded(body: bytes, model: ImageModel) -> _VectorPart:
-    """Raises what a file that is no part brings."""
+    """Raises ValueError, or various errors of pyarrow, for an invalid file."""
     file = pq.ParquetFile(io.BytesIO(body))
-    schema, said = file.schema_arrow, file.metadata.metadata or {}
-    if said.get(ABOUT) != b'1' or said.get(MODEL) != model.digest.encode():
-        raise ValueError('it is of another model')
+    schema, metadata = file.schema_arrow, file.metadata.metadata or {}
+    if metadata.get(ABOUT) != b'1' or metadata.get(MODEL) != model.digest.encode():
+        raise ValueError('it belongs to another model')
     if schema.names != ['sha256', 'vector'] or any(
         each.nullable or not pa.types.is_fixed_size_binary(each.type) for each in schema
     ):
         raise ValueError('it has other columns')
     width = schema.field('vector').type.byte_width
-    if schema.field('sha256').type.byte_width != DIGEST_BYTES or width % 2 or not 0 < width <= 2 * MOST_NUMBERS:
+    if schema.field('sha256').type.byte_width != DIGEST_BYTES or width % 2 or not 0 < width <= 2 * MAX_DIMENSIONS:
         raise ValueError('its columns have other sizes')
     if file.metadata.num_rows * (DIGEST_BYTES + width) > len(body):
         raise ValueError('it claims more rows than it has bytes for')
@@ -283,7 +283,7 @@ def _decoded(body: bytes, model: ImageModel) -> _VectorPart:
 
 
 def _checked(part: _VectorPart, key: str, findings: Findings) -> _VectorPart:
-    """Without vectors that are none."""
+    """The file without invalid vectors."""
     squares = np.einsum('ij,ij->i', part.vectors, part.vectors, dtype=np.float32)
     with np.errstate(invalid='ignore'):
         good = np.abs(np.sqrt(squares) - 1) <= LENGTH_ERROR
@@ -295,7 +295,7 @@ def _checked(part: _VectorPart, key: str, findings: Findings) -> _VectorPart:
 
 
 def _collected(parts: Iterator[_VectorPart]) -> tuple[list[bytes], NDArray[np.float16]]:
-    """All in one; those of another width than the first are of a part that lies."""
+    """All vectors in one array; a file whose vectors have another size than the first ones is invalid and skipped."""
     digests: list[bytes] = []
     vectors: list[NDArray[np.float16]] = []
     for part in parts:

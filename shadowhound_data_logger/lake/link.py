@@ -1,4 +1,4 @@
-"""How fast a robot's uploads went, and where it was then: the samples that it writes while it keeps something (``_wifi``)."""
+"""A robot's upload speed and position over time, from the samples that it stores while it keeps data (``_wifi``)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from shadowhound_data_logger.lake.tables import literal
 from shadowhound_data_logger.lake.views import rows_of
 
 LINK: Final = '_wifi'
-MOST_LINK_BYTES: Final = 1 << 20
+MAX_LINK_BYTES: Final = 1 << 20
 RECENT_NS: Final = 7 * 24 * 3600 * SECOND
 RECENT_OBJECTS: Final = 3
-FASTEST_MBPS: Final = 1e6
+MAX_MBPS: Final = 1e6
 
 
 class LinkSample(NamedTuple):
@@ -30,14 +30,17 @@ class LinkSample(NamedTuple):
     stamp_ns: int
     x: float | None
     y: float | None
-    """Metres, in the odometry's frame."""
+    """Meters in the odometry frame."""
     mbps: float
-    """Megabits a second; 0 where the store could not be reached."""
+    """Megabits per second; 0 if the store was unreachable."""
 
 
 def samples(source: Bucket, robot: str, since_ns: int, until_ns: int, findings: Findings,
             newest: int | None = None) -> list[LinkSample]:  # fmt: skip
-    """Of a robot, from ``since_ns`` until before ``until_ns``, or of the ``newest`` objects of that time. Raises StoreError."""
+    """The samples of a robot from ``since_ns`` until before ``until_ns``; with ``newest``, only of so many newest objects.
+
+    Raises StoreError.
+    """
     wanted = Wanted(since_ns=since_ns, until_ns=until_ns)
     where = f'sensor = {literal(LINK)} AND t_start_ns >= {since_ns} AND t_start_ns < {until_ns}'
     rows = rows_of(source, OBJECTS, findings, robot=robot, has_date=wanted.has_date, where=where, columns=('key',),
@@ -45,26 +48,26 @@ def samples(source: Bucket, robot: str, since_ns: int, until_ns: int, findings: 
     found: list[LinkSample] = []
     for row in rows if newest is None else rows[-newest:]:
         try:
-            told = from_json(source.get(row['key'], MOST_LINK_BYTES), MOST_LINK_BYTES)
-            found += [sample for one in told['samples'] if (sample := _sample(one)) is not None]
+            document = from_json(source.get(row['key'], MAX_LINK_BYTES), MAX_LINK_BYTES)
+            found += [sample for one in document['samples'] if (sample := _sample(one)) is not None]
         except (ObjectRefused, ValueError, TypeError, LookupError) as error:
-            findings.add(row['key'], f'it has no samples of the link ({error})')
+            findings.add(row['key'], f'it has no valid samples of the link ({error})')
     return found
 
 
 def pace_mbps(source: Bucket, robot: str, findings: Findings) -> float | None:
-    """Megabits a second at which a robot uploaded lately; None where it has told nothing for a week. Raises StoreError."""
+    """The median of a robot's recent upload speed in megabits per second; None if it is unknown for a week. Raises StoreError."""
     now_ns = time.time_ns()
     found = [one.mbps for one in samples(source, robot, now_ns - RECENT_NS, now_ns, findings, RECENT_OBJECTS) if one.mbps > 0]
     return median(found) if found else None
 
 
 def _sample(one: Any) -> LinkSample | None:
-    """None for what makes no sense."""
+    """None for an invalid sample."""
     if not isinstance(one, dict) or type(one.get('stamp_ns')) is not int:
         return None
     x, y, mbps = (_number(one.get(name)) for name in ('x', 'y', 'mbps'))
-    if mbps is None or not 0 <= mbps < FASTEST_MBPS:
+    if mbps is None or not 0 <= mbps < MAX_MBPS:
         return None
     return LinkSample(one['stamp_ns'], x, y, mbps)
 

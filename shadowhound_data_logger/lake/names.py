@@ -1,4 +1,4 @@
-"""Whether the names in a query exist: a misspelled one must not look like an answer without objects."""
+"""Checks whether the names in a query exist: a misspelled name must not look like a result without objects."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import robots
 
-MOST_NAMED: Final = 10
+MAX_SUGGESTIONS: Final = 10
 """Names in a remedy."""
 SHORT: Final = 3
-"""In a name of this length one wrong letter is a third of it, or half."""
+"""In a name of this length, one wrong letter is a third or half of it."""
 _WORD: Final = re.compile(r'[A-Za-z_]\w*', re.ASCII)
 _COLUMNS: Final = ('sensor', 'topic', 'mission_type')
 
 
 def check_name_of(what: str, name: str, known: Iterable[str | None]) -> None:
-    """Raises UnknownName, with the nearest names, for a name that is not among the known ones; if none is known, it may exist."""
+    """Raises UnknownName, with the most similar names, for a name that is not known. If no name is known, accepts any."""
     there = sorted({each for each in known if each})
     if not there or name in there:
         return
@@ -32,8 +32,8 @@ def check_name_of(what: str, name: str, known: Iterable[str | None]) -> None:
     if near:
         remedy = f'is it {" or ".join(map(repr, near))}?'
     else:
-        more = f' and {len(there) - MOST_NAMED:,} more' if len(there) > MOST_NAMED else ''
-        remedy = f'there are {", ".join(there[:MOST_NAMED])}{more}'
+        more = f' and {len(there) - MAX_SUGGESTIONS:,} more' if len(there) > MAX_SUGGESTIONS else ''
+        remedy = f'there are {", ".join(there[:MAX_SUGGESTIONS])}{more}'
     raise UnknownName(f'there is no {what} {name!r}', remedy=remedy, kind=what, name=name, near=near)
 
 
@@ -45,25 +45,25 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
 
 
 def misspelled(query: str, error: str, known: Iterable[str]) -> str:
-    """A remedy for SQL that an engine cannot answer: the names nearest to one that the query has and the error quotes, or ''.
+    """A remedy for invalid SQL: the known names most similar to an unknown one that both the query and the error contain, or ''.
 
-    ``known`` are the columns and views. It depends on no engine's wording.
+    ``known`` are the columns and views. It does not depend on the wording of the engine's errors.
     """
     there = set(known)
-    asked = set(_WORD.findall(query)) - there
+    unknown = set(_WORD.findall(query)) - there
     for name in _WORD.findall(error):
-        if name in asked and len(name) > SHORT and (near := nearest(name, there)):
+        if name in unknown and len(name) > SHORT and (near := nearest(name, there)):
             return f'is {name!r} {" or ".join(map(repr, near))}?'
     return ''
 
 
 def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None, **flags: Any) -> None:
-    """Raises UnknownName for the first name in the flags of ``lake.objects`` that nothing in the catalog has.
+    """Raises UnknownName for the first name in the flags of ``lake.objects`` that the catalog does not have.
 
-    ``kept`` are rows of what robots keep: names in them exist as well. It reads the names of all objects of the robot: call it
-    only after an empty answer. Raises StoreError, LakeError.
+    Names in ``kept``, rows of what robots keep, exist as well. Reads the names of all objects of the robot, so call it only after
+    an empty result. Raises StoreError, LakeError.
     """
-    from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - which needs it
+    from shadowhound_data_logger.lake import labels, query  # noqa: PLC0415 - imports names
 
     robot = flags.get('robot')
     if robot:
@@ -86,8 +86,8 @@ def check_names(source: Bucket, findings: Findings, kept: pa.Table | None = None
     if flags.get('label'):
         check_name_of('label', flags['label'], (each.label for each in labels.read(source, robot, findings=findings)))
     if flags.get('policy'):
-        told = query.missions(source, findings=findings, robot=robot).select(['policy', 'policies']).to_pydict()
-        ids = [name for text in (*told['policy'], *told['policies']) for name in (text or '').split(', ')]
+        found = query.missions(source, findings=findings, robot=robot).select(['policy', 'policies']).to_pydict()
+        ids = [name for text in (*found['policy'], *found['policies']) for name in (text or '').split(', ')]
         versions = [each.partition('#')[0] for each in ids if each]
         if not any('#' in flags['policy'] and each.startswith(flags['policy']) for each in ids if each):
             check_name_of('policy', flags['policy'], [*versions, *(each.partition('@')[0] for each in versions)])

@@ -1,6 +1,6 @@
-"""Pictures of an answer: a contact sheet of the images that were found, and where the objects lie on the ground.
+"""Pictures of query results: a contact sheet of images, a map of objects, the coverage of topics, and the upload speed on a map.
 
-Importing this loads Pillow; ``ground`` loads matplotlib.
+Importing this module loads Pillow; the plots load matplotlib.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ PALE: Final = '#c7cfd6'
 SKY: Final = '#9cc4e4'
 LOST: Final = ('#c0392b', '#e08e0b', '#8e44ad', '#d35400', '#7f1d1d', '#b0578d')
 """Causes of gaps, by name."""
-MOST_LINES: Final = 60
+MAX_LINES: Final = 60
 LINE_DOTS: Final = 700
-"""Across a line of coverage: a gap is drawn at least so wide."""
+"""Pixels across a line of coverage: a gap is at least one pixel wide."""
 DAY_NS: Final = 24 * 3600 * SECOND
-FARTHEST_M: Final = 1e6
+MAX_DISTANCE_M: Final = 1e6
 LETTERS: Final = 56
-"""Of a line of the title."""
+"""Per line of the title."""
 SQUARE_M: Final = 1.0
-"""Side of a square of ground whose link is one colour."""
+"""Side of a square of the map that has one color."""
 DOTS: Final = 60
-"""Area of an object on the ground, in square points, where there are few."""
+"""Largest area of an object's marker on the map, in square points."""
 
 
 def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket], title: str, target: Path) -> None:
-    """A JPEG with up to twenty of the images among the rows, evenly chosen; a frame's number is its row's, from 1.
+    """Write a JPEG with up to twenty evenly spaced images of these rows; a frame's number is that of its row, from 1.
 
-    Raises LakeError where there is none, StoreError.
+    Raises LakeError if no row has an image, StoreError.
     """
     images = [(number, row) for number, row in enumerate(rows, 1) if str(row['key']).lower().endswith(IMAGES)]
     if not images:
@@ -56,7 +56,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
         path = Path(folder, str(number))
         try:
             path.write_bytes(open_bucket(row['bucket']).get(row['key'], MOST_OBJECT_BYTES))
-        except ObjectRefused:  # the catalogue outlives what is deleted
+        except ObjectRefused:  # the catalog has deleted objects, too
             return None
         return LoggedFrame(row.get('t_start_ns') or 0, number, path)
 
@@ -74,20 +74,20 @@ def ground(
     rows: Sequence[Mapping[str, Any]], path: Sequence[tuple[float, float]], near: tuple[float, float, float] | None, title: str,
     target: Path,
 ) -> None:  # fmt: skip
-    """A PNG: the objects by their places, coloured by battery where that is known, over all poses of that time.
+    """Write a PNG with a map of the objects, colored by battery if known, over all poses of that time.
 
-    Raises LakeError where none has a place.
+    Raises LakeError if no object has a position.
     """
-    from matplotlib import rc_context  # noqa: PLC0415 - a second, for this picture alone
+    from matplotlib import rc_context  # noqa: PLC0415 - takes a second, only for this picture
     from matplotlib.figure import Figure  # noqa: PLC0415
     from matplotlib.patches import Circle  # noqa: PLC0415
 
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415
 
-    placed = [row for row in rows if _is_place(row.get('x'), row.get('y'))]
-    path = [pair for pair in path if _is_place(*pair)]
+    placed = [row for row in rows if _is_plausible(row.get('x'), row.get('y'))]
+    path = [pair for pair in path if _is_plausible(*pair)]
     if not placed:
-        raise LakeError('no object that was found has a place', remedy='was there odometry when it was recorded?')
+        raise LakeError('none of the objects has a position', remedy='check that the robot published odometry at that time')
     with rc_context(plots.STYLE):
         figure = Figure(dpi=plots.DPI, layout='constrained')
         axes = figure.add_subplot()
@@ -96,7 +96,7 @@ def ground(
             axes.scatter(east, north, s=5, c=PALE, lw=0, label='all poses')
         if near is not None:
             axes.add_patch(Circle(near[:2], near[2], fill=False, ec=plots.AMBER, lw=1.6, ls='--'))
-            axes.plot([], [], c=plots.AMBER, lw=1.6, ls='--', label='asked for')
+            axes.plot([], [], c=plots.AMBER, lw=1.6, ls='--', label='selected')
         charge = [float('nan') if row.get('battery_pct') is None else row['battery_pct'] for row in placed]
         is_known = any(value == value for value in charge)  # noqa: PLR0124 - not all are NaN
         look = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
@@ -119,9 +119,9 @@ def ground(
 
 
 def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
-    """A PNG: a line a topic over the time, each stretch in the colour of what became of it. Raises LakeError.
+    """Write a PNG with the coverage of topics: one line per topic over time, colored by state.
 
-    At least one topic, and no more than ``MOST_LINES``.
+    Raises LakeError for more than ``MAX_LINES`` topics; there must be at least one.
     """
     from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num  # noqa: PLC0415
@@ -130,7 +130,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
 
     from shadowhound_data_logger.missions import plots  # noqa: PLC0415
 
-    if len(found) > MOST_LINES:
+    if len(found) > MAX_LINES:
         raise LakeError(f'{len(found):,} topics do not fit into a picture', remedy='select with --robot or --topic')
     spans: dict[str, dict[int, list[tuple[int, int]]]] = {STORED: {}, DOWNSAMPLED: {}}
     for line, each in enumerate(found):
@@ -138,26 +138,26 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
             spans.setdefault(word, {}).setdefault(line, []).append((begin_ns, end_ns))
     open_ = spans.pop(NOT_KNOWN, {})
     causes = sorted(spans.keys() - {STORED, DOWNSAMPLED})
-    colours = {STORED: plots.BLUE, DOWNSAMPLED: SKY, **{cause: LOST[place % len(LOST)] for place, cause in enumerate(causes)},
+    colors = {STORED: plots.BLUE, DOWNSAMPLED: SKY, **{cause: LOST[place % len(LOST)] for place, cause in enumerate(causes)},
                NOT_KNOWN: PALE}  # fmt: skip
     begin_ns, end_ns = found[0].known.begin_ns, found[0].known.end_ns
-    least_ns = (end_ns - begin_ns) // LINE_DOTS
+    pixel_ns = (end_ns - begin_ns) // LINE_DOTS
     with rc_context({**plots.STYLE, 'text.parse_math': False}):  # a topic's name is not a formula
         figure = Figure(figsize=(plots.WIDTH_IN, 1.8 + 0.42 * len(found)), dpi=plots.DPI, layout='constrained')
         axes = figure.add_subplot()
         for word, lines in {**spans, NOT_KNOWN: open_}.items():
-            widest = least_ns if word in causes else 0  # a short gap is as wide as can be seen
+            min_ns = pixel_ns if word in causes else 0  # so that a short gap is visible
             for line, some in lines.items():
-                axes.broken_barh([(date2num(utc(first)), max(last - first, widest) / DAY_NS) for first, last in some],
-                                 (line - 0.36, 0.72), fc=colours[word], lw=0, zorder=3 if word in causes else 2)  # fmt: skip
+                axes.broken_barh([(date2num(utc(first)), max(last - first, min_ns) / DAY_NS) for first, last in some],
+                                 (line - 0.36, 0.72), fc=colors[word], lw=0, zorder=3 if word in causes else 2)  # fmt: skip
         axes.set_yticks(range(len(found)), [visible(f'{each.known.robot} {each.known.topic}') for each in found])
         axes.set(xlim=(date2num(utc(begin_ns)), date2num(utc(end_ns))), ylim=(len(found) - 0.5, -0.5))
         axes.xaxis.set_major_locator(locator := AutoDateLocator())
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         axes.set_title('\n'.join(textwrap.wrap(title, LETTERS)))
-        shown = [word for word in colours if spans.get(word) or (word == NOT_KNOWN and open_)]
+        shown = [word for word in colors if spans.get(word) or (word == NOT_KNOWN and open_)]
         figure.legend(
-            handles=[Patch(fc=colours[word], label=visible(word)) for word in shown], loc='outside lower center', ncols=4
+            handles=[Patch(fc=colors[word], label=visible(word)) for word in shown], loc='outside lower center', ncols=4
         )
         try:
             figure.savefig(target, format='png')
@@ -166,7 +166,7 @@ def coverage(found: Sequence[Coverage], title: str, target: Path) -> None:
 
 
 def wifi(found: Sequence[LinkSample], title: str, target: Path) -> None:
-    """A PNG: squares of ground in the colour of how fast uploads went there. Raises LakeError where no sample has a place."""
+    """Write a PNG with a map of the upload speed in squares of ground. Raises LakeError if no sample has a position."""
     from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
@@ -174,10 +174,12 @@ def wifi(found: Sequence[LinkSample], title: str, target: Path) -> None:
 
     squares: dict[tuple[int, int], list[float]] = {}
     for one in found:
-        if one.x is not None and one.y is not None and _is_place(one.x, one.y):
+        if one.x is not None and one.y is not None and _is_plausible(one.x, one.y):
             squares.setdefault((math.floor(one.x / SQUARE_M), math.floor(one.y / SQUARE_M)), []).append(one.mbps)
     if not squares:
-        raise LakeError('no sample of the link has a place', remedy='was there odometry, and something to upload?')
+        raise LakeError(
+            'no sample of the link has a position', remedy='check that the robot had odometry and something to upload'
+        )
     with rc_context(plots.STYLE):
         figure = Figure(figsize=(plots.WIDTH_IN, plots.WIDTH_IN), dpi=plots.DPI, layout='constrained')
         axes = figure.add_subplot()
@@ -194,6 +196,6 @@ def wifi(found: Sequence[LinkSample], title: str, target: Path) -> None:
             raise LakeError(f'{target} cannot be written: {error.strerror or error}', remedy=UNWRITABLE) from error
 
 
-def _is_place(x: float | None, y: float | None) -> bool:
-    """Whether a robot can have been there: what somebody made up would set the scale for all the others."""
-    return x is not None and y is not None and abs(x) < FARTHEST_M and abs(y) < FARTHEST_M
+def _is_plausible(x: float | None, y: float | None) -> bool:
+    """Whether a robot can have been there: a forged position would set the scale of the map."""
+    return x is not None and y is not None and abs(x) < MAX_DISTANCE_M and abs(y) < MAX_DISTANCE_M

@@ -1,4 +1,4 @@
-"""The contents of objects for one process that reads a data set: prefetched by a few threads, verified, in bounded memory."""
+"""The contents of objects for one process that reads a dataset: prefetched by a few threads, verified, in bounded memory."""
 
 from __future__ import annotations
 
@@ -28,45 +28,45 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _PATIENT: Final = UploadSettings(threads=32, connect_timeout_s=10.0, read_timeout_s=60.0)
-"""The timeouts of all other readers (stores/s3_obstore.py), and connections for several data sets in one process."""
+"""The timeouts of all other readers (stores/s3_obstore.py), and connections for several datasets in one process."""
 _locks: Final[dict[int, threading.Lock]] = {}
-"""Process id -> its lock."""
+"""Process id -> lock."""
 Read = Callable[[str, str, int], bytes]
 """Bucket, key and size -> content."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where contents come from: a store, or a folder of fetched objects. Can be sent to another process."""
+    """Where contents are read from: a store, or a folder of fetched objects. A value that can be sent to another process."""
 
     settings: StoreSettings
     folder: Path | None = None
-    """Fetched objects, as ``DIR/KEY``; with a folder nothing is read from the store."""
+    """Fetched objects, as ``DIR/KEY``; if set, the store is not used."""
 
-    def read(self, bucket: str, key: str, most: int) -> bytes:
-        """Return an object's content. Raises StoreError; ObjectRefused, with nothing read, for more than ``most`` bytes."""
+    def read(self, bucket: str, key: str, limit: int) -> bytes:
+        """Return an object's content. Raises StoreError, and ObjectRefused for more than ``limit`` bytes."""
         if self.folder is None:
             store = _of_this_process(self.settings)
-            return steadily(lambda: store.get(bucket, key, most))
+            return steadily(lambda: store.get(bucket, key, limit))
         where: dict[str, Any] = {'bucket': bucket, 'key': key}
         try:
             path = path_below(self.folder, key)
             with path.open('rb') as file:
-                body = file.read(most + 1)
+                body = file.read(limit + 1)
         except NameRefused as error:
             raise ObjectRefused(str(error), reason='name', **where) from error
         except OSError as error:
             raise ObjectRefused(f'{path} cannot be read: {error.strerror}', reason='missing', **where) from error
-        if len(body) > most:
-            raise ObjectRefused(f'{path} has more than {most:,} bytes', reason='size', **where)
+        if len(body) > limit:
+            raise ObjectRefused(f'{path} has more than {limit:,} bytes', reason='size', **where)
         return body
 
 
 class Prefetch:
-    """Fetches contents ahead of their use, in a few threads, and keeps what it returned while that fits into ``keep_bytes``.
+    """Fetches contents in advance, in a few threads, and caches up to ``keep_bytes`` of those that it returned.
 
-    Life: new; ``ahead`` and ``get`` on one thread; close. The threads start with the first ``ahead`` and only read: everything
-    else happens on the caller's thread, so nothing needs a lock.
+    Lifecycle: New; ``ahead`` and ``get`` on one thread; close. The first ``ahead`` starts the threads, which only read.
+    Everything else runs on the caller's thread, so no lock is needed.
     """
 
     def __init__(self, read: Read, keep_bytes: int, threads: int) -> None:
@@ -88,7 +88,7 @@ class Prefetch:
         self.close()
 
     def close(self) -> None:
-        """Wait for the requests under way; idempotent."""
+        """Wait for running requests; idempotent."""
         self._over.set()
         pool, self._pool = self._pool, None
         if pool is not None:
@@ -96,7 +96,7 @@ class Prefetch:
         self._waiting.clear()
 
     def ahead(self, objects: Iterable[Object]) -> None:
-        """Start to fetch these; ``settle`` them when they are not needed any more."""
+        """Start fetching these; call ``settle`` when they are no longer needed."""
         for each in objects:
             name = (each.bucket, each.key)
             if name not in self._kept and name not in self._waiting:
@@ -106,7 +106,7 @@ class Prefetch:
                 self.waiting_bytes += each.size
 
     def get(self, wanted: Object) -> bytes:
-        """Return the content. Raises StoreError, and LakeError for content that is not what was stored."""
+        """Return the content. Raises StoreError, and LakeError for damaged content."""
         name = (wanted.bucket, wanted.key)
         if (body := self._kept.get(name)) is not None:
             self._kept.move_to_end(name)
@@ -116,7 +116,7 @@ class Prefetch:
         return body
 
     def settle(self, objects: Iterable[Object]) -> None:
-        """Forget those of these that nobody asked for."""
+        """Discard those of these that were fetched but not used."""
         for each in objects:
             waiting = self._waiting.pop((each.bucket, each.key), None)
             if waiting is not None:
@@ -136,7 +136,7 @@ class Prefetch:
 
     def _verified(self, wanted: Object) -> bytes:
         if not 0 < wanted.size <= MOST_OBJECT_BYTES:
-            text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes; more than {MOST_OBJECT_BYTES:,} are not decoded'
+            text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes, allowed are up to {MOST_OBJECT_BYTES:,}'
             raise LakeError(text, bucket=wanted.bucket, key=wanted.key)
 
         def once() -> bytes:
@@ -150,14 +150,14 @@ class Prefetch:
         except ObjectRefused as error:
             if error.data.get('reason') != 'damaged':
                 raise
-            text = f'the content of {wanted.bucket}/{wanted.key} is not what was stored'
+            text = f'the content of {wanted.bucket}/{wanted.key} is damaged: its SHA-256 differs'
             raise LakeError(text, bucket=wanted.bucket, key=wanted.key) from error
 
 
 def _of_this_process(settings: StoreSettings) -> ObjectStore:
-    """A forked process opens its own store: it inherits no thread, connection or lock from the parent."""
+    """The store of this process: a forked process must not use its parent's threads, connections and locks."""
     process = os.getpid()
-    with _locks.setdefault(process, threading.Lock()):  # else each thread would open one, of half a second and megabytes
+    with _locks.setdefault(process, threading.Lock()):  # otherwise each thread would open a store (half a second, megabytes)
         return _opened(settings, process)
 
 

@@ -1,11 +1,11 @@
-"""``lake prune``: deletes objects that rules name, and keeps a row about each (``formats/rows/schema.py``, ``FORGOTTEN``).
+"""``lake prune``: deletes objects by retention rules, and keeps a row about each (``formats/rows/schema.py``, ``FORGOTTEN``).
 
-In this order: a row file with those rows, statements of the gap journal, the commit of the rows to shared tables, the deletion
-of the objects, and a mark next to the row file that says that they are deleted. So a run can be killed at any moment, and two can
-run at a time: an object can be listed as deleted while it still exists, until the next run deletes it, but never the reverse.
+It proceeds in this order: a row file with those rows, statements of the gap journal, the commit of the rows to shared tables, the
+deletion of the objects, and a marker next to the row file. A run can be killed at any moment, and two can run at the same time:
+an object can be listed as deleted while it still exists, until the next run deletes it, but never the reverse.
 
-What no rule names is kept, and so is what a dataset, a label or an open request of a robot's mailbox refers to. A bag, and what
-a mission stored, is deleted completely or not at all.
+Objects of sensors without a rule are kept, and so are objects that a dataset, a label or an open request of a robot's mailbox
+refers to. A bag, and the objects of a mission, are deleted completely or not at all.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 FOREVER: Final = 'forever'
 BAGS, EVENTS = 'bags', 'events'
-"""Names of recordings in a rule; the manifest of a recording shows whether an event started it."""
+"""Names of recordings in a rule; a recording's manifest shows whether an event started it."""
 BAG_SENSORS: Final = frozenset({'bag', 'rosbags'})
 MISSIONS: Final = 'missions'
-EXPORT, LABEL, REQUEST, UNTOLD = 'data set', 'label', 'request', 'no manifest'
-"""Why an object that a rule names is kept."""
-MOST_ROWS: Final = 10_000
-"""Of a row file."""
-MOST_NAMES: Final = 20
-"""Listed per sensor."""
+EXPORT, LABEL, REQUEST, NO_MANIFEST = 'data set', 'label', 'request', 'no manifest'
+"""Why an object that a rule would delete is kept."""
+MAX_ROWS: Final = 10_000
+"""Per row file."""
+MAX_NAMES: Final = 20
+"""Referrers listed per sensor."""
 REPEATS: Final = '_repeats'
-"""In the names of row files about repeats: their objects are named in other files, by which they are deleted."""
+"""Part of the names of row files about repeats; other row files name the objects with their content, and cause the deletion."""
 DELETED: Final = '.deleted'
-"""Appended to the key of a row file whose objects are deleted."""
+"""Suffix of the marker next to a row file whose objects are deleted."""
 KIND, CAUSE = 'forgotten', 'retention'
-"""Of the gaps."""
+"""Kind and cause of the gaps."""
 RULES: Final = "a text such as 'camera 90d, lidar 14d, events forever': a sensor and for how long to keep it, as often as needed"
 DAY_NS: Final = 24 * HOUR_NS
 _RULE: Final = re.compile(r'([A-Za-z0-9][\w-]*)\s+(\S+)', re.ASCII)
@@ -73,16 +73,16 @@ _COLUMNS: Final = ('robot', 'sensor', 'topic', 'bucket', 'key', 'bytes', 't_star
 
 
 class RetentionRule(NamedTuple):
-    """For how long the objects of a sensor are kept."""
+    """How long the objects of a sensor are kept."""
 
     sensor: str
     text: str
     since_ns: int | None
-    """Objects that ended before it are deleted; None: none."""
+    """Objects that ended before this time are deleted; None: none."""
 
 
 def keep_rules(text: str, now_ns: int) -> tuple[RetentionRule, ...]:
-    """Raises SettingError for invalid rules."""
+    """Parse rules such as ``camera 90d, events forever``. Raises SettingError."""
     found: dict[str, RetentionRule] = {}
     for part in text.split(','):
         match = _RULE.fullmatch(part.strip())
@@ -90,17 +90,17 @@ def keep_rules(text: str, now_ns: int) -> tuple[RetentionRule, ...]:
             raise SettingError('--keep', text, RULES)
         sensor = BAGS if match[1] in BAG_SENSORS else match[1]
         if sensor in found:
-            raise SettingError('--keep', text, f'one rule for each sensor, and there are two for {sensor}')
+            raise SettingError('--keep', text, f'one rule per sensor, but there are two for {sensor}')
         since_ns = None if match[2] == FOREVER else moment('--keep', match[2], now_ns)
         if since_ns is not None and since_ns > now_ns:
-            raise SettingError('--keep', text, f'a time that has passed, which {match[2]} has not')
+            raise SettingError('--keep', text, f'a time in the past, but {match[2]} is in the future')
         found[sensor] = RetentionRule(sensor, f'{sensor} {match[2]}', since_ns)
     return tuple(found.values())
 
 
 @dataclass(slots=True)
 class PrunedSensor:
-    """What the store has of a sensor, and what of it will be deleted."""
+    """The objects of a sensor in the store, and those of them that will be deleted."""
 
     sensor: str
     rule: str = ''
@@ -109,26 +109,26 @@ class PrunedSensor:
     going: int = 0
     going_bytes: int = 0
     protected: Counter[str] = field(default_factory=Counter)
-    """Reason -> how many objects are kept that the rules would delete."""
+    """Reason -> number of objects that are kept although the rules would delete them."""
     referrers: set[str] = field(default_factory=set)
-    """The first of the datasets, labels and requests that refer to those."""
+    """The first datasets, labels and requests that refer to these."""
 
     @property
     def is_all(self) -> bool:
-        """Whether nothing of it will be left."""
+        """Whether all objects of the sensor will be deleted."""
         return 0 < self.objects == self.going
 
 
 class Protection:
-    """What must be kept, whatever the rules are: objects and times to which something refers."""
+    """Objects and times that must be kept regardless of the rules, because something refers to them."""
 
-    def __init__(self, exported: Mapping[tuple[str, str], str] | None = None, labelled: Iterable[labels.Label] = (),
+    def __init__(self, exported: Mapping[tuple[str, str], str] | None = None, labeled: Iterable[labels.Label] = (),
                  requests: Mapping[str, Sequence[tuple[str, KeptFilter]]] | None = None) -> None:  # fmt: skip
         self._exported = exported or {}
         self._requests = requests or {}
         self._keys: dict[tuple[str, str], str] = {}
         self._spans: defaultdict[str, list[tuple[int, int, str]]] = defaultdict(list)
-        for each in labelled:
+        for each in labeled:
             if each.key is not None:
                 self._keys[each.bucket or BUCKET, each.key] = each.label
             else:
@@ -140,10 +140,10 @@ class Protection:
             self._latest[robot] = [latest := max(latest, until_ns) for _, until_ns, _ in spans]
 
     def why(self, row: Row) -> tuple[str, str] | None:
-        """Why an object is kept, and what refers to it; None if nothing does."""
+        """Why an object is kept, and what refers to it; None if it is not protected."""
         name = row['bucket'], row['key']
-        if (data_set := self._exported.get(name)) is not None:
-            return EXPORT, data_set
+        if (dataset := self._exported.get(name)) is not None:
+            return EXPORT, dataset
         if (label := self._keys.get(name) or self._label_of(row)) is not None:
             return LABEL, label
         metadata = {word: row[word] for word in (words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if row[word] is not None}
@@ -155,7 +155,7 @@ class Protection:
         return None
 
     def any_of(self, row: Row) -> tuple[str, str] | None:
-        """The same for an object with its repeats."""
+        """The same for an object and its repeats."""
         return next((found for each in (row, *row['repeats']) if (found := self.why(each)) is not None), None)
 
     def _label_of(self, row: Row) -> str | None:
@@ -173,7 +173,7 @@ class Protection:
 
 @dataclass(slots=True)
 class PrunePlan:
-    """What a prune will do; ``apply`` does it."""
+    """The plan of a prune, which ``apply`` carries out."""
 
     rules: tuple[RetentionRule, ...]
     robots: tuple[str, ...]
@@ -181,11 +181,11 @@ class PrunePlan:
     is_forced: bool
     protection: Protection = field(repr=False)
     cut_ns: int = 0
-    """To reach the size, objects that ended before this are deleted as well, of sensors whose rule is not ``forever``."""
+    """To reach the size, objects that ended before this time are also deleted, if the rule of their sensor is not ``forever``."""
     over_bytes: int = 0
-    """How much the requested size is exceeded afterwards."""
+    """By how much the store exceeds the requested size afterwards."""
     unfinished: int = 0
-    """Row files of an earlier run, which may not have deleted all of their objects."""
+    """Row files of an earlier run that may not have deleted all of their objects."""
     groups: dict[str, _Group] = field(repr=False, default_factory=dict)
 
     @property
@@ -197,39 +197,39 @@ class PrunePlan:
         return sum(each.going_bytes for each in self.sensors.values())
 
     def known_sensors(self) -> tuple[str, ...]:
-        """What a rule can name: the sensors with objects, and those that every robot and store can have."""
+        """The names that a rule can have: the sensors with objects, and those that every robot and store can have."""
         there = [name for name, each in self.sensors.items() if each.objects]
         return (*there, *DEFAULT_SENSORS, BAGS, EVENTS, MISSIONS) if there else ()
 
-    def lets_go(self, why: tuple[str, str] | None) -> bool:
-        """Whether an object that the rules name is deleted although this protects it."""
-        return why is None or (self.is_forced and why[0] != UNTOLD)
+    def may_delete(self, why: tuple[str, str] | None) -> bool:
+        """Whether an object may be deleted in spite of this protection."""
+        return why is None or (self.is_forced and why[0] != NO_MANIFEST)
 
     def since_ns(self, sensor: str) -> int | None:
-        """Objects of a sensor that ended before this are deleted; None: none."""
+        """The time before which objects of a sensor must have ended to be deleted; None: none is deleted."""
         found = next((rule.since_ns for rule in self.rules if rule.sensor == sensor), None)
         return None if found is None else max(found, self.cut_ns)
 
 
 @dataclass(slots=True)
 class Pruned:
-    """What a prune did."""
+    """The result of a prune."""
 
     objects: int = 0
     bytes: int = 0
-    mended: int = 0
-    """Objects of an earlier run that it may not have deleted."""
+    resumed: int = 0
+    """Objects whose deletion an earlier run may not have finished."""
 
 
 def protection(source: Bucket, named: Sequence[str], exported: Mapping[tuple[str, str], str]) -> Protection:
-    """What refers to data of these robots; ``exported`` maps (bucket, key) to the dataset that has values of it.
+    """Find everything that refers to data of these robots; ``exported`` maps (bucket, key) to the dataset with its values.
 
-    Raises LakeError if a label or a mailbox cannot be read, because it is unknown what it refers to. Raises StoreError.
+    Raises LakeError if a label or a mailbox cannot be read, because then it is unknown what it refers to. Raises StoreError.
     """
-    left_out = Findings(lambda _: None)
-    found = [one for name in named for one in labels.read(source, name, findings=left_out)]
-    for one in left_out:
-        raise LakeError(f'the labels cannot be read: {one}', remedy='move the part away: nothing is deleted until they can')
+    skipped = Findings(lambda _: None)
+    found = [one for name in named for one in labels.read(source, name, findings=skipped)]
+    for one in skipped:
+        raise LakeError(f'the labels cannot be read: {one}', remedy='move that file away; until then nothing is deleted')
     requests = {name: [(each.id, each.want) for each in pull.unanswered(source, name)] for name in named}
     return Protection(exported, found, requests)
 
@@ -250,9 +250,9 @@ class _Group:
 
 
 def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = None, exported: Mapping[tuple[str, str], str],  # noqa: PLR0913
-         most_bytes: int | None = None, is_forced: bool = False, findings: Findings,
+         max_bytes: int | None = None, is_forced: bool = False, findings: Findings,
          tell: Callable[[str], None] = lambda _: None) -> PrunePlan:  # fmt: skip
-    """What these rules delete and, if more than ``most_bytes`` is left, also the oldest days of the sensors that they name.
+    """Plan which objects these rules delete; if more than ``max_bytes`` would be left, also the oldest days of their sensors.
 
     Raises LakeError, StoreError.
     """
@@ -270,18 +270,18 @@ def plan(source: Bucket, rules: Sequence[RetentionRule], *, robot: str | None = 
                 _grouped(made, row)
     if not {BAGS, EVENTS}.isdisjoint(made.sensors):
         with ThreadPoolExecutor(THREADS, 'prune') as pool:
-            for _ in pool.map(lambda group: _tell_events_apart(source, group), made.groups.values()):
+            for _ in pool.map(lambda group: _read_manifest(source, group), made.groups.values()):
                 pass
     for group in made.groups.values():
         counts.add(group.sensor, group.objects, group.bytes, group.end_ns, lambda group=group: group.why)  # type: ignore[misc]
-    if most_bytes is not None:
-        counts.cut(most_bytes)
-    made.unfinished = sum(len(_begun(source, name, findings)[1]) for name in named)
+    if max_bytes is not None:
+        counts.cut(max_bytes)
+    made.unfinished = sum(len(_unfinished(source, name, findings)[1]) for name in named)
     return made
 
 
 class _Counts:
-    """Adds up what each sensor has, and what of it will be deleted."""
+    """Counts the objects of each sensor, and those that will be deleted."""
 
     def __init__(self, made: PrunePlan) -> None:
         self._made = made
@@ -297,10 +297,10 @@ class _Counts:
         if since_ns is None:
             return
         why = ask_why()
-        is_free = self._made.lets_go(why)
+        is_free = self._made.may_delete(why)
         if end_ns < since_ns and why is not None:
             one.protected[why[0]] += objects
-            if len(one.referrers) < MOST_NAMES:
+            if len(one.referrers) < MAX_NAMES:
                 one.referrers.add(f'{why[0]} {why[1]}')
         if end_ns < since_ns and is_free:
             one.going += objects
@@ -310,37 +310,37 @@ class _Counts:
             day[0] += objects
             day[1] += size
 
-    def cut(self, most_bytes: int) -> None:
-        """Also delete the oldest days, until so much is left."""
+    def cut(self, max_bytes: int) -> None:
+        """Also delete the oldest days, until at most ``max_bytes`` are left."""
         left = self.total - self._made.going_bytes
         for day in sorted(self._younger):
-            if left <= most_bytes:
+            if left <= max_bytes:
                 break
             self._made.cut_ns = (day + 1) * DAY_NS
             for sensor, (objects, size) in self._younger[day].items():
                 self._made.sensors[sensor].going += objects
                 self._made.sensors[sensor].going_bytes += size
                 left -= size
-        self._made.over_bytes = max(0, left - most_bytes)
+        self._made.over_bytes = max(0, left - max_bytes)
 
 
 def apply(source: Bucket, store: ObjectStore, made: PrunePlan, *, now_ns: int, findings: Findings,
           tell: Callable[[str], None] = lambda _: None) -> Pruned:  # fmt: skip
-    """Finish an earlier run, then do what was planned. Raises LakeError, StoreError: a later run continues."""
+    """Finish an earlier run, then carry out the plan. Raises LakeError, StoreError; after an error, a later run continues."""
     done = Pruned()
     try:
         for robot in made.robots:
-            done.mended += _settle(source, store, robot, findings, tell)
+            done.resumed += _finish_deletion(source, store, robot, findings, tell)
             for rows in _by_day(source, [robot], findings, tell):
-                going = [row for row in rows if _goes(made, row)]
-                _state_bags(store, made, going)
+                going = [row for row in rows if _is_deleted(made, row)]
+                _put_bag_statements(store, made, going)
                 _put_rows(store, made, robot, [each for row in going for each in row['repeats']], now_ns, REPEATS)
                 _put_rows(store, made, robot, going, now_ns)
                 done.objects += len(going)
                 done.bytes += sum(row['bytes'] for row in going)
-            _settle(source, store, robot, findings, tell)
+            _finish_deletion(source, store, robot, findings, tell)
     except AccessDenied as error:
-        raise LakeError(f'these credentials may not prune: {error.what}',
+        raise LakeError(f'these credentials do not permit pruning: {error.what}',
                         remedy='use those of the user `prune` (docs/tower.md)') from error  # fmt: skip
     return done
 
@@ -348,13 +348,13 @@ def apply(source: Bucket, store: ObjectStore, made: PrunePlan, *, now_ns: int, f
 def _put_rows(store: ObjectStore, made: PrunePlan, robot: str, rows: Iterable[Row], now_ns: int, mark: str = '') -> None:
     for _, date, numbered in parts.by_folder(enumerate(rows)):
         some = [_forgotten_row(made, row, now_ns) for _, row in numbered]
-        for start in range(0, len(some), MOST_ROWS):
-            part = some[start : start + MOST_ROWS]
+        for start in range(0, len(some), MAX_ROWS):
+            part = some[start : start + MAX_ROWS]
             key = FORGOTTEN.part_key(robot, date, f'{date.replace("-", "")}{mark}_{_digest(part)}')
             put_part(store, key, robot, parts.encode(part, FORGOTTEN), len(part))
 
 
-def _goes(made: PrunePlan, row: Row) -> bool:
+def _is_deleted(made: PrunePlan, row: Row) -> bool:
     group = None if row['group'] is None else made.groups.get(row['group'])
     if row['group'] is not None and group is None:
         return False  # it was added after the plan was made
@@ -362,14 +362,14 @@ def _goes(made: PrunePlan, row: Row) -> bool:
     since_ns = made.since_ns(sensor)
     if since_ns is None or end_ns >= since_ns:
         return False
-    return made.lets_go(made.protection.any_of(row) if group is None else group.why)
+    return made.may_delete(made.protection.any_of(row) if group is None else group.why)
 
 
 def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Callable[[str], None]) -> Iterator[list[Row]]:
-    """The rows of what the store has, the newest day of a robot first; each object once.
+    """The rows of all objects in the store, the newest day of each robot first; each object once.
 
-    Each with ``name`` (what a rule calls its sensor), ``group``, ``end_ns``, and as ``repeats`` the other rows that name it as
-    their content: it is as old as the youngest of them.
+    Each row has ``name`` (the sensor's name in rules), ``group``, ``end_ns``, and ``repeats``: the other rows with this object as
+    their content. An object is as old as the youngest of them.
     """
     columns = ', '.join(map(quoted, _COLUMNS))
     for robot in named:
@@ -385,9 +385,9 @@ def _by_day(source: Bucket, named: Sequence[str], findings: Findings, tell: Call
 
 
 def _rows_of(found: pa.Table, robot: str, date: str, later: defaultdict[tuple[str, str], list[Row]]) -> Iterator[Row]:
-    """``later`` has the rows of younger days whose key has another date than theirs; those of this day are added to it.
+    """``later`` collects the rows of younger days whose key has another date than the row, including those of this day.
 
-    Such a row is a repeat of an older object, or forged: nothing is deleted because of it alone.
+    Such a row is a repeat of an older object, or forged; on its own it never causes a deletion.
     """
     day = date.replace('-', '')
     own: dict[tuple[str, str], Row] = {}
@@ -429,15 +429,18 @@ def _grouped(made: PrunePlan, row: Row) -> None:
     group.why = group.why or made.protection.any_of(row)
 
 
-def _tell_events_apart(source: Bucket, group: _Group) -> None:
-    """By the manifest. A bag without one is kept: an event may have started it, or it may still be recorded."""
+def _read_manifest(source: Bucket, group: _Group) -> None:
+    """Read the manifest of a bag, and whether an event started it.
+
+    A bag without a manifest is kept: an event may have started it, or it may still be recorded.
+    """
     if group.sensor != BAGS:
         return
     try:
         body = source.get(f'{group.prefix}manifest.json', MOST_DOCUMENT_BYTES)
         group.manifest = Manifest.from_json(body)
     except (ObjectRefused, BagDamaged):
-        group.why = UNTOLD, group.prefix
+        group.why = NO_MANIFEST, group.prefix
         return
     group.sensor = BAGS if group.manifest.event is None else EVENTS
 
@@ -448,12 +451,12 @@ def _end_ns(row: Row) -> int:
 
 
 def _key_ns(key: str) -> int:
-    """The latest date in a key, 0 without one: a robot can write a row with an older time, but not another key."""
-    return max((_begin_ns(date) for date in _DATE.findall(key)), default=0)
+    """The latest date in a key, 0 without a date: a robot can forge the time in a row, but not the key of the object."""
+    return max((_start_of_day_ns(date) for date in _DATE.findall(key)), default=0)
 
 
 @lru_cache(maxsize=4096)
-def _begin_ns(date: str) -> int:
+def _start_of_day_ns(date: str) -> int:
     try:
         day = datetime.strptime(date, '%Y%m%d').replace(tzinfo=timezone.utc)
     except ValueError:
@@ -464,8 +467,8 @@ def _begin_ns(date: str) -> int:
 def _forgotten_row(made: PrunePlan, row: Row, now_ns: int) -> Row:
     of = row['name'] if row['group'] is None else made.groups[row['group']].sensor
     rule = next(rule.text for rule in made.rules if rule.sensor == of)
-    told = {name: row[name] for name in FORGOTTEN.columns if name in row}
-    return {**told, 't_start': row['t_start_ns'] // 1000, 'rule': rule, 'forgotten': now_ns // 1000, 'forgotten_ns': now_ns,
+    kept = {name: row[name] for name in FORGOTTEN.columns if name in row}
+    return {**kept, 't_start': row['t_start_ns'] // 1000, 'rule': rule, 'forgotten': now_ns // 1000, 'forgotten_ns': now_ns,
             'format_version': FORMAT_VERSION}  # fmt: skip
 
 
@@ -475,7 +478,7 @@ def _digest(rows: Iterable[Row]) -> str:
 
 
 def forgotten(source: Bucket, robot: str | None, findings: Findings) -> pa.Table:
-    """What was deleted, with the columns of ``FORGOTTEN``, by time; each object once. Raises StoreError, LakeError."""
+    """The deleted objects, with the columns of ``FORGOTTEN``, by time; each object once. Raises StoreError, LakeError."""
     return rows_of(source, FORGOTTEN, findings, robot=robot, order='t_start_ns, forgotten_ns')
 
 
@@ -488,13 +491,13 @@ def dates_of_deletion(rows: pa.Table) -> dict[tuple[str, str], str]:
 # -- objects that are listed as deleted -----------------------------------------------------------------------------------------
 
 
-def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
-    """Delete what has a row and is not marked as deleted yet; how many objects that were."""
-    files, unmarked = _begun(source, robot, findings)
+def _finish_deletion(source: Bucket, store: ObjectStore, robot: str, findings: Findings, tell: Callable[[str], None]) -> int:
+    """Delete the objects that are listed as deleted but not marked yet; returns their number."""
+    files, unmarked = _unfinished(source, robot, findings)
     for date in sorted({file.date for file in unmarked}):
-        _state(store, robot, source, [file for file in files if file.date == date], findings)
+        _put_gap_statements(store, robot, source, [file for file in files if file.date == date], findings)
     tables = Tables.of(source)
-    if tables.is_shared and unmarked:  # no reader of the tables alone may expect an object that is deleted
+    if tables.is_shared and unmarked:  # before the deletion: readers of the tables must not expect deleted objects
         ingest(source, tables, findings, pending(tables.open(INGESTED), unmarked))
     done = 0
     with ThreadPoolExecutor(THREADS, 'prune') as pool:
@@ -509,15 +512,15 @@ def _settle(source: Bucket, store: ObjectStore, robot: str, findings: Findings, 
     return done
 
 
-def _begun(source: Bucket, robot: str, findings: Findings) -> tuple[list[RowFile], list[RowFile]]:
-    """The row files about deleted objects, and those of them that are not marked: some of their objects may still exist."""
+def _unfinished(source: Bucket, robot: str, findings: Findings) -> tuple[list[RowFile], list[RowFile]]:
+    """The row files about deleted objects, and those of them without a marker, whose objects may still exist."""
     marks = {entry.key for entry in source.list(FORGOTTEN.prefix(robot)) if entry.key.endswith(DELETED)}
     files = row_files(source, findings, Scope((FORGOTTEN,), robot))
     return files, [file for file in files if file.entry.key + DELETED not in marks]
 
 
-def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFile], findings: Findings) -> None:
-    """Statements of the gap journal about the deleted objects of a date, one per topic and hour; the newest one counts."""
+def _put_gap_statements(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFile], findings: Findings) -> None:
+    """Upload statements of the gap journal about the deleted objects of a date, one per topic and hour; the newest counts."""
     hours: defaultdict[tuple[str, int], dict[tuple[str, str, int], Row]] = defaultdict(dict)
     for found_in in read(source, files, findings):
         for row in found_in.rows:
@@ -537,8 +540,8 @@ def _state(store: ObjectStore, robot: str, source: Bucket, files: Sequence[RowFi
     _put_statements(store, robot, found)
 
 
-def _state_bags(store: ObjectStore, made: PrunePlan, going: Iterable[Row]) -> None:
-    """For each bag that is deleted, one statement per topic, from its manifest, which is deleted as well."""
+def _put_bag_statements(store: ObjectStore, made: PrunePlan, going: Iterable[Row]) -> None:
+    """For each deleted bag, upload one statement per topic, from its manifest, which is deleted as well."""
     for name in sorted({row['group'] for row in going if row['group'] is not None}):
         group = made.groups[name]
         if group.manifest is None:
@@ -555,6 +558,6 @@ def _state_bags(store: ObjectStore, made: PrunePlan, going: Iterable[Row]) -> No
 def _put_statements(store: ObjectStore, robot: str, found: Sequence[journal.Statement]) -> None:
     for date, rows in groupby(sorted(found, key=journal.date_of), journal.date_of):
         part = list(rows)
-        said = '\n'.join(f'{row["id"]} {row["revision"]}' for row in part)
-        name = f'{date.replace("-", "")}_{KIND}_{hashlib.sha256(said.encode()).hexdigest()[:16]}'
+        ids = '\n'.join(f'{row["id"]} {row["revision"]}' for row in part)
+        name = f'{date.replace("-", "")}_{KIND}_{hashlib.sha256(ids.encode()).hexdigest()[:16]}'
         put_part(store, journal.GAPS.part_key(robot, date, name), robot, parts.encode(part, journal.GAPS), len(part))

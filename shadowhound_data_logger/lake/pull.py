@@ -1,6 +1,6 @@
-"""Requests what a robot keeps: which objects it keeps, the mailbox that it polls, and its answers.
+"""Requests the objects that a robot keeps: lists them, writes requests to the mailbox that it polls, and reads its answers.
 
-Requesters share a mailbox (core/mailbox.py): each reads it, and replaces it only if it has not changed since.
+Requesters share a robot's mailbox (core/mailbox.py): each reads it, and replaces it only if it has not changed since.
 """
 
 from __future__ import annotations
@@ -58,19 +58,19 @@ from shadowhound_data_logger.stores.base import ObjectStore
 FINAL: Final = frozenset({'done', 'expired', 'cancelled', 'refused'})
 """States after which a request gets no further answer."""
 TRIES: Final = 60
-"""To replace the mailbox: of a hundred requesters at a time, one succeeds in each round."""
+"""Attempts to replace the mailbox: of a hundred concurrent requesters, one succeeds per round."""
 PAUSE_S: Final = 0.2
-"""The longest pause between two tries; it doubles ten times."""
-MOST_OF_ONE: Final = 128
-"""Open requests per requester, so that others have room in the mailbox."""
+"""The longest first pause between two attempts; it doubles up to four times."""
+MAX_REQUESTS_PER_USER: Final = 128
+"""Open requests per requester, so that the mailbox has space for others."""
 ANSWERS_TRIED: Final = 8
-"""Invalid answers that are skipped, from the newest one on."""
-MOST_ANSWER_BYTES: Final = 1 << 20
-LOOK_S: Final = 2.0
-LOOKS: Final = 90
-"""For the rows of what the robot sent."""
+"""The newest answers that are tried until one is valid."""
+MAX_ANSWER_BYTES: Final = 1 << 20
+POLL_S: Final = 2.0
+MAX_POLLS: Final = 90
+"""How often to poll for the rows of the objects that the robot uploaded."""
 _OF_ROBOT: Final = ('robot', 'since', 'until', 'near', 'near_gps', 'mission', 'mission_type')
-"""Flags that a request can have; the others select among what the robot sent."""
+"""Flags that a request can have; the other flags select among the uploaded objects."""
 _DAY_NS: Final = 24 * 3600 * 10**9
 
 
@@ -81,21 +81,21 @@ class PullState:
     id: str
     by: str
     state: str
-    """``asked`` until the robot has answered; then that of its newest answer."""
+    """``asked`` until the robot has answered; then the state of its newest answer."""
     priority: int | None
     want: dict[str, Any]
     answer: RequestAnswer | None
-    """The newest one."""
+    """The newest answer."""
 
 
 def kept(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
-    """Rows of what a robot keeps and the filter selects, with the columns of ``KEPT``. Raises StoreError."""
+    """The rows of objects that a robot keeps and that match the filter, with the columns of ``KEPT``. Raises StoreError."""
     rows = known(source, robot, want, findings)
     return rows.filter(pc.equal(rows['where'], ON_ROBOT))
 
 
 def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> pa.Table:
-    """The same, with rows of what it has lost. Raises StoreError."""
+    """The same, including rows of objects that the robot has lost. Raises StoreError."""
     early = Wanted(robot=robot, since_ns=None if want.since_ns is None else want.since_ns - _DAY_NS, until_ns=want.until_ns)
     has_date = early.has_date if early.since_ns is not None or early.until_ns is not None else None
     columns = ', '.join(map(quoted, KEPT.columns))
@@ -106,20 +106,20 @@ def known(source: Bucket, robot: str, want: KeptFilter, findings: Findings) -> p
     of_robot = f'SELECT k.*, {newest} FROM all_kept k WHERE robot = {literal(robot)} AND NOT EXISTS ({stored})'  # noqa: S608
     with views(source, [KEPT, OBJECTS], findings, robot=robot, has_date=has_date) as ready:
         rows = answer(ready, f'SELECT {columns} FROM ({of_robot}) WHERE _place = 1 ORDER BY bucket, key')  # noqa: S608
-    return rows.filter(pa.array([takes(want, row) for row in rows.to_pylist()], pa.bool_()))
+    return rows.filter(pa.array([matches(want, row) for row in rows.to_pylist()], pa.bool_()))
 
 
-def takes(want: KeptFilter, row: Mapping[str, Any]) -> bool:
-    """Whether a filter selects an object, by its row."""
+def matches(want: KeptFilter, row: Mapping[str, Any]) -> bool:
+    """Whether an object matches a filter, by its row."""
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
     metadata |= place_of(row)
     begin_ns = row['t_start_ns'] or 0
     return want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, row['t_end_ns'] or begin_ns, metadata)
 
 
-def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by: str, priority: int = DEFAULT_PRIORITY,
+def put_request(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by: str, priority: int = DEFAULT_PRIORITY,
         expiry_ns: int = DEFAULT_EXPIRY_NS) -> PullRequest:  # fmt: skip
-    """Put a request into the mailbox of a robot, each request once. Raises StoreError, LakeError."""
+    """Put a request into a robot's mailbox, unless it is already there. Raises StoreError, LakeError."""
     now_ns = time.time_ns()
     request = PullRequest(robot=robot, by=by, made_ns=now_ns, expires_ns=now_ns + expiry_ns, want=want, priority=priority)
     _checked(robot, request.to_json())
@@ -131,9 +131,11 @@ def ask(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by:
             if asked.id == request.id and not any(entry.get('cancel') == asked.id for entry in left):
                 request = asked
                 return None
-        if sum(asked.by == by for asked in _requests(robot, left)) >= MOST_OF_ONE:
-            raise LakeError(f'{by} has {MOST_OF_ONE} requests open', remedy='wait until some are answered, or cancel one')
-        return [*(entry for entry in left if _id_of(entry) != request.id), request.to_json()]
+        if sum(asked.by == by for asked in _requests(robot, left)) >= MAX_REQUESTS_PER_USER:
+            raise LakeError(
+                f'{by} has {MAX_REQUESTS_PER_USER} requests open', remedy='wait until some are answered, or cancel one'
+            )
+        return [*(entry for entry in left if _request_id(entry) != request.id), request.to_json()]
 
     _change(store, robot, add)
     return request
@@ -153,26 +155,26 @@ def cancel(store: ObjectStore, source: Bucket, robot: str, request: str, *, by: 
 
 
 def listed(source: Bucket, robot: str) -> list[PullState]:
-    """The requests in the mailbox of a robot, and their states. Raises StoreError, LakeError."""
+    """The requests in a robot's mailbox, and their states. Raises StoreError, LakeError."""
     requests = _requests(robot, _entries(source, robot))
     with ThreadPoolExecutor(THREADS) as pool:
         answers = pool.map(lambda request: newest_answer(source, robot, request.id), requests)
     found = []
     for request, newest in zip(requests, answers, strict=True):
-        is_of_it = newest is not None and (newest.state not in FINAL or _is_last(newest, request.made_ns))
-        answer = newest if is_of_it else None
+        is_current = newest is not None and (newest.state not in FINAL or _is_final_answer(newest, request.made_ns))
+        answer = newest if is_current else None
         state = 'asked' if answer is None else answer.state
         found.append(PullState(request.id, request.by, state, request.priority, request.want.to_json(), answer))
     return found
 
 
 def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
-    """The requests in the mailbox of a robot without a final answer. Raises StoreError, LakeError."""
+    """The requests in a robot's mailbox without a final answer. Raises StoreError, LakeError."""
     return _requests(robot, _unanswered(source, robot, _entries(source, robot)))
 
 
 def _entries(source: Bucket, robot: str) -> list[Any]:
-    """Of the mailbox of a robot; none without a mailbox."""
+    """The entries of a robot's mailbox; empty if it does not exist."""
     try:
         return decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
     except ObjectRefused as error:
@@ -180,13 +182,11 @@ def _entries(source: Bucket, robot: str) -> list[Any]:
             return []
         raise
     except RequestRefused as error:
-        raise LakeError(
-            f'the mailbox of {robot}: {error}', remedy='somebody damaged it: put an empty one in its place'
-        ) from error
+        raise LakeError(f'the mailbox of {robot} is damaged: {error}', remedy='replace it with an empty one') from error
 
 
 def newest_answer(source: Bucket, robot: str, request: str) -> RequestAnswer | None:
-    """The newest valid answer to a request; None before the first one. Raises StoreError."""
+    """The newest valid answer to a request; None before the first. Raises StoreError."""
     numbers = []
     for entry in source.list(answers_prefix(robot, request)):
         name = entry.key.rpartition('/')[2].removesuffix('.json')
@@ -194,8 +194,8 @@ def newest_answer(source: Bucket, robot: str, request: str) -> RequestAnswer | N
             numbers.append(int(name))
     for number in sorted(numbers, reverse=True)[:ANSWERS_TRIED]:
         try:
-            body = source.get(f'{answers_prefix(robot, request)}{number}.json', MOST_ANSWER_BYTES)
-            answer = parse(RequestAnswer, from_json(body, MOST_ANSWER_BYTES))
+            body = source.get(f'{answers_prefix(robot, request)}{number}.json', MAX_ANSWER_BYTES)
+            answer = parse(RequestAnswer, from_json(body, MAX_ANSWER_BYTES))
         except (ObjectRefused, ValueError):
             continue
         if answer.id == request:
@@ -205,27 +205,26 @@ def newest_answer(source: Bucket, robot: str, request: str) -> RequestAnswer | N
 
 def wait(source: Bucket, robot: str, request: str, *, tell: Callable[[RequestAnswer | None], None] = lambda _: None,
          made_ns: int = 0) -> RequestAnswer:  # fmt: skip
-    """Wait for the final answer to a request made at that time; ``tell`` gets the newest answer. Raises StoreError."""
+    """Wait for the final answer to a request made at ``made_ns``; the callback gets the newest answer. Raises StoreError."""
     while True:
         answer = newest_answer(source, robot, request)
         tell(answer)
-        if answer is not None and _is_last(answer, made_ns):
+        if answer is not None and _is_final_answer(answer, made_ns):
             return answer
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
 
 
 def requester() -> str:
-    """The user of this process, as a name."""
+    """The user of this process, as a valid name."""
     return re.sub(r'[^A-Za-z0-9_.-]', '_', getpass.getuser())
 
 
-def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] | None = None,
-          say: Callable[[str], None] = lambda _: None, findings: Findings | None = None) -> int:  # fmt: skip
-    """Request what every robot keeps of these sensors (None: all but bags), and wait until the store has it.
+def request_and_wait(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] | None = None,
+                     say: Callable[[str], None] = lambda _: None, findings: Findings | None = None) -> int:  # fmt: skip
+    """Request what every robot keeps of these sensors (None: all except bags), and wait until the store has it.
 
-    ``flags`` are those of a query; ``near`` and ``near_gps`` apply only to the first of the sensors, because few others
-    have a place. Returns
-    the number of requested objects. Raises LakeError if a robot refuses or a request expires, SettingError, StoreError.
+    ``flags`` are those of a query; ``near`` and ``near_gps`` apply only to the first sensor, because few others have a position.
+    Returns the number of requested objects. Raises LakeError if a robot refuses or a request expires, SettingError, StoreError.
     """
     asked = wanted(time.time_ns(), **{name: flags[name] for name in _OF_ROBOT if flags.get(name) is not None})
     findings = Findings() if findings is None else findings
@@ -242,8 +241,8 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
                     is_first = sensors is not None and sensor == next(iter(sensors))
                     near, near_gps = (asked.near, asked.near_gps) if is_first else (None, None)
                     of_it = replace(want, sensor=sensor, near=near, near_gps=near_gps)
-                    found = [row for row in rows if takes(of_it, row)]
-                    requests.append((ask(store, source, robot, of_it, by=requester()), found))
+                    found = [row for row in rows if matches(of_it, row)]
+                    requests.append((put_request(store, source, robot, of_it, by=requester()), found))
                     total += len(found)
     for request, found in requests:
         _await(source, request, found, say, findings)
@@ -252,38 +251,38 @@ def bring(source: Bucket, flags: Mapping[str, Any], *, sensors: Collection[str] 
 
 def await_rows(source: Bucket, robot: str, want: KeptFilter, rows: Iterable[Mapping[str, Any]], findings: Findings,
                say: Callable[[str], None] = lambda _: None) -> None:  # fmt: skip
-    """Wait until the store has rows of these objects, which a robot has sent; three minutes at most.
+    """Wait up to three minutes until the store has the rows of these objects, which a robot has uploaded.
 
-    Slices that were sent in part are not awaited. Raises StoreError.
+    Does not wait for slices that were uploaded only in part. Raises StoreError.
     """
     names = {row['key'] for row in rows if row['where'] == ON_ROBOT and size_of(want, row) == (row['bytes'] or 0)}
-    for _ in range(LOOKS):
+    for _ in range(MAX_POLLS):
         if names.isdisjoint(kept(source, robot, want, findings)['key'].to_pylist()):
             return
-        say(f'waiting for the rows of {robot}: {want.sensor or "what it sent"}')
-        time.sleep(LOOK_S)
+        say(f'waiting for the rows of {robot}: {want.sensor or "all sensors"}')
+        time.sleep(POLL_S)
 
 
 def _await(source: Bucket, request: PullRequest, rows: Sequence[Mapping[str, Any]], say: Callable[[str], None],
            findings: Findings) -> None:  # fmt: skip
-    """Wait until a request is done, and the store has rows of its objects."""
+    """Wait until a request is done and the store has the rows of its objects."""
 
     def tell(answer: RequestAnswer | None) -> None:
-        say(f'waiting for {request.robot}: {request.want.sensor}, {visible(_how_far(answer))}')
+        say(f'waiting for {request.robot}: {request.want.sensor}, {visible(_progress_text(answer))}')
 
     answer = wait(source, request.robot, request.id, tell=tell, made_ns=request.made_ns)
     if answer.state != 'done':
-        raise LakeError(f'{request.robot} did not send all of {request.want.sensor}: {visible(_how_far(answer))}',
-                        remedy='`shadowhound-data pull --list`, or ask again')  # fmt: skip
+        raise LakeError(f'{request.robot} did not send all of {request.want.sensor}: {visible(_progress_text(answer))}',
+                        remedy='see `shadowhound-data pull --list`, or request it again')  # fmt: skip
     await_rows(source, request.robot, request.want, rows, findings, say)
 
 
-def _how_far(answer: RequestAnswer | None) -> str:
+def _progress_text(answer: RequestAnswer | None) -> str:
     return 'asked' if answer is None else f'{answer.state}, {answer.delivered.objects} of {answer.objects} objects'
 
 
-def _is_last(answer: RequestAnswer, made_ns: int) -> bool:
-    """Whether it ends a request made at that time; a request that ended can be made again."""
+def _is_final_answer(answer: RequestAnswer, made_ns: int) -> bool:
+    """Whether it is the final answer to a request made at that time: an earlier answer belongs to an earlier request."""
     return answer.state in FINAL and answer.made_ns >= made_ns
 
 
@@ -303,31 +302,31 @@ def _checked(robot: str, entry: dict[str, Any]) -> None:
     try:
         read_entry(robot, entry)
     except RequestRefused as error:
-        raise LakeError(f'the robot would refuse the request: {error}', remedy='ask for less, or in other words') from error
+        raise LakeError(f'the robot would refuse the request: {error}', remedy='request less, or change the filter') from error
 
 
 def _unanswered(source: Bucket, robot: str, entries: Sequence[Any]) -> list[Any]:
-    """Without requests that have a final answer or expired a day ago, and without their cancellations."""
+    """The entries without requests that have a final answer or expired more than a day ago, and without their cancellations."""
     requests = _requests(robot, entries)
     with ThreadPoolExecutor(THREADS) as pool:
         answers = list(pool.map(lambda request: newest_answer(source, robot, request.id), requests))
     now_ns = time.time_ns()
     waiting = {
         request.id for request, answer in zip(requests, answers, strict=True)
-        if not (answer is not None and _is_last(answer, request.made_ns))
+        if not (answer is not None and _is_final_answer(answer, request.made_ns))
         and request.expires_ns + _DAY_NS > now_ns
     }  # fmt: skip
-    return [entry for entry in entries if isinstance(entry, dict) and _id_of(entry) in waiting]
+    return [entry for entry in entries if isinstance(entry, dict) and _request_id(entry) in waiting]
 
 
-def _id_of(entry: Mapping[str, Any]) -> str:
-    """The request that an entry makes or cancels; it can be anything."""
+def _request_id(entry: Mapping[str, Any]) -> str:
+    """The id of the request that an entry makes or cancels; the entry can be any JSON object."""
     found = entry.get('id', entry.get('cancel'))
     return found if isinstance(found, str) else ''
 
 
 def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
-    """The entries of the mailbox, which is created if it does not exist, and its version."""
+    """The entries of the mailbox, which is created if it does not exist, and its ETag."""
     try:
         found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
     except ObjectRefused as error:
@@ -340,11 +339,11 @@ def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
         return decode_inbox(found[0]), found[1]
     except RequestRefused as error:
         where = f'{MAILBOX_BUCKET}/{inbox_key(robot)}'
-        raise LakeError(f'{where}: {error}', remedy='somebody damaged it: put an empty one in its place') from error
+        raise LakeError(f'{where} is damaged: {error}', remedy='replace it with an empty one') from error
 
 
 def make(store: ObjectStore, robot: str) -> None:
-    """Create the empty mailbox of a robot, if it does not exist. Raises StoreError."""
+    """Create an empty mailbox for a robot, if it does not exist. Raises StoreError."""
     body = encode_inbox([])
     with tempfile.TemporaryDirectory(prefix='shadowhound-inbox-') as folder:
         path = Path(folder, 'inbox.json')
@@ -356,7 +355,7 @@ def make(store: ObjectStore, robot: str) -> None:
 
 
 def _change(store: ObjectStore, robot: str, change: Callable[[list[Any]], list[Any] | None]) -> None:
-    """Replace the entries by those that ``change`` returns, or by none if it returns None, also while others do the same."""
+    """Replace the entries by those that ``change`` returns, even if other processes do the same; None: change nothing."""
     for attempt in range(TRIES):
         entries, version = _read(store, robot)
         changed = change(entries)
@@ -369,4 +368,4 @@ def _change(store: ObjectStore, robot: str, change: Callable[[list[Any]], list[A
         if steadily(lambda: store.replace(MAILBOX_BUCKET, inbox_key(robot), body, version)):  # noqa: B023 - called at once
             return
         time.sleep(random.uniform(0.0, PAUSE_S * 2.0 ** min(attempt, 4)))
-    raise LakeError('others changed the mailbox each time', remedy='try it again')
+    raise LakeError('other processes kept changing the mailbox', remedy='run the command again')

@@ -1,6 +1,6 @@
-"""What is stored, as Arrow tables: by flags, or by SQL over ``objects missions topics gaps watermarks labels forgotten``.
+"""Queries over what is stored: by flags, or by SQL over ``objects missions topics gaps watermarks labels forgotten``.
 
-The engine is that of the tables (lake/tables.py): only the selected rows and columns are read into this process.
+The results are Arrow tables. The engine (lake/tables.py) reads only the selected rows and columns into this process.
 """
 
 from __future__ import annotations
@@ -87,17 +87,17 @@ _OF_WATERMARKS: Final = {
 }
 _UNSEEN_OF_LABELS: Final = {'what', 'made', 'format_version'}
 _WATERMARK_COLUMNS: Final = [name for name in GAPS.columns if name in _OF_WATERMARKS]
-LONGEST_NS: Final = 24 * 3600 * SECOND
-"""For so long after the requested time, the objects of a mission are searched for the id of its run."""
+MAX_MISSION_NS: Final = 24 * 3600 * SECOND
+"""How long after the requested time the objects of a mission are searched for the id of its run."""
 _TIMES: Final = ('robot', 'bucket', 'key', 't_start_ns', 't_end_ns')
-"""The columns that decide whether an object overlaps a chosen time."""
+"""The columns that determine whether an object overlaps a selected time."""
 _OF_SUMMARY: Final = [name for name in SUMMARY if name not in {'mission_id', 'mission_type', 'start_ns', 'end_ns'}]
 """Columns of ``missions`` that are null for a mission that has not ended."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """The store that is queried, where invalid files are reported, and the time as of which the tables are read."""
+    """The queried store, the receiver of reports about invalid files, and the past time at which to read the tables, if any."""
 
     source: Bucket
     findings: Findings
@@ -139,7 +139,7 @@ def objects(source: Bucket | None = None, *, columns: Sequence[str] = tuple(COLU
         order: SQL, such as ``t_start_ns DESC``.
         limit: the maximum number of rows.
         distinct: without repeated rows.
-        as_of: answer from the tables as they were at that time.
+        as_of: a past time; answer from the tables of that time.
         findings: receives invalid rows and files, which are skipped; by default they are logged.
         flags: what to select, as in ``shadowhound-data query``: ``sensor topic robot since until near near_gps mission
             mission_type success policy label where by``, such as ``since='2h'``, ``near=(3.2, 1.5, 2)``, or
@@ -186,7 +186,7 @@ def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | Non
     Args:
         query: a SELECT in DataFusion's SQL.
         source: the store; by default the one that the environment names.
-        as_of: answer from the tables as they were at that time.
+        as_of: a past time; answer from the tables of that time.
         findings: receives invalid rows and files, which are skipped; by default they are logged.
         flags: restrict each view, as in ``objects``.
 
@@ -217,20 +217,20 @@ def sql(query: str, source: Bucket | None = None, *, as_of: str | datetime | Non
 
 
 def chosen(rows: pa.Table, where: str) -> pa.Table:
-    """The rows for which a condition is true. Raises LakeError for invalid SQL or an unknown column."""
+    """The rows that satisfy a condition. Raises LakeError for invalid SQL or an unknown column."""
     with engine({'rows': rows}) as ready, answering(where, rows.column_names):
         return answer(ready, f'SELECT * FROM rows WHERE ({where}\n)')  # noqa: S608 - the condition is the caller's own SQL
 
 
 def ordered(rows: pa.Table, order: str | None, limit: int | None) -> pa.Table:
-    """The first rows of an answer in an order, such as ``t_start DESC``. Raises LakeError for an unknown column."""
+    """The first rows in an order such as ``t_start DESC``. Raises LakeError for an unknown column."""
     with engine({'rows': rows}) as ready, answering(order or '', rows.column_names):
         return answer(ready, Shape(rows.column_names, order, limit).sql('rows'))
 
 
 @contextmanager
 def answering(query: str, known: Iterable[str]) -> Iterator[None]:
-    """A LakeError about an unknown name gets the most similar of the known names as its remedy."""
+    """Add the most similar known names as the remedy of a LakeError about an unknown name."""
     try:
         yield
     except LakeError as error:
@@ -260,7 +260,7 @@ def _objects(lake: _Asked, asked: Wanted, shape: Shape) -> pa.Table:
 
 
 def within_chosen(table: pa.Table, asked: Wanted) -> pa.Table:
-    """The rows that are in every one of the query's ranges."""
+    """The rows that are in all of the query's selections of times and objects."""
     if not asked.chosen:
         return table
     first = pc.fill_null(table['t_start_ns'], -1).to_numpy()
@@ -282,8 +282,8 @@ def within_chosen(table: pa.Table, asked: Wanted) -> pa.Table:
 
 
 def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, str]:
-    """The query without labels and missions, which are replaced by times and ids; and the condition for a row in SQL."""
-    asked = labels.labelled(lake.source, asked, lake.findings)
+    """The query with labels and missions replaced by times and ids, and the condition for a row in SQL."""
+    asked = labels.with_label_resolved(lake.source, asked, lake.findings)
     conditions = list(_conditions(asked))
     if asked.mission is not None:
         runs = {} if '_' in asked.mission else _runs(lake, asked)  # ids of runs have no underscore, ids of missions have
@@ -296,7 +296,7 @@ def _understood(lake: _Asked, asked: Wanted) -> tuple[Wanted, str]:
 
 
 def _missions_of(lake: _Asked, asked: Wanted) -> list[str]:
-    """The missions with that result, and in which that policy was active."""
+    """The missions with the requested result in which the requested policy was active."""
     columns = ('mission_id', 'success', 'policy', 'policies')
     found = _missions(lake, replace(asked, success=None, policy=None)).select(columns).to_pydict()
     return [mission for mission, success, policy, policies in zip(*(found[name] for name in columns), strict=True)
@@ -377,7 +377,7 @@ def _missions(lake: _Asked, asked: Wanted) -> pa.Table:
 def _dataset_of(source: Bucket, policy: str) -> str | None:
     """The digest of the dataset that a policy was trained on, from its manifest in the store; None without a manifest.
 
-    The id contains the start of the manifest's hash: a mission cannot name another one.
+    The id contains the start of the manifest's hash, so a mission cannot refer to a forged manifest.
     """
     name, version, sha256 = split_id(policy) or ('', 0, '')
     models = Bucket(source.settings, POLICIES)
@@ -392,7 +392,7 @@ def _dataset_of(source: Bucket, policy: str) -> str | None:
 
 
 def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
-    """Those that overlap the time."""
+    """The labels that overlap the requested time."""
     found = labels.read(lake.source, asked.robot, label=asked.label, findings=lake.findings)
     since_ns, until_ns = asked.since_ns or 0, (1 << 63) - 1 if asked.until_ns is None else asked.until_ns
     rows = [asdict(each) for each in found if each.until_ns >= since_ns and each.since_ns < until_ns]
@@ -401,7 +401,7 @@ def _labels(lake: _Asked, asked: Wanted) -> pa.Table:
 
 
 def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:
-    """What was deleted on purpose, by the time of the data."""
+    """The objects that were deleted by ``lake prune``, by the time of the data."""
     if refused := [name for name in (*_OF_OBJECTS, 'mission') if getattr(asked, name) is not None]:
         raise LakeError(f'forgotten cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since or until')  # fmt: skip
@@ -415,7 +415,7 @@ def _forgotten(lake: _Asked, asked: Wanted) -> pa.Table:
 
 
 def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
-    """The newest statements about gaps that overlap the time, and the watermarks."""
+    """The newest statements about gaps that overlap the requested time, and the watermarks."""
     if refused := [name for name in _OF_OBJECTS if getattr(asked, name) is not None]:
         raise LakeError(f'gaps and watermarks cannot be selected by {" ".join(refused)}',
                         remedy='select by robot, sensor, topic, since, until or mission, or join them with objects')  # fmt: skip
@@ -438,7 +438,7 @@ def _gaps(lake: _Asked, asked: Wanted) -> dict[str, pa.Table]:
 
 def _runs(lake: _Asked, asked: Wanted) -> dict[str, str]:
     """The run of each mission of that time, from any of its objects: those delivered before the run existed do not name it."""
-    until_ns = None if asked.until_ns is None else asked.until_ns + LONGEST_NS
+    until_ns = None if asked.until_ns is None else asked.until_ns + MAX_MISSION_NS
     of_time = Wanted(robot=asked.robot, since_ns=asked.since_ns, until_ns=until_ns, by=asked.by)
     where = ' AND '.join((*_conditions(of_time), 'mission_id IS NOT NULL', 'run_id IS NOT NULL'))
     with _opened(lake, of_time) as ready:

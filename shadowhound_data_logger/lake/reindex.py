@@ -1,7 +1,7 @@
 """``lake reindex``: adds missing rows, from a listing of the store and the metadata of its objects.
 
-It adds row files and changes none. A robot can deliver the same rows later: ingest adds each row once. So it can run at any time
-and be killed at any moment; the next run continues.
+It only adds row files. If a robot delivers the same rows later, ingest adds each row once. Therefore it can run at any time, and
+it can be killed; the next run continues.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from shadowhound_data_logger.stores.base import ObjectStore
 KEY: Final = ('bucket', 'key')
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000
-"""Objects whose metadata are read before their rows are written."""
+"""Objects whose rows are written together."""
 STATISTICS_PAGE: Final = 1000
-"""Objects that are opened before their rows are written."""
+"""Objects whose statistics are written together."""
 
 
 @dataclass(slots=True)
@@ -43,14 +43,14 @@ class Reindexed:
     added: int = 0
     parts: int = 0
     gone: int = 0
-    """Rows whose objects are neither in the store nor deleted by ``lake prune``; they are kept."""
+    """Rows whose objects are missing but were not deleted by ``lake prune``; the rows are kept."""
 
 
 def reindex(
     source: Bucket, store: ObjectStore, robot: str, *, buckets: tuple[str, ...] = BUCKETS,
     tell: Callable[[Reindexed], None] = lambda _: None, findings: Findings | None = None,
 ) -> Reindexed:  # fmt: skip
-    """Add the missing rows of one robot. Raises StoreError, NameRefused; rows that were added until then are kept."""
+    """Add the missing rows of one robot. Raises StoreError, NameRefused; rows added before an error are kept."""
     check_name(robot, 'the robot name')
     found = Reindexed()
     findings = Findings() if findings is None else findings
@@ -78,22 +78,22 @@ def reindex(
 
 def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Callable[[Reindexed], None] = lambda _: None,
                    findings: Findings | None = None) -> Reindexed:  # fmt: skip
-    """Open the objects of one robot that have no statistics, and add those. Raises StoreError, NameRefused.
+    """Compute the missing statistics of one robot's objects. Raises StoreError, NameRefused.
 
-    Rows that were added until then are kept. Objects that are missing or damaged are in the ``findings``.
+    Rows added before an error are kept. Missing and damaged objects are reported in ``findings``.
     """
     from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - the extra lake
 
     check_name(robot, 'the robot name')
     findings, found = Findings() if findings is None else findings, Reindexed()
-    told_of = rows_of(source, STATISTICS, findings, robot=robot, where=f'field = {literal(ALL)}', columns=KEY)
-    known = set(zip(*(told_of[name].to_pylist() for name in KEY), strict=True))
+    existing = rows_of(source, STATISTICS, findings, robot=robot, where=f'field = {literal(ALL)}', columns=KEY)
+    known = set(zip(*(existing[name].to_pylist() for name in KEY), strict=True))
     columns = ('robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns')
     asked = query.objects(source, findings=findings, robot=robot, columns=columns)
     rows = [row for row in asked.to_pylist() if row['topic'] is not None and (row['bucket'], row['key']) not in known]
     found.listed = len(rows)
 
-    def told(row: dict[str, Any]) -> list[Row]:
+    def statistics(row: dict[str, Any]) -> list[Row]:
         of = {**row, 't_start': None if row['t_start'] is None else row['t_start_ns'] // 1000}
         try:
             body = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
@@ -104,7 +104,7 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
 
     with ThreadPoolExecutor(THREADS) as pool:
         for start in range(0, len(rows), STATISTICS_PAGE):
-            made = [one for some in pool.map(told, rows[start : start + STATISTICS_PAGE]) for one in some]
+            made = [one for some in pool.map(statistics, rows[start : start + STATISTICS_PAGE]) for one in some]
             for _, date, numbered in parts.by_folder(enumerate(made)):
                 part = [row for _, row in numbered]
                 key = backfilled_key(robot, date, {f'{row["bucket"]}/{row["key"]}' for row in part}, STATISTICS)
@@ -121,7 +121,7 @@ def _keys(source: Bucket, robot: str, findings: Findings, of: TableSchema = OBJE
 
 
 def _rows(place: Bucket, entries: list[ObjectInfo]) -> Iterator[Row]:
-    """The rows of those that still exist."""
+    """The rows of the objects that still exist."""
 
     def row(entry: ObjectInfo) -> Row | None:
         info = place.head(entry.key)

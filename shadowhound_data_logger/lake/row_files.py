@@ -1,6 +1,6 @@
-"""Row files in the store: which ones there are, and the rows of each as a table (formats/rows/parts.py).
+"""Lists and reads the row files in the store (formats/rows/parts.py).
 
-They are ``<robot>/<folder of the table>/date=YYYY-MM-DD/<name>.jsonl.zst``, written by a robot or by a workstation for it.
+They are ``<robot>/<folder of the table>/date=YYYY-MM-DD/<name>.jsonl.zst``, written by a robot, or by a workstation for it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class RowFile(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """Which row files a query needs."""
+    """The row files that a query needs."""
 
     tables: Sequence[TableSchema] = tuple(SCHEMAS.values())
     robot: str | None = None
@@ -47,17 +47,17 @@ class Scope:
 
 
 class RowsOfFile(NamedTuple):
-    """What a row file contains."""
+    """The content of a row file."""
 
     file: RowFile
     rows: list[Row]
-    """The valid ones of its table; each has its robot."""
+    """The valid rows; each names its robot."""
     rejected: int = 0
-    """Rows that were rejected; 1 for a file that is not one."""
+    """Rows that were rejected; 1 for a file that is not a row file."""
     why: str | None = None
     """Why rows were rejected."""
     unknown: int = 0
-    """Rows with columns that this version does not know and ignored."""
+    """Rows with columns that this version does not know; the columns were ignored."""
 
 
 def robots(source: Bucket) -> list[str]:
@@ -71,13 +71,13 @@ def folder_of(robot: str, date: str, of: TableSchema = OBJECTS) -> str:
 
 
 def backfilled_key(robot: str, date: str, keys: Iterable[str], of: TableSchema = OBJECTS) -> str:
-    """The key of a file with rows that were missing (``reindex``): the same for the same rows."""
+    """The key of a file with rows that were missing (``reindex``); the same rows get the same key."""
     digest = hashlib.sha256('\n'.join(sorted(keys)).encode()).hexdigest()[:16]
     return of.part_key(robot, date, f'{date.replace("-", "")}_backfilled_{digest}')
 
 
 def row_files(source: Bucket, findings: Findings, scope: Scope) -> list[RowFile]:
-    """All row files in the store, oldest date first. Raises StoreError."""
+    """All row files of a scope in the store, the oldest date first. Raises StoreError."""
     named = [scope.robot] if scope.robot else robots(source)
     with ThreadPoolExecutor(THREADS, 'lake-list') as pool:
         pairs = [(of, robot) for of in scope.tables for robot in named]
@@ -86,8 +86,8 @@ def row_files(source: Bucket, findings: Findings, scope: Scope) -> list[RowFile]
 
 
 def read(source: Bucket, files: Sequence[RowFile], findings: Findings) -> Iterator[RowsOfFile]:
-    """Each file with its valid rows. What is rejected is named in the findings. Raises StoreError."""
-    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:  # they wait for the server; threads that parse block each other
+    """Each file with its valid rows; rejected rows are reported in the findings. Raises StoreError."""
+    with ThreadPoolExecutor(THREADS, 'lake-read') as pool:  # only for requests: threads that parse would block each other
         for file, body in zip(files, pool.map(lambda file: _body(source, file), files), strict=True):
             found = RowsOfFile(file, [], 1, body) if isinstance(body, str) else _contents(file, body)
             if found.rejected:

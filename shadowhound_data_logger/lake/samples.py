@@ -1,4 +1,4 @@
-"""One sample of a data set: a message of the anchor as arrays, with what other sensors said about the same time."""
+"""Samples of a dataset: a message of the anchor as arrays, with the messages of other sensors at the same time."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 AlignedSample = dict[str, Any]
 POSE_GAP_NS: Final = 1_500_000_000
-"""As on the robot: between poses that are farther apart there is none (node/encoding/pose_track.py)."""
+"""Poses that are farther apart are not interpolated, as on the robot (node/encoding/pose_track.py)."""
 DECODED_BYTES: Final = 48 << 20
-"""Of tables and archives that are kept: a batch of 1 s serves all frames of it."""
+"""Limit for cached tables and archives: a batch of 1 s is used by all frames of that second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,26 +70,26 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What a data set consists of; a value that can be pickled."""
+    """The content of a dataset; a value that can be pickled."""
 
     anchors: tuple[Track, ...]
-    """By robot."""
+    """One track per robot."""
     aligned: Mapping[str, Near | Window]
     sides: Mapping[tuple[str, str], Track]
-    """(robot, sensor) -> what there is of an aligned sensor."""
+    """(robot, sensor) -> the objects of an aligned sensor."""
     size: tuple[int, int] | None
-    """(height, width) of images; None: as they are."""
+    """(height, width) of images; None: not scaled."""
     by: str = BY_STAMP
-    """Which of the two times of messages the tracks have."""
+    """Which of the two times of messages the tracks use."""
 
     def like(self, robot: str, sensor: str) -> Track | None:
-        """What says how many numbers a sensor has: the robot's own, or another robot's where it stored nothing."""
+        """A track that defines the number of values of a sensor: the robot's own, or another robot's if it stored nothing."""
         own = self.sides.get((robot, sensor))
         others = (track for (_, name), track in self.sides.items() if name == sensor)
         return own or next((track for track in others if len(track)), None)
 
     def needed(self, track: Track, number: int) -> Iterator[Object]:
-        """The objects that the samples of this object of an anchor are made of, the object itself among them."""
+        """The objects from which the samples of an anchor's object are built, including the object itself."""
         yield track.object(number)
         first, last = int(track.start_ns[number]), int(track.end_ns[number])
         for sensor, how in self.aligned.items():
@@ -101,12 +101,12 @@ class Selection:
                 best = list(side.nearest(first, before, after))[:1]
                 yield from (side.object(found) for _, found in best)
             else:
-                if isinstance(how, Near):  # of each moment in it, only what is next to it
+                if isinstance(how, Near):  # only the objects closest to each time in the object
                     before, after = (min(reach, SECOND) for reach in (before, after))
                 yield from (side.object(int(found)) for found in side.within(first - before, last + after))
 
-    def can_be_complete(self, track: Track, number: int) -> bool:
-        """Whether the catalogue knows of messages of all aligned sensors about the time of an object."""
+    def has_aligned_data(self, track: Track, number: int) -> bool:
+        """Whether the catalog has messages of all aligned sensors at the time of an object."""
         first, last = int(track.start_ns[number]), int(track.end_ns[number])
         for sensor, how in self.aligned.items():
             side, (before, after) = self.sides.get((track.robot, sensor)), how.reach_ns
@@ -116,7 +116,7 @@ class Selection:
 
 
 class Samples:
-    """Makes the samples of a data set, and keeps what it decoded, because neighbours need it again.
+    """Builds the samples of a dataset, and caches what it decoded, because neighboring samples need it again.
 
     One thread at a time.
     """
@@ -147,7 +147,7 @@ class Samples:
             return (*self._picture(wanted, self._prefetch.get(wanted), extension), int(track.start_ns[number]))
         found = self._members(wanted)
         if member >= len(found):
-            raise LakeError(f'{wanted.key} has {len(found)} messages, the catalogue says {track.count[number]}', key=wanted.key)
+            raise LakeError(f'{wanted.key} has {len(found)} messages, but {track.count[number]} by the catalog', key=wanted.key)
         one = found[member]
         return (*self._picture(wanted, one.body, one.extension), self._times(track, number, found)[member])
 
@@ -156,11 +156,11 @@ class Samples:
             return ('cloud', decode.cloud(body)) if extension in CLOUDS else ('image', decode.image(body, self._selection.size))
 
     def _received(self, track: Track, number: int) -> tuple[int, int] | None:
-        """When the first and the last message of an object arrived, if arrivals are the times."""
+        """The arrival of an object's first and last message, if the times are arrivals; otherwise None."""
         return (int(track.start_ns[number]), int(track.end_ns[number])) if self._selection.by == BY_RECEIVED else None
 
     def _times(self, track: Track, number: int, members: Sequence[ArchiveMember]) -> list[int]:
-        """Of the messages of an archive."""
+        """The times of the messages of an archive."""
         times = np.array([each.stamp_ns for each in members], np.int64) + int(track.offset_ns[number])
         received = self._received(track, number)
         return [int(each) for each in (times if received is None else decode.arrivals(times, *received))]
@@ -187,7 +187,7 @@ class Samples:
         return {sensor: row, f'{sensor}_ok': np.bool_(away_ns is not None), f'{sensor}_dt_s': _seconds(away_ns)}
 
     def _nearest(self, how: Near, side: Track | None, stamp_ns: int) -> tuple[NDArray[np.float64] | None, int | None]:
-        """Its numbers, and how much later it is than the anchor; None where there is none."""
+        """The numbers of the nearest message, and how much later than the anchor it is; None if there is none."""
         best: tuple[int, NDArray[np.float64]] | None = None
         if side is not None:
             before, after = how.reach_ns
@@ -241,7 +241,7 @@ class Samples:
         return values, present
 
     def _width(self, like: Track | None, fields: tuple[str, ...]) -> int:
-        """Columns of a sensor, those of the first object; none of one that nobody has."""
+        """The number of columns of a sensor, by its first object; 0 if no robot has stored it."""
         return 0 if like is None else int(self._table(like, 0, fields).values.shape[1])
 
     def _table(self, side: Track, number: int, fields: tuple[str, ...]) -> Table:
@@ -269,7 +269,7 @@ class Samples:
 
 @contextmanager
 def _naming(wanted: Object) -> Iterator[None]:
-    """A LakeError about content says of which object."""
+    """Add the object's name to a LakeError about its content."""
     try:
         yield
     except LakeError as error:
@@ -284,7 +284,7 @@ def _is_cloud(side: Track) -> bool:
 
 
 def _closest(stamps: NDArray[np.int64], stamp_ns: int, after_ns: int) -> int | None:
-    """Of sorted stamps, the one that is nearest, not later than ``after_ns`` after it."""
+    """The index of the nearest of sorted stamps, at most ``after_ns`` later."""
     possible = stamps[: int(np.searchsorted(stamps, stamp_ns + after_ns, 'right'))]
     return int(np.argmin(np.abs(possible - stamp_ns))) if len(possible) else None
 
@@ -294,5 +294,5 @@ def _seconds(away_ns: int | None) -> Any:
 
 
 def is_complete(sample: AlignedSample, aligned: Mapping[str, Near | Window]) -> bool:
-    """Whether the pose and all aligned sensors are there; of a window one message is enough."""
+    """Whether the sample has the pose and all aligned sensors; for a window, one message is enough."""
     return not bool(np.isnan(sample['pose']).any()) and all(bool(np.any(sample[f'{name}_ok'])) for name in aligned)

@@ -1,15 +1,15 @@
-"""Words: a full-text index of what missions were told, what happened in them, what went wrong, and what people labelled.
+"""A full-text index of missions' commands, events and errors, and of labels.
 
-The index is one SQLite file (FTS5), made of the store alone: of the ``summary.json`` of each mission, which is never changed, and
-of the labels. An update reads only missions that are new. It can be thrown away, and made again from nothing.
+The index is one SQLite file (FTS5), built only from the store: from the ``summary.json`` of each mission, which never changes,
+and the labels. An update reads only new missions. The index can be deleted and rebuilt at any time.
 
-In scripts without spaces between words (Chinese, Japanese, Thai, ...) each letter is a word of the index; a word of a query is
-the phrase of its letters: it is found wherever it occurs, from one letter on (docs/decisions/0023). In other scripts a part of a
-word is found as its beginning alone: ``küche*`` finds ``Küchentür``.
+In scripts without spaces between words (Chinese, Japanese, Thai, ...), each character is a word of the index, and a word of a
+query is the phrase of its characters: it is found wherever it occurs, from one character on (docs/decisions/0023). In other
+scripts, only the start of a word can be searched: ``küche*`` finds ``Küchentür``.
 
-A query is words that all must be there, in any order and any form of letters: ``door handle``, ``"door handle"`` for a phrase,
-``door*`` for what begins so, ``-door`` for without, ``door OR gate`` for either. The best match comes first (BM25; what a mission
-was told and the name of an event or label count four times).
+A query is a list of words that must all occur, in any order, case and accents: ``door handle``; ``"door handle"`` for a phrase,
+``door*`` for a prefix, ``-door`` for exclusion, ``door OR gate`` for either. The best match comes first (BM25; a mission's
+command and the name of an event or label have four times the weight).
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 MISSION, EVENT, ERROR, LABEL_KIND = 'mission', 'event', 'error', 'label'
 KINDS: Final = (MISSION, EVENT, ERROR, LABEL_KIND)
-REMEDY: Final = 'shadowhound-data lake index makes it of the store'
-MOST_WORDS: Final = 32
-MOST_TEXT: Final = 20_000
-"""Letters of a document."""
-MOST_DOCUMENTS: Final = 1000
+REMEDY: Final = 'shadowhound-data lake index builds it from the store'
+MAX_WORDS: Final = 32
+MAX_TEXT: Final = 20_000
+"""Characters of a document."""
+MAX_DOCUMENTS: Final = 1000
 """Events and errors of one mission."""
 AT_A_TIME: Final = 500
-MOST_BYTES: Final = 2 << 30
+MAX_BYTES: Final = 2 << 30
 _TRIES: Final = 5
 _APPLICATION, _VERSION = 0x53484944, 2
-"""An index of another version is removed and built again from the store."""
+"""An index of another version is deleted and rebuilt from the store."""
 _SCHEMA: Final = f"""
 CREATE TABLE documents (
   id INTEGER PRIMARY KEY, kind TEXT NOT NULL, robot TEXT NOT NULL, run_id TEXT, mission_id TEXT, mission_type TEXT,
@@ -75,37 +75,37 @@ _REACHES: Final = (
     "EXISTS (SELECT 1 FROM json_each(?) AS span WHERE ifnull(json_extract(span.value, '$[0]'), robot) = robot"
     " AND since_ns <= json_extract(span.value, '$[2]') AND until_ns >= json_extract(span.value, '$[1]'))"
 )
-_SAID: Final = (
-    "documents AS said JOIN words AS named ON named.rowid = said.id WHERE said.kind = 'label' AND said.robot = documents.robot"
-    ' AND said.since_ns <= documents.until_ns AND said.until_ns >= documents.since_ns'
+_OVERLAPPING: Final = (
+    "documents AS other JOIN words AS label ON label.rowid = other.id WHERE other.kind = 'label'"
+    ' AND other.robot = documents.robot AND other.since_ns <= documents.until_ns AND other.until_ns >= documents.since_ns'
 )
 """The labels of a document's time."""
-_LABELS: Final = f'SELECT DISTINCT named.title FROM documents, {_SAID} AND documents.id = ? AND said.id != ?'  # noqa: S608 - our own
+_LABELS: Final = f'SELECT DISTINCT label.title FROM documents, {_OVERLAPPING} AND documents.id = ? AND other.id != ?'  # noqa: S608
 _UNSPACED: Final = re.compile(
     '[\u0e00-\u0eff\u0f00-\u0fff\u1000-\u109f\u1780-\u17ff'  # Thai, Lao, Tibetan, Burmese, Khmer
     '\u2e80-\u2fdf\u3005-\u3007\u3021-\u3029\u3040-\u30ff\u3105-\u312f\u31a0-\u31bf\u31f0-\u31ff'  # radicals, kana, bopomofo
     '\u3400-\u4dbf\u4e00-\u9fff\uf900-\ufaff\U00020000-\U0003ffff]'  # Han
 )
-"""Letters of scripts that have no spaces between words; https://www.unicode.org/charts/"""
+"""Characters of scripts without spaces between words; https://www.unicode.org/charts/"""
 _SEAM: Final = '\x1f'
-"""Between such letters in the index, and never shown; FTS5 takes it for a blank."""
+"""Separates such characters in the index, and is removed from results; FTS5 treats it as a space."""
 _TERM: Final = re.compile(r'\s*(?P<not>-)?(?:"(?P<phrase>[^"]*)"|(?P<word>[^\s"]+))(?P<prefix>\*)?')
 
 
 @dataclass(frozen=True, slots=True)
 class Indexed:
-    """What an update did."""
+    """The result of an update."""
 
     missions: int
-    """Added."""
+    """Missions that were added."""
     documents: int
-    """In the index now."""
+    """Documents in the index now."""
     waiting: int
     """Missions without a summary yet."""
 
 
 def update(path: Path, source: Bucket, findings: Findings | None = None) -> Indexed:
-    """Bring the index up to date with the store, or make it. Raises StoreError, LakeError for a file that is something else."""
+    """Create or update the index from the store. Raises StoreError, and LakeError for a file that is not an index."""
     findings = Findings() if findings is None else findings
     path.parent.mkdir(parents=True, exist_ok=True)
     if _is_outdated(path):
@@ -120,13 +120,13 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
             for start in range(0, len(new), AT_A_TIME):
                 some = new[start : start + AT_A_TIME]
                 with ThreadPoolExecutor(THREADS, 'lake-index') as pool:
-                    told = list(pool.map(lambda run, of=robot: summary(source, of, run, findings), some))
+                    summaries = list(pool.map(lambda run, of=robot: summary(source, of, run, findings), some))
                 with db:
-                    for run, said in zip(some, told, strict=True):
-                        if said is not None:
-                            add(db, of_mission(robot, run, said))
+                    for run, each in zip(some, summaries, strict=True):
+                        if each is not None:
+                            add(db, of_mission(robot, run, each))
                             added += 1
-                waiting += told.count(None)
+                waiting += summaries.count(None)
         with db:
             db.execute("DELETE FROM words WHERE rowid IN (SELECT id FROM documents WHERE kind = 'label')")
             db.execute("DELETE FROM documents WHERE kind = 'label'")
@@ -138,10 +138,10 @@ def update(path: Path, source: Bucket, findings: Findings | None = None) -> Inde
 
 
 def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, limit: int = 20) -> list[dict[str, Any]]:
-    """The best documents, the best first.
+    """The best matching documents, the best first.
 
-    Each has ``kind robot mission_id run_id mission_type success since_ns until_ns bucket key title excerpt score``, and as
-    ``labels`` those of its time. Raises SettingError for what is no query, LakeError for a file that is no index.
+    Each has ``kind robot mission_id run_id mission_type success since_ns until_ns bucket key title excerpt score``, and
+    ``labels``, the labels of its time. Raises SettingError for an invalid query, LakeError for a file that is not an index.
     """
     match = match_of(text)
     conditions, values = _conditions(asked, kind)
@@ -159,7 +159,7 @@ def search(path: Path, text: str, asked: Wanted, *, kind: str | None = None, lim
 
 
 def _check_names(db: sqlite3.Connection, asked: Wanted) -> None:
-    """Raises UnknownName for one that no document has."""
+    """Raises UnknownName for a name in the query that no document has."""
     for name in ('robot', 'mission_type'):
         if (value := getattr(asked, name)) is not None:
             known = (each for (each,) in db.execute(f'SELECT DISTINCT {name} FROM documents'))  # noqa: S608 - our own
@@ -174,7 +174,7 @@ def _check_names(db: sqlite3.Connection, asked: Wanted) -> None:
 
 
 def updated(path: Path) -> tuple[int, int] | None:
-    """When the last update of an index began, by this machine's clock, and how many missions had no summary yet; None before one.
+    """The start of the last update, by the clock of the updating machine, and how many missions had no summary; None before it.
 
     Raises LakeError.
     """
@@ -184,10 +184,10 @@ def updated(path: Path) -> tuple[int, int] | None:
 
 
 def match_of(text: str) -> str:
-    """The query as FTS5 takes it, every word quoted: nothing in it is obeyed. Raises SettingError."""
+    """Translate a query to FTS5, with every word quoted, so that no FTS5 syntax is injected. Raises SettingError."""
     allowed = 'words, "a phrase", begin*, -without, this OR that'
     if any(unicodedata.category(letter)[0] == 'C' and letter not in '\t\n' for letter in text):
-        raise SettingError('query', text, f'{allowed}; it has a control character')
+        raise SettingError('query', text, f'{allowed}, without control characters')
     if text.count('"') % 2:
         raise SettingError('query', text, f'{allowed}; a quotation mark is not closed')
     groups: list[list[str]] = [[]]
@@ -203,14 +203,14 @@ def match_of(text: str) -> str:
             continue
         quoted = '"{}"{}'.format(_spaced(word).replace('"', '""'), '*' if is_prefix else '')
         (without if term['not'] else groups[-1]).append(quoted)
-    if not all(groups) or sum(map(len, groups)) + len(without) > MOST_WORDS:
-        raise SettingError('query', text, f'{allowed}: at least one word on each side of OR, at most {MOST_WORDS} in all')
+    if not all(groups) or sum(map(len, groups)) + len(without) > MAX_WORDS:
+        raise SettingError('query', text, f'{allowed}: at least one word on each side of OR, at most {MAX_WORDS} in all')
     match = ' OR '.join(f'({" AND ".join(group)})' for group in groups)
     return f'({match}) NOT ({" OR ".join(without)})' if without else match
 
 
 def _spaced(text: str) -> str:
-    """The text with seams around the letters of scripts without spaces, in one of the forms that mean the same."""
+    """The text in a normal form, with a separator between the characters of scripts without spaces."""
     seamed = _UNSPACED.sub(f'{_SEAM}\\g<0>{_SEAM}', unicodedata.normalize('NFKC', text.replace(_SEAM, ' ')))
     return seamed.replace(2 * _SEAM, _SEAM)
 
@@ -239,7 +239,7 @@ def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
     for chosen in asked.chosen:
         must(_REACHES, json.dumps(chosen.spans))
     if asked.label is not None:
-        must(f'EXISTS (SELECT 1 FROM {_SAID} AND named.title = ?)', _spaced(asked.label))  # noqa: S608 - our own
+        must(f'EXISTS (SELECT 1 FROM {_OVERLAPPING} AND label.title = ?)', _spaced(asked.label))  # noqa: S608 - our own
     return conditions, values
 
 
@@ -248,7 +248,7 @@ def _conditions(asked: Wanted, kind: str | None) -> tuple[list[str], list[Any]]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """What the index has of a mission, an event, an error or a label."""
+    """The index entry of a mission, an event, an error or a label."""
 
     kind: str
     robot: str
@@ -266,7 +266,7 @@ class Document:
 
 
 def add(db: sqlite3.Connection, found: Iterable[Document]) -> None:
-    """Into an index that is open, within a transaction."""
+    """Add documents to an open index, within a transaction."""
     for each in found:
         number = db.execute(
             'INSERT INTO documents (kind, robot, run_id, mission_id, mission_type, success, since_ns, until_ns, bucket, key,'
@@ -277,24 +277,24 @@ def add(db: sqlite3.Connection, found: Iterable[Document]) -> None:
         db.execute('INSERT INTO words (rowid, title, text) VALUES (?,?,?)', (number, _spaced(each.title), _spaced(each.text)))
 
 
-def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[Document]:
-    """Of a ``summary.json``, which may say anything."""
+def of_mission(robot: str, run_id: str, content: Mapping[str, Any]) -> Iterator[Document]:
+    """The documents of a ``summary.json``, whose fields may have any value."""
     common: dict[str, Any] = {
-        'robot': robot, 'run_id': run_id, 'mission_id': _text(told.get('mission_id')) or None,
-        'mission_type': _text(told.get('mission_type')) or None,
-        'success': told.get('success') if isinstance(told.get('success'), bool) else None,
+        'robot': robot, 'run_id': run_id, 'mission_id': _text(content.get('mission_id')) or None,
+        'mission_type': _text(content.get('mission_type')) or None,
+        'success': content.get('success') if isinstance(content.get('success'), bool) else None,
     }  # fmt: skip
-    since_ns, until_ns = _stamp(told.get('start_ns')), _stamp(told.get('end_ns'))
-    errors, events = _listed(told.get('errors')), _listed(told.get('events'))
-    text = _text([*(told.get(name) for name in ('mission_type', 'result', 'run_name', 'ended_by', 'last')), robot])
-    yield Document(kind=MISSION, title=_text(told.get('mission_command')), text=text, since_ns=since_ns, until_ns=until_ns,
+    since_ns, until_ns = _stamp(content.get('start_ns')), _stamp(content.get('end_ns'))
+    errors, events = _listed(content.get('errors')), _listed(content.get('events'))
+    text = _text([*(content.get(name) for name in ('mission_type', 'result', 'run_name', 'ended_by', 'last')), robot])
+    yield Document(kind=MISSION, title=_text(content.get('mission_command')), text=text, since_ns=since_ns, until_ns=until_ns,
                    bucket=BUCKET, key=f'{robot}/missions/{run_id}/summary.json', **common)  # fmt: skip
     for kind, some in ((ERROR, errors), (EVENT, events)):
-        for each in some[:MOST_DOCUMENTS]:
-            said = dict(each) if isinstance(each, dict) else {'text': each}
-            at_ns = _moment(said.pop('time', None), since_ns)
-            name = _text(said.pop('name', '')) if kind == EVENT else ''
-            yield Document(kind=kind, title=name, text=_text(said), since_ns=at_ns, until_ns=at_ns, **common)
+        for each in some[:MAX_DOCUMENTS]:
+            fields = dict(each) if isinstance(each, dict) else {'text': each}
+            at_ns = _moment(fields.pop('time', None), since_ns)
+            name = _text(fields.pop('name', '')) if kind == EVENT else ''
+            yield Document(kind=kind, title=name, text=_text(fields), since_ns=at_ns, until_ns=at_ns, **common)
 
 
 def _of_label(each: labels.Label) -> Document:
@@ -307,8 +307,8 @@ def _listed(value: Any) -> list[Any]:
 
 
 def _text(value: Any) -> str:
-    """All words of a value of JSON, names of fields among them."""
-    return ' '.join(_words(value, 0))[:MOST_TEXT].encode(errors='replace').decode()
+    """All words of a JSON value, including the names of fields."""
+    return ' '.join(_words(value, 0))[:MAX_TEXT].encode(errors='replace').decode()
 
 
 def _words(value: Any, depth: int) -> Iterator[str]:
@@ -337,10 +337,10 @@ def _moment(value: Any, otherwise: int | None) -> int | None:
 
 
 def summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapping[str, Any] | None:
-    """Of a mission, None where there is none yet. One that is none is left out, and looked at again the next time."""
+    """The summary of a mission; None if it does not exist yet. An invalid one is skipped, and read again the next time."""
     key = f'{robot}/missions/{run_id}/summary.json'
     try:
-        told = from_json(source.get(key, MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+        content = from_json(source.get(key, MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
     except ObjectRefused as error:
         if error.data.get('reason') != 'missing':
             findings.add(key, str(error))
@@ -348,10 +348,10 @@ def summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapp
     except ValueError as error:
         findings.add(key, f'it is not a summary: {error}')
         return None
-    if not isinstance(told, dict):
+    if not isinstance(content, dict):
         findings.add(key, 'it is not a summary')
         return None
-    return told
+    return content
 
 
 # -- the file ------------------------------------------------------------------------------------------------------------------
@@ -359,9 +359,9 @@ def summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapp
 
 @contextmanager
 def _opened(path: Path, *, is_new: bool = False) -> Iterator[sqlite3.Connection]:
-    """An index, whoever wrote the file: it must have our tables, and nothing of its own. Raises LakeError."""
+    """Open an index. The file may be hostile: it must have exactly our tables, without views or triggers. Raises LakeError."""
     if not is_new and not path.is_file():
-        raise LakeError(f'there is no index of words at {path}', remedy=REMEDY)
+        raise LakeError(f'the search index {path} does not exist', remedy=REMEDY)
     try:
         with closing(sqlite3.connect(path, timeout=30.0)) as db:
             db.execute('PRAGMA trusted_schema = OFF')
@@ -369,14 +369,14 @@ def _opened(path: Path, *, is_new: bool = False) -> Iterator[sqlite3.Connection]
                 db.executescript(f'BEGIN; {_SCHEMA} COMMIT;')
             elif _definitions(db) != _expected() or _marks(db) != (_APPLICATION, _VERSION):
                 remedy = REMEDY if _marks(db)[0] == _APPLICATION else f'remove it: {REMEDY}'
-                raise LakeError(f'{path} is not an index of words of this version', remedy=remedy)
+                raise LakeError(f'{path} is not a search index of this version', remedy=remedy)
             yield db
     except sqlite3.Error as error:
-        raise LakeError(f'the index of words {path} cannot be used: {error}', remedy=f'remove it: {REMEDY}') from error
+        raise LakeError(f'the search index {path} cannot be used: {error}', remedy=f'remove it: {REMEDY}') from error
 
 
 def _is_outdated(path: Path) -> bool:
-    """Whether it is an index of ours, of another version."""
+    """Whether it is an index of another version."""
     if not path.is_file():
         return False
     with suppress(sqlite3.Error), closing(sqlite3.connect(path)) as db:
@@ -401,7 +401,7 @@ def _expected() -> list[tuple[str, str]]:
 
 
 def put(store: ObjectStore, bucket: str, key: str, path: Path) -> None:
-    """Put the index into the store, in the place of the one that is there. Raises StoreError, LakeError."""
+    """Upload the index, replacing an existing one. Raises StoreError, LakeError."""
     body = path.read_bytes()
     item = SpooledObject(
         id=0, bucket=bucket, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
@@ -412,16 +412,16 @@ def put(store: ObjectStore, bucket: str, key: str, path: Path) -> None:
             store.put(item)
             return
     for _ in range(_TRIES):
-        there = store.changed(bucket, key, '', MOST_BYTES)
+        there = store.changed(bucket, key, '', MAX_BYTES)
         if there is None or store.replace(bucket, key, body, there[1]):
             return
-    raise LakeError(f'others put an index at {bucket}/{key} at the same time', remedy='run it again')
+    raise LakeError(f'other processes kept replacing the index {bucket}/{key}', remedy='run the command again')
 
 
 @contextmanager
 def downloaded(source: Bucket, key: str) -> Iterator[Path]:
-    """The index at a key, as a file for a while. Raises StoreError."""
+    """Download the index at a key to a temporary file. Raises StoreError."""
     with tempfile.TemporaryDirectory(prefix='shadowhound-search-') as folder:
         path = Path(folder, 'search.db')
-        path.write_bytes(source.get(key, MOST_BYTES))
+        path.write_bytes(source.get(key, MAX_BYTES))
         yield path

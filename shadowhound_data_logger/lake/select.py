@@ -1,6 +1,6 @@
-"""What a query selects: which objects, of which time and place; and the dates that can have them.
+"""What a query selects: objects, by time, position and other conditions; and the dates on which they can be.
 
-The time of an object is its start (``t_start``, UTC), which is also the date of its row.
+The time of an object is its start (``t_start``, UTC), whose date is also the date of its row.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from shadowhound_data_logger.core.times import moment
 from shadowhound_data_logger.formats.rows.schema import UNDATED
 
 DAY: Final = timedelta(days=1)
-LONGEST_BATCH_NS: Final = 3600 * SECOND
-"""A batch that started so long before a time can overlap it (``sensor.batch_s``)."""
+MAX_BATCH_NS: Final = 3600 * SECOND
+"""A batch that started this long before a time can overlap it (``sensor.batch_s``)."""
 RANGES: Final = 'the ranges of `shadowhound-data query --when ... --json`: since_ns and until_ns in ns since 1970, and robot'
-MOST_FOLDERS: Final = 400
-"""Dates that are asked for by name; for a longer time the folders that there are are listed first."""
+MAX_FOLDERS: Final = 400
+"""For up to this many dates, the folders are accessed by name; for more, the existing folders are listed."""
 
 
 class TimeSpan(NamedTuple):
-    """A time of one robot, or of all (None), both ends included."""
+    """A time of one robot, or of all (None), both ends inclusive."""
 
     robot: str | None
     since_ns: int
@@ -35,10 +35,10 @@ class TimeSpan(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Objects that overlap one of some times, or are named."""
+    """Objects that overlap one of these times, or that are named."""
 
     spans: tuple[TimeSpan, ...]
-    """By robot, in the order of their times, without overlap."""
+    """By robot, ordered by time, without overlap."""
     keys: frozenset[tuple[str, str]] = frozenset()
     """(bucket, key)."""
 
@@ -61,7 +61,7 @@ class Wanted:
     """The start of the id of a mission or of its run."""
     mission_type: str | None = None
     success: bool | None = None
-    """Whether the mission succeeded, by its ``summary.json``; a mission that has not ended is neither."""
+    """Whether the mission succeeded, by its ``summary.json``; a mission that has not ended never matches."""
     policy: str | None = None
     """Missions in which this policy was active, by their ``summary.json``: a name, ``NAME@7`` or an id."""
     where: str | None = None
@@ -73,7 +73,7 @@ class Wanted:
     chosen: tuple[Chosen, ...] = ()
     """An object must be in each of these."""
     bounds: tuple[tuple[str, Any, Any], ...] = ()
-    """Further columns with the least and the greatest value of what is wanted: row groups without are left out."""
+    """Further columns with the minimum and maximum of the wanted values: other row groups are skipped."""
 
     def has_date(self, date: str) -> bool:
         """Whether a row with this date can match."""
@@ -85,7 +85,7 @@ class Wanted:
         return first <= date and (self.until_ns is None or date <= date_of(self.until_ns - 1))
 
     def dates(self, now_ns: int) -> list[str] | None:
-        """Those folders, where they can be named; None where it is shorter to look which there are."""
+        """The dates in the requested time; None if there are so many that listing the existing ones is faster."""
         if self.since_ns is None:
             return None
         last_ns = now_ns + FUTURE_SLACK_NS if self.until_ns is None else self.until_ns - 1
@@ -93,7 +93,7 @@ class Wanted:
         count = (last - first).days + 1
         if self.until_ns is not None and self.until_ns <= self.since_ns:
             return []
-        return None if count > MOST_FOLDERS else [str(first + DAY * number) for number in range(count)]
+        return None if count > MAX_FOLDERS else [str(first + DAY * number) for number in range(count)]
 
 
 def wanted(  # noqa: PLR0913 - the flags of a question
@@ -106,7 +106,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
 ) -> Wanted:  # fmt: skip
     """The query with these flags. Raises SettingError for an invalid flag.
 
-    ``ranges`` are those of an answer about values or labels: mappings with ``since_ns``, ``until_ns`` and maybe ``robot``.
+    ``ranges`` are the result of a query about values or labels: mappings with ``since_ns``, ``until_ns``, optionally ``robot``.
     """
     if by not in CLOCKS:
         raise SettingError('by', by, ' or '.join(CLOCKS))
@@ -120,7 +120,7 @@ def wanted(  # noqa: PLR0913 - the flags of a question
 
 
 def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
-    """Raises SettingError for invalid ranges."""
+    """Convert ranges to time spans. Raises SettingError."""
     found = []
     for each in ranges:
         try:
@@ -135,9 +135,9 @@ def spans_of(ranges: Sequence[Mapping[str, Any]]) -> list[TimeSpan]:
 
 
 def within(asked: Wanted, spans: Iterable[TimeSpan], keys: Iterable[tuple[str, str]] = (), all_ns: Iterable[int] = ()) -> Wanted:
-    """The query, restricted to objects that overlap these times or are named; to none if there are none of either.
+    """Restrict a query to objects that overlap these times or are named; without times and keys, to no objects.
 
-    ``all_ns`` are the times of the objects.
+    ``all_ns`` are the times of the named objects.
     """
     joined: list[TimeSpan] = []
     for each in sorted((each for each in spans if each.since_ns <= each.until_ns), key=lambda each: (each.robot or '', each[1:])):
@@ -146,7 +146,7 @@ def within(asked: Wanted, spans: Iterable[TimeSpan], keys: Iterable[tuple[str, s
         else:
             joined.append(each)
     ends = [*all_ns, *(each.since_ns for each in joined), *(each.until_ns for each in joined)]
-    since_ns = max(0, min(ends, default=0) - LONGEST_BATCH_NS)
+    since_ns = max(0, min(ends, default=0) - MAX_BATCH_NS)
     until_ns = max(ends, default=-1) + 1
     return replace(
         asked, chosen=(*asked.chosen, Chosen(tuple(joined), frozenset(keys))), since_ns=max(since_ns, asked.since_ns or 0),

@@ -21,7 +21,7 @@ from shadowhound_data_logger.lake.bucket import Bucket, default_source
 from shadowhound_data_logger.lake.decode import ARCHIVES, CLOUDS, IMAGES
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prefetch import Place
-from shadowhound_data_logger.lake.pull import bring
+from shadowhound_data_logger.lake.pull import request_and_wait
 from shadowhound_data_logger.lake.samples import Near, Selection, Window
 from shadowhound_data_logger.lake.tables import among, narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track, packed
@@ -34,8 +34,8 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
     if isinstance(source, (str, Path)):
         if not any(Path(source).glob(f'*/{SENSOR}')):
             raise LakeError(
-                f'{source} has no catalogue',
-                remedy='fetch by a query, such as --since yesterday: a prefix alone brings no rows',
+                f'{source} has no catalog',
+                remedy='fetch with a query, such as --since yesterday: fetching by prefix includes no rows',
             )
         return Place(StoreSettings(), Path(source).absolute()), fetched(Path(source))
     found = source or default_source()
@@ -43,7 +43,7 @@ def place(source: Bucket | Path | str | None) -> tuple[Place, Bucket]:
 
 
 def fetched(folder: Path) -> Bucket:
-    """A folder of fetched objects as a bucket: it has their rows as well (``fetched.keep_rows``)."""
+    """A folder of fetched objects as a bucket: it also has their rows (``fetched.keep_rows``)."""
     whole = folder.absolute()
     return Bucket(StoreSettings(directory=whole.parent), whole.name)
 
@@ -51,14 +51,14 @@ def fetched(folder: Path) -> Bucket:
 def pull(
     lake: Bucket, source: Bucket | Path | str | None, sensors: Sequence[str], flags: Mapping[str, Any], findings: Findings
 ) -> None:
-    """Request what robots keep of these sensors. Raises SettingError for a folder, and the errors of ``bring``."""
+    """Request what robots keep of these sensors. Raises SettingError for a folder, and the errors of ``request_and_wait``."""
     if isinstance(source, (str, Path)):
-        raise SettingError('pull', True, 'a store as the source: robots are asked through one')
-    bring(lake, flags, sensors=sensors, say=log.info, findings=findings)
+        raise SettingError('pull', True, 'a store as the source, because robots receive requests through the store')
+    request_and_wait(lake, flags, sensors=sensors, say=log.info, findings=findings)
 
 
 def labels_of(lake: Bucket, objects: Sequence[tuple[Track, int]], findings: Findings) -> list[list[str]]:
-    """Of each message in these objects of tracks. Raises StoreError."""
+    """The labels of each message in these objects of tracks. Raises StoreError."""
     names: dict[str, list[Any]] = {name: [] for name in ('robot', 'bucket', 'key', 't_start_ns')}
     for track, number in objects:
         stamps = [int(stamp) for stamp in track.stamps_ns(number)]
@@ -71,7 +71,10 @@ def labels_of(lake: Bucket, objects: Sequence[tuple[Track, int]], findings: Find
 
 def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], size: tuple[int, int] | None,
            flags: Mapping[str, Any], findings: Findings) -> Selection:  # fmt: skip
-    """Raises SettingError for an invalid query, LakeError if an aligned sensor has no objects, StoreError."""
+    """Select the objects of a dataset.
+
+    Raises SettingError for an invalid query, LakeError if an aligned sensor has no objects, StoreError.
+    """
     for name, how in aligned.items():
         if min(how.reach_ns) < 0 or not sum(how.reach_ns):
             raise SettingError(f'align[{name!r}]', how, 'a time of more than 0 s')
@@ -81,7 +84,7 @@ def select(source: Bucket, anchor: str, aligned: Mapping[str, Near | Window], si
     anchors = tracks_of(_possible(found, findings))
     del found, ends
     sides = _sides(source, list(anchors.values()), aligned, findings, flags) if anchors else {}
-    pa.default_memory_pool().release_unused()  # of a million rows 1 GB
+    pa.default_memory_pool().release_unused()  # 1 GB for a million rows
     return Selection(tuple(anchors.values()), dict(aligned), sides, size, flags.get('by', BY_STAMP))
 
 
@@ -90,7 +93,7 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     if not aligned:
         return {}
     reach = max(max(how.reach_ns) for how in aligned.values()) + SECOND
-    longest_ns = 3600 * SECOND  # a batch that started so long before can overlap the time (sensor.batch_s)
+    longest_ns = 3600 * SECOND  # a batch that started this long before a time can overlap it (sensor.batch_s)
     since = utc(min(int(track.start_ns[0]) for track in anchors) - reach - longest_ns)
     until = utc(max(int(track.latest_ns[-1]) for track in anchors) + reach)
     where = among('sensor', aligned)
@@ -99,15 +102,17 @@ def _sides(source: Bucket, anchors: list[Track], aligned: Mapping[str, Near | Wi
     for name in aligned:
         kinds = {*pc.unique(found.filter(pc.equal(found['sensor'], name))['type']).to_pylist()}
         if not kinds:
-            raise LakeError(f'{name} has no object about the time of the {anchors[0].sensor}',
-                            remedy='was it fetched, and is it the name of a sensor? Otherwise remove it from align')  # fmt: skip
+            raise LakeError(f'{name} has no object in the time of {anchors[0].sensor}',
+                            remedy='check that it is the name of a sensor and was fetched, or remove it from align')  # fmt: skip
         if len(kinds) > 1:
-            raise LakeError(f'{name} has messages of {" and of ".join(sorted(map(str, kinds)))}', remedy='restrict the time')
+            raise LakeError(
+                f'{name} has messages of several types: {", ".join(sorted(map(str, kinds)))}', remedy='restrict the time'
+            )
     return {key: _near(track, anchors, reach) for key, track in tracks_of(found).items()}
 
 
 def _near(track: Track, anchors: list[Track], reach: int) -> Track:
-    """The rows near the time of an anchor of the same robot: there can be months between two anchors."""
+    """The rows near the times of the same robot's anchors: there can be months between two anchors."""
     same = [anchor for anchor in anchors if anchor.robot == track.robot]
     first = min((int(anchor.start_ns[0]) for anchor in same), default=0) - reach
     last = max((int(anchor.latest_ns[-1]) for anchor in same), default=0) + reach
@@ -115,13 +120,13 @@ def _near(track: Track, anchors: list[Track], reach: int) -> Track:
 
 
 def _rows(batches: Iterable[pa.Table]) -> pa.Table:
-    """Packed batch by batch: a million rows would take 0.5 GB."""
+    """Pack the rows batch by batch: unpacked, a million rows would take 0.5 GB."""
     found = [packed(batch.filter(pc.is_valid(batch['t_start']))) for batch in batches]
     return pa.concat_tables([packed(narrow(NEEDED).empty_table()), *found])
 
 
 def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
-    """Without objects whose row claims more samples than its size allows: they would dominate the dataset."""
+    """The rows without those that claim more messages than an object can have: they would dominate the dataset."""
     counts = pc.fill_null(rows['count'], 0)
     is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MOST_MEMBERS))
     for row in rows.filter(pc.invert(is_possible)).select(['key', 'count']).to_pylist():
@@ -135,10 +140,10 @@ def _kept(rows: pa.Table, mask: pa.ChunkedArray) -> pa.Table:
 
 
 def tracks_of(rows: pa.Table) -> dict[tuple[str, str], Track]:
-    """By robot and sensor."""
+    """The tracks, by robot and sensor."""
     robots, sensors = (pc.fill_null(rows[name], '') for name in ('robot', 'sensor'))
     names = {(robot, sensor) for robot in pc.unique(robots).to_pylist() for sensor in pc.unique(sensors).to_pylist()}
-    if len(names) == 1:  # the largest tables: without a copy
+    if len(names) == 1:  # without a copy, because the largest tables have one sensor
         return {names.pop(): Track.of(rows)}
     found = {}
     for robot, sensor in sorted(names):

@@ -1,6 +1,6 @@
-"""In which order a data set is streamed, and which of it by whom: whole shards, so that a worker reads an object once.
+"""The order in which a dataset is streamed, and its distribution to workers: by whole shards, so that one worker reads an object.
 
-A shard is an archive, or some objects of one message each that follow each other in time.
+A shard is an archive, or consecutive objects of one message each.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from shadowhound_data_logger.lake.track import Track
 
 SHARD: Final = 64
-"""Objects of one message each: neighbours share the batches of the sensors beside them."""
+"""Objects of one message each in a shard: neighbors share the batches of the aligned sensors."""
 MIXED: Final = 4
-"""Shards of which the samples are shuffled among each other."""
+"""Shards whose samples are shuffled together."""
 
 
 class Reference(NamedTuple):
-    """One sample: which anchor's track, which object of it, which message in that."""
+    """One sample: the anchor's track, the object in the track, and the message in the object."""
 
     track: int
     number: int
@@ -39,7 +39,7 @@ class Shard(NamedTuple):
 
 
 def shards(tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]]) -> list[Shard]:
-    """All of them, in the order of time of each robot; their bounds count the ``chosen`` objects of a track."""
+    """All shards, ordered by time for each robot; their bounds are indices into the ``chosen`` objects of a track."""
     found: list[Shard] = []
     for number, (track, objects) in enumerate(zip(tracks, chosen, strict=True)):
         first = 0
@@ -58,15 +58,15 @@ def shards(tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]]) -> list[
 
 def order(tracks: Sequence[Track], chosen: Sequence[NDArray[np.intp]], *, share: tuple[int, int], seed: int | None,
           epoch: int) -> Iterator[Reference]:  # fmt: skip
-    """The samples of one share of (share, shares); without a seed in the order of time. All shares together are all samples."""
+    """The samples of one share (number, total), ordered by time without a seed. Together, the shares contain all samples."""
     every = shards(tracks, chosen)
     rng = None if seed is None else np.random.default_rng((seed, epoch))
     if rng is not None:
         every = [every[place] for place in rng.permutation(len(every))]
     mine = every[share[0] :: share[1]]
     mixed = None if seed is None else np.random.default_rng((seed, epoch, share[0]))
-    for begin in range(0, len(mine), MIXED if mixed is not None else 1):
-        group = [reference for shard in mine[begin : begin + (MIXED if mixed is not None else 1)]
+    for start in range(0, len(mine), MIXED if mixed is not None else 1):
+        group = [reference for shard in mine[start : start + (MIXED if mixed is not None else 1)]
                  for reference in _references(shard, tracks, chosen)]  # fmt: skip
         places = range(len(group)) if mixed is None else mixed.permutation(len(group))
         yield from (group[int(place)] for place in places)
@@ -79,7 +79,7 @@ def _references(shard: Shard, tracks: Sequence[Track], chosen: Sequence[NDArray[
 
 
 def worker_share() -> tuple[int, int]:
-    """(this worker, workers) of a torch DataLoader's process; (0, 1) elsewhere, and without torch."""
+    """(number of this worker, number of workers) in a worker of a torch DataLoader; otherwise (0, 1)."""
     loading = sys.modules.get('torch.utils.data')
-    told = loading.get_worker_info() if loading is not None else None
-    return (0, 1) if told is None else (int(told.id), int(told.num_workers))
+    worker = loading.get_worker_info() if loading is not None else None
+    return (0, 1) if worker is None else (int(worker.id), int(worker.num_workers))

@@ -1,14 +1,13 @@
-"""Objects, gaps, missions, their events and labels as documents of Elasticsearch or OpenSearch.
+"""Sends objects, gaps, missions, events and labels as documents to Elasticsearch or OpenSearch.
 
-Requests are plain HTTP, because the clients of each reject the servers of the other: ``PUT _index_template``, ``PUT INDEX`` and
-``POST _bulk``, which are the same in both.
+Requests are plain HTTP, because each product's client rejects the other's servers: ``PUT _index_template``, ``PUT INDEX`` and
+``POST _bulk`` are the same in both.
 https://www.elastic.co/docs/api/doc/elasticsearch/operation/operation-bulk
 https://docs.opensearch.org/latest/api-reference/document-apis/bulk/
 
-The ``_id`` of a document is a hash of its content, so it exists once however often it is sent. Rows of objects never change and
-are only created; statements of the gap journal and labels are replaced by newer ones (external versions) in any order. A file
-records up to which version of each table the server has confirmed the rows: a run that is killed continues there, and what is
-sent twice exists already.
+The ``_id`` of a document is a hash of its identity, so sending it repeatedly does not duplicate it. Documents of objects never
+change and are only created; those of gaps and labels are replaced by newer ones (external versions), in any order. A file
+records up to which version of each table the server has confirmed the rows, so that the next run continues after a kill.
 """
 
 from __future__ import annotations
@@ -52,18 +51,18 @@ from shadowhound_data_logger.lake.views import current
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-WHICH: Final = 'is it an Elasticsearch or an OpenSearch?'
+WHICH: Final = 'check that the URL is that of an Elasticsearch or OpenSearch server'
 BULK_BYTES: Final = 4 << 20
-"""Of one request; both servers take 100 MB by default (``http.max_content_length``)."""
+"""Per request; both servers accept 100 MB by default (``http.max_content_length``)."""
 BULK_DOCUMENTS: Final = 4_000
 MISSIONS_AT_A_TIME: Final = 180
-"""Recorded together: at most so many are sent again after a kill."""
+"""Recorded together: after a kill, at most this many are sent again."""
 TRIES: Final = 8
-"""Of a request, without ``--follow``: about a minute."""
+"""Attempts per request without ``--follow``: about a minute."""
 CAP_S: Final = 30.0
 ANSWER_S: Final = 60.0
-MOST_ANSWER_BYTES: Final = 64 << 20
-MOST_REASON: Final = 200
+MAX_ANSWER_BYTES: Final = 64 << 20
+MAX_REASON: Final = 200
 _NAME: Final = re.compile(r'[a-z0-9][a-z0-9_.-]{0,99}', re.ASCII)
 _RETRIED: Final = (429, 502, 503, 504)
 _GOOD: Final = range(200, 300)
@@ -93,7 +92,7 @@ ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS = 'objects', 'gaps', 'missions', 'e
 INDEXES: Final = (ROWS, GAP_ROWS, MISSIONS, EVENTS, LABEL_ROWS)
 """Each is an index, ``NAME-objects`` and so on."""
 FORGOTTEN_ROWS: Final = 'forgotten'
-"""Later additions to documents of ``objects``."""
+"""Updates of documents in ``objects``."""
 
 
 class SinkDocument(NamedTuple):
@@ -104,23 +103,23 @@ class SinkDocument(NamedTuple):
     id: str
     fields: Mapping[str, Any]
     version: int | None = None
-    """None: it is only created. Otherwise it replaces documents with a lower one."""
+    """None: create the document if it does not exist. Otherwise replace documents with a lower version."""
     is_update: bool = False
     """Whether these fields are added to an existing document."""
 
 
 @dataclass(slots=True)
 class SinkTally:
-    """The outcome of a run, in documents."""
+    """The result of a run, in documents."""
 
     added: int = 0
-    """Created, or replaced by newer ones."""
+    """Created or replaced documents."""
     present: int = 0
-    """They existed already, the same or newer."""
+    """Documents that already existed, in the same or a newer version."""
     refused: Counter[str] = field(default_factory=Counter)
-    """By the server's reason; the position's file lists them."""
+    """Rejected documents by the server's reason; the position's file lists them."""
     restarted: list[str] = field(default_factory=list)
-    """Indexes that were replaced since the last run: everything was sent again."""
+    """Indexes that were recreated since the last run: everything was sent again."""
 
     def __iadd__(self, other: SinkTally) -> Self:
         self.added += other.added
@@ -134,10 +133,10 @@ class SinkTally:
 
 
 class SearchServer:
-    """A client of one Elasticsearch (7.8 or later) or OpenSearch. Its repr shows no secret.
+    """A client of one Elasticsearch (7.8 or later) or OpenSearch server. Its repr shows no secret.
 
-    ``authorization`` is the value of that header, see ``authorization``. Raises SettingError for an invalid URL, SinkUnavailable
-    without an answer or if the server is overloaded, LakeError if the server rejects the request.
+    ``authorization`` is the value of the HTTP header (see the function of this name). Raises SettingError for an invalid URL,
+    SinkUnavailable if the server does not answer or is overloaded, LakeError if it rejects a request.
     """
 
     def __init__(self, url: str, authorization: str = '', ca: Path | None = None) -> None:
@@ -149,7 +148,7 @@ class SearchServer:
             raise SettingError(
                 'URL',
                 'with a password',
-                'a URL without one: ELASTIC_USERNAME and ELASTIC_PASSWORD, or ELASTIC_API_KEY, name them',
+                'a URL without a password: set ELASTIC_USERNAME and ELASTIC_PASSWORD, or ELASTIC_API_KEY',
             )
         if parsed.scheme not in {'http', 'https'} or not parsed.host or parsed.query or parsed.fragment:
             raise SettingError('URL', url[:200], 'http://HOST:9200 or https://HOST:9200')
@@ -163,83 +162,81 @@ class SearchServer:
 
     def ask(self, method: str, path: str, body: bytes | None = None, kind: str = 'application/json',
             allowed: Sequence[int] = ()) -> tuple[int, Any]:  # fmt: skip
-        """The status and the JSON of an answer; statuses other than 2xx and the allowed ones are errors."""
+        """Send a request; returns status and JSON of the response. Statuses other than 2xx and the allowed ones are errors."""
         try:
             answer = self._pool.request(method, f'{self.url}/{path}', body=body, redirect=False, preload_content=False,
                                         enforce_content_length=True, headers={**self._headers, 'Content-Type': kind})  # fmt: skip
             try:
-                content = answer.read(MOST_ANSWER_BYTES + 1, decode_content=False)
-                if len(content) > MOST_ANSWER_BYTES:
-                    raise LakeError(
-                        f'{self.url} answers with more than {MOST_ANSWER_BYTES:,} bytes', remedy='is it the right server?'
-                    )
-                answer.read()  # the rest: raises for an incomplete body
+                content = answer.read(MAX_ANSWER_BYTES + 1, decode_content=False)
+                if len(content) > MAX_ANSWER_BYTES:
+                    raise LakeError(f'{self.url} responded with more than {MAX_ANSWER_BYTES:,} bytes', remedy=WHICH)
+                answer.read()  # raises if the body is incomplete
             finally:
                 answer.close()
         except urllib3.exceptions.HTTPError as error:
-            raise SinkUnavailable(f'{self.url} gives no answer: {_cause(error)}') from error
+            raise SinkUnavailable(f'{self.url} does not answer: {_cause(error)}') from error
         if answer.status in _RETRIED:
-            raise SinkUnavailable(f'{self.url} asks to wait ({answer.status})')
+            raise SinkUnavailable(f'{self.url} is overloaded or unavailable ({answer.status})')
         try:
-            told = from_json(content, MOST_ANSWER_BYTES) if content else {}
+            document = from_json(content, MAX_ANSWER_BYTES) if content else {}
         except ValueError as error:
-            raise LakeError(f'{self.url} does not answer in JSON ({answer.status})', remedy=WHICH) from error
+            raise LakeError(f'{self.url} did not respond with JSON ({answer.status})', remedy=WHICH) from error
         if answer.status not in _GOOD and answer.status not in allowed:
             remedies = {
                 401: 'set ELASTIC_API_KEY, or ELASTIC_USERNAME and ELASTIC_PASSWORD',
-                403: 'this user may not do that: see docs/elastic.md',
+                403: 'give this user the permissions in docs/elastic.md',
             }
-            raise LakeError(f'{self.url} refuses {method} /{path} ({answer.status}): {_reason(told)}',
+            raise LakeError(f'{self.url} refused {method} /{path} ({answer.status}): {_reason(document)}',
                             remedy=remedies.get(answer.status, 'see docs/elastic.md'), status=answer.status)  # fmt: skip
-        return answer.status, told
+        return answer.status, document
 
     def prepare(self, name: str) -> dict[str, str]:
-        """Put the template and create missing indexes; returns the UUID of each."""
-        _, told = self.ask('GET', '')
-        version = told.get('version') if isinstance(told, dict) else None
+        """Upload the template and create missing indexes; returns the UUID of each index."""
+        _, info = self.ask('GET', '')
+        version = info.get('version') if isinstance(info, dict) else None
         if not isinstance(version, dict) or 'number' not in version:
-            raise LakeError(f'{self.url} is neither an Elasticsearch nor an OpenSearch', remedy='does the URL lead to one?')
+            raise LakeError(f'{self.url} is neither an Elasticsearch nor an OpenSearch server', remedy=WHICH)
         made = template(name, is_opensearch=version.get('distribution') == 'opensearch')
         self.ask('PUT', f'_index_template/{name}', _dump(made))
         for index in INDEXES:
             self.ask('PUT', f'{name}-{index}', b'{}', allowed=(400,))  # 400: it exists; the next request fails if it does not
         names = ','.join(f'{name}-{index}' for index in INDEXES)
-        _, told = self.ask('GET', f'{names}/_settings')
+        _, settings = self.ask('GET', f'{names}/_settings')
         try:
-            return {index: str(told[f'{name}-{index}']['settings']['index']['uuid']) for index in INDEXES}
+            return {index: str(settings[f'{name}-{index}']['settings']['index']['uuid']) for index in INDEXES}
         except (KeyError, TypeError) as error:
             raise LakeError(
-                f'{self.url} does not tell the UUIDs of {name}-*', remedy='may this user read their settings?'
+                f'{self.url} does not return the UUIDs of {name}-*', remedy='permit this user to read their settings'
             ) from error
 
     def bulk(self, documents: Sequence[bytes]) -> list[tuple[int, str]]:
-        """Send documents made by ``encoded``; the status and the error of each."""
-        _, told = self.ask('POST', '_bulk', b''.join(documents), 'application/x-ndjson')
+        """Send documents encoded by ``encoded``; returns status and error of each."""
+        _, result = self.ask('POST', '_bulk', b''.join(documents), 'application/x-ndjson')
         try:
-            items = [next(iter(item.values())) for item in told['items']]
+            items = [next(iter(item.values())) for item in result['items']]
             found = [(int(item['status']), _reason(item)) for item in items]
         except (KeyError, TypeError, AttributeError, ValueError, StopIteration) as error:
-            raise LakeError(f'{self.url} does not answer _bulk as documented', remedy=WHICH) from error
+            raise LakeError(f'{self.url} does not respond to _bulk as documented', remedy=WHICH) from error
         if len(found) != len(documents):
             raise LakeError(
-                f'{self.url} answers for {len(found)} of {len(documents)} documents', remedy='is there a proxy before it?'
+                f'{self.url} confirmed {len(found)} of {len(documents)} documents', remedy='check for a proxy in front of it'
             )
         return found
 
 
 def authorization(environ: Mapping[str, str]) -> str:
-    """The header that ``ELASTIC_API_KEY``, else ``ELASTIC_USERNAME`` and ``ELASTIC_PASSWORD`` ask for. Raises SettingError."""
+    """The header for ``ELASTIC_API_KEY``, otherwise for ``ELASTIC_USERNAME`` and ``ELASTIC_PASSWORD``. Raises SettingError."""
     key, user = environ.get('ELASTIC_API_KEY', ''), environ.get('ELASTIC_USERNAME', '')
     found = f'ApiKey {key}' if key else ''
     if user and not key:
         found = 'Basic ' + base64.b64encode(f'{user}:{environ.get("ELASTIC_PASSWORD", "")}'.encode()).decode()
     if not found.isascii() or not found.isprintable():
-        raise SettingError('ELASTIC_API_KEY', '...', 'letters, digits and signs, without a line break')
+        raise SettingError('ELASTIC_API_KEY', '...', 'printable ASCII characters without line breaks')
     return found
 
 
 def template(name: str, *, is_opensearch: bool) -> dict[str, Any]:
-    """The index template: types of the fields; other fields are stored but cannot be searched."""
+    """The index template with the types of the fields; other fields are stored but cannot be searched."""
     position = {'position': {'type': 'xy_point' if is_opensearch else 'point'}}
     return {
         'index_patterns': [f'{name}-{index}' for index in INDEXES],
@@ -251,22 +248,22 @@ def template(name: str, *, is_opensearch: bool) -> dict[str, Any]:
 
 def _cause(error: BaseException) -> str:
     reason = getattr(error, 'reason', None)
-    return visible(str(reason if isinstance(reason, BaseException) else error))[:MOST_REASON]
+    return visible(str(reason if isinstance(reason, BaseException) else error))[:MAX_REASON]
 
 
-def _reason(told: object) -> str:
-    """The error, in one line; '' without one."""
-    error = told.get('error') if isinstance(told, dict) else None
+def _reason(answer: object) -> str:
+    """The error in a response, on one line; '' without an error."""
+    error = answer.get('error') if isinstance(answer, dict) else None
     if isinstance(error, dict):
         error = ': '.join(str(error[word]) for word in ('type', 'reason') if word in error)
-    return visible(str(error))[:MOST_REASON] if error else ''
+    return visible(str(error))[:MAX_REASON] if error else ''
 
 
 # -- documents -----------------------------------------------------------------------------------------------------------------
 
 
 def of_object(row: Mapping[str, Any]) -> SinkDocument:
-    """Of an object; its ``_id`` is the SHA-256 of bucket, key and ``t_start_ns``, each on a line."""
+    """The document of an object. Its ``_id`` is the SHA-256 of bucket, key and ``t_start_ns``, separated by line breaks."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 't_start', 't_end'}}
     if row['t_start'] is not None:
         found |= {'time': _iso(row['t_start_ns']), 't_start': _iso(row['t_start_ns']), 't_end': _iso(row['t_end_ns'])}
@@ -278,7 +275,7 @@ def of_object(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def of_forgotten(row: Mapping[str, Any]) -> SinkDocument:
-    """Of an object that ``lake prune`` deleted: its document is kept, with the time and the rule."""
+    """The update for an object that ``lake prune`` deleted: adds the time and the rule to its document, which is kept."""
     document = of_object({**row, 'x': None, 'y': None, 'latitude': None, 'longitude': None})
     unknown = {'x', 'y', 'latitude', 'longitude', 'forgotten_ns'}
     fields = {name: value for name, value in document.fields.items() if name not in unknown}
@@ -286,7 +283,7 @@ def of_forgotten(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def of_statement(row: Mapping[str, Any]) -> SinkDocument:
-    """Of a statement of the gap journal: the newest one about each gap is kept."""
+    """The document of a statement of the gap journal; the newest statement about each gap is kept."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 't_from', 't_to'}}
     for stamp, name in (('from_ns', 't_from'), ('to_ns', 't_to')):
         found[name] = None if row[name] is None else _iso(row[stamp])
@@ -297,7 +294,7 @@ def of_statement(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def of_label(row: Mapping[str, Any]) -> SinkDocument:
-    """Of a row about a label: the newest one is kept; ``what`` is whether it adds or removes the label."""
+    """The document of a row about a label; the newest row is kept. Its field ``what`` is whether it adds or removes the label."""
     found = {name: value for name, value in row.items() if name not in {'format_version', 'made'}}
     found |= {
         'time': _iso(row['since_ns']),
@@ -311,22 +308,22 @@ def of_label(row: Mapping[str, Any]) -> SinkDocument:
 
 
 def _version(number: int, *, is_later: bool) -> int:
-    """Of a document: the higher number is kept, and of two equal ones the later. Never more than 63 bits.
+    """The version of a document: the highest number is kept; of two equal ones, the one that is later. At most 63 bits.
 
-    A server rejects a whole request if one version is larger, and a hostile robot can write any number.
+    A server rejects the whole request if one version is larger, and a hostile robot can write any number.
     """
     return 2 * min(max(number, 0), (1 << 62) - 1) + is_later
 
 
-def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[SinkDocument]:
-    """A mission, its events and its errors, of its ``summary.json``."""
-    for number, each in enumerate(search.of_mission(robot, run_id, told)):
+def of_mission(robot: str, run_id: str, content: Mapping[str, Any]) -> Iterator[SinkDocument]:
+    """The documents of a mission, its events and its errors, from its ``summary.json``."""
+    for number, each in enumerate(search.of_mission(robot, run_id, content)):
         found: dict[str, Any] = {
             'robot': robot, 'run_id': run_id, 'mission_id': each.mission_id, 'mission_type': each.mission_type,
             'success': each.success, 'time': None if each.since_ns is None else _iso(each.since_ns), 'text': each.text,
         }  # fmt: skip
         if each.kind == search.MISSION:
-            scalars = {name: told[name] for name in _SUMMARY if isinstance(told.get(name), (str, int, float))}
+            scalars = {name: content[name] for name in _SUMMARY if isinstance(content.get(name), (str, int, float))}
             found |= scalars | {
                 'command': each.title, 'bucket': each.bucket, 'key': each.key, 'started': found['time'],
                 'ended': None if each.until_ns is None else _iso(each.until_ns),
@@ -337,7 +334,7 @@ def of_mission(robot: str, run_id: str, told: Mapping[str, Any]) -> Iterator[Sin
 
 
 def encoded(name: str, document: SinkDocument) -> bytes:
-    """Two lines of a bulk request; a number that JSON does not have is null."""
+    """Encode a document as two lines of a bulk request; numbers that JSON cannot represent become null."""
     action: dict[str, Any] = {'_index': f'{name}-{document.kind}', '_id': document.id}
     if document.is_update:
         return _dump({'update': action}) + b'\n' + _dump({'doc': document.fields, 'doc_as_upsert': True}) + b'\n'
@@ -365,7 +362,7 @@ def _digest(*parts: object) -> str:
 
 
 def _iso(stamp_ns: int | None) -> str | None:
-    """With nanoseconds: both servers read times until the year 2262, like int64."""
+    """A time with nanoseconds: both servers support times until the year 2262, like int64."""
     if stamp_ns is None:
         return None
     seconds, rest = divmod(stamp_ns, SECOND)
@@ -384,7 +381,7 @@ PRAGMA user_version = 1;
 
 
 class Position:
-    """What one server has, in a SQLite file: up to which version of each table, which missions, and what it rejected."""
+    """Records in a SQLite file what one server has: the version of each table, the missions, and the rejected documents."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -397,14 +394,14 @@ class Position:
                 raise sqlite3.DatabaseError('it is of another version')
         except sqlite3.Error as error:
             raise LakeError(
-                f'{path} is not the position of a sink: {error}', remedy='remove it: all is sent again, nothing is there twice'
+                f'{path} is not the position of a sink: {error}', remedy='remove it: everything is sent again, without duplicates'
             ) from error
 
     def close(self) -> None:
         self._db.close()
 
     def is_same(self, name: str, uuid: str) -> bool:
-        """Whether an index is the same as in the last run, or the first one; records it."""
+        """Record an index; returns False if it was recreated since the last run."""
         known = self._db.execute('SELECT uuid FROM indexes WHERE name = ?', (name,)).fetchone()
         with self._db:
             self._db.execute('INSERT OR REPLACE INTO indexes VALUES (?,?)', (name, uuid))
@@ -419,7 +416,7 @@ class Position:
                 self._db.execute('DELETE FROM missions')
 
     def version(self, name: str, robot: str | None) -> TableVersion | None:
-        """Up to which version of its table an index has the rows of one robot, or of all."""
+        """The version of its table up to which an index has the rows of one robot, or of all."""
         found = self._db.execute('SELECT id, number FROM versions WHERE name = ? AND robot = ?', (name, robot or '')).fetchone()
         return None if found is None else TableVersion(*found)
 
@@ -443,20 +440,20 @@ class Position:
 
 
 def position_path(home: Path, url: str, name: str) -> Path:
-    """The file of one name on one server, in the sender's home."""
+    """The file for one prefix of indexes on one server, in the sender's home."""
     return home / 'sink' / f'{hashlib.sha256(f"{url} {name}".encode()).hexdigest()[:16]}.db'
 
 
 @contextmanager
 def opened(server: SearchServer, name: str, home: Path) -> Iterator[Position]:
-    """The position, for one process at a time. Raises SettingError, LakeError."""
+    """Open the position, in one process at a time. Raises SettingError, LakeError."""
     if not _NAME.fullmatch(name):
         raise SettingError('--prefix', name[:100], 'small letters, digits, "-", "_" and ".", beginning with a letter or digit')
     path = position_path(home, server.url, name)
     path.parent.mkdir(parents=True, exist_ok=True)
     with flock(path.with_suffix('.lock'), wait=False) as had:
         if not had:
-            raise LakeError(f'another process sends to {name} at {server.url}', remedy='wait for it, or stop it')
+            raise LakeError(f'another process is sending to {name} at {server.url}', remedy='wait for it, or stop it')
         with closing(Position(path)) as position:
             yield position
 
@@ -474,7 +471,7 @@ _TABLES: Final[Sequence[tuple[str, TableSchema, Callable[[Mapping[str, Any]], Si
 
 @dataclass(slots=True)
 class Sink:
-    """Sends what a server does not have yet, some megabytes at a time, until each document is accepted or rejected.
+    """Sends the documents that a server does not have yet, some megabytes per request, until each is accepted or rejected.
 
     A request is tried ``tries`` times if the server does not answer or is overloaded.
     """
@@ -491,7 +488,7 @@ class Sink:
     _refused: list[tuple[str, int, str]] = field(default_factory=list)
 
     def send(self, robot: str | None = None) -> SinkTally:
-        """Send the rows of one robot, or of all. Raises StoreError, SinkUnavailable, LakeError; what was sent is recorded."""
+        """Send the rows of one robot or of all. Raises StoreError, SinkUnavailable, LakeError, after recording what was sent."""
         self._sent = SinkTally()
         for kind, uuid in self._patiently(lambda: self.server.prepare(self.name)).items():
             if not self.position.is_same(kind, uuid):
@@ -522,9 +519,9 @@ class Sink:
         for start in range(0, len(new), MISSIONS_AT_A_TIME):
             some = new[start : start + MISSIONS_AT_A_TIME]
             with ThreadPoolExecutor(THREADS, 'lake-sink') as pool:
-                told = list(pool.map(lambda run: search.summary(self.source, robot, run, self.findings), some))
-            ended = [(run, said) for run, said in zip(some, told, strict=True) if said is not None]
-            self._send(document for run, said in ended for document in of_mission(robot, run, said))
+                summaries = list(pool.map(lambda run: search.summary(self.source, robot, run, self.findings), some))
+            ended = [(run, content) for run, content in zip(some, summaries, strict=True) if content is not None]
+            self._send(document for run, content in ended for document in of_mission(robot, run, content))
             self.position.take_missions(robot, (run for run, _ in ended), self._refused)
             self._refused = []
 
@@ -553,23 +550,23 @@ class Sink:
             left = self._settled(batch, found)
             failures = 0 if len(left) < len(batch) else failures + 1
             if failures >= self.tries:
-                raise SinkUnavailable(f'{self.server.url} takes no documents: {found[0][1]}')
+                raise SinkUnavailable(f'{self.server.url} accepts no documents: {found[0][1]}')
             if left:
                 self.pause(backoff(failures + 1, CAP_S, _rng))
             batch = left
-            self.tell(f'{self.name}: {self._sent.added:,} sent, {self._sent.present:,} were there')
+            self.tell(f'{self.name}: {self._sent.added:,} sent, {self._sent.present:,} already present')
 
     def _bulk(self, batch: Sequence[tuple[str, bytes]]) -> list[tuple[int, str]] | None:
-        """The outcome of each; None if the request is too large."""
+        """Send a batch; returns the result of each document, or None if the request is too large."""
         try:
             return self.server.bulk([body for _, body in batch])
         except LakeError as error:
             if error.data.get('status') != TOO_LARGE:
                 raise
-            return None if len(batch) > 1 else [(TOO_LARGE, 'the server takes no document of this size')]
+            return None if len(batch) > 1 else [(TOO_LARGE, 'the server does not accept a document of this size')]
 
     def _settled(self, batch: Sequence[tuple[str, bytes]], found: Sequence[tuple[int, str]]) -> list[tuple[str, bytes]]:
-        """Count them; returns those that must be sent again."""
+        """Count the results; returns the documents that must be sent again."""
         left = []
         for each, (status, reason) in zip(batch, found, strict=True):
             if status in _RETRIED:
@@ -584,13 +581,13 @@ class Sink:
         return left
 
     def _patiently(self, ask: Callable[[], _Answer]) -> _Answer:
-        """The answer, after up to ``tries`` requests. Raises the error of the last one."""
+        """Try a request up to ``tries`` times. Raises the error of the last attempt."""
         return steadily(ask, tries=self.tries, cap_s=CAP_S, pause=self.pause, away=SinkUnavailable,
                         failed=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
 
 
 def _rows(table: pa.RecordBatch) -> Iterator[dict[str, Any]]:
-    """The rows, with times as microseconds."""
+    """The rows, with times in microseconds."""
     columns = [column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column for column in table.columns]
     for values in zip(*(column.to_pylist() for column in columns), strict=True):
         yield dict(zip(table.column_names, values, strict=True))

@@ -1,7 +1,7 @@
-"""How missions ended: rows of the table ``missions``, made of the ``summary.json`` that a mission uploads at its end.
+"""How missions ended: rows of the table ``missions``, from the ``summary.json`` that a mission uploads at its end.
 
 ``lake ingest`` adds the row of a mission when it adds rows that name its run. A query reads the summaries of other runs from the
-store, as it reads row files that are not ingested yet. A robot writes only its own summaries; a value of another type is null.
+store, like row files that are not ingested yet. A robot can write only its own summaries; values of a wrong type become null.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SUMMARY: Final[Mapping[str, str]] = {
 
 
 def ended(source: Bucket, runs: Collection[Run], tables: Tables, as_of: datetime | None = None) -> dict[Run, dict[str, Any]]:
-    """How these runs ended: by the table as of a time, or by the table and the store. Raises StoreError, LakeError."""
+    """How these runs ended, from the table as of a time, otherwise from table and store. Raises StoreError, LakeError."""
     if not runs:
         return {}
     found = {(row[ROBOT], row['run_id']): row for row in known(runs, tables, as_of).to_pylist()}
@@ -44,7 +44,7 @@ def ended(source: Bucket, runs: Collection[Run], tables: Tables, as_of: datetime
 
 
 def known(runs: Collection[Run], tables: Tables, as_of: datetime | None = None) -> pa.Table:
-    """The rows that the table has of these runs. Raises LakeError."""
+    """The rows of these runs in the table. Raises LakeError."""
     robots, ids = zip(*runs, strict=True)
     wanted = pa.table({ROBOT: pa.array(robots, pa.string()), 'run_id': pa.array(ids, pa.string())})
     with engine({'missions': tables.open(MISSION_ROWS, as_of), 'wanted': wanted}) as ready:
@@ -52,7 +52,7 @@ def known(runs: Collection[Run], tables: Tables, as_of: datetime | None = None) 
 
 
 def uploaded(source: Bucket, runs: Collection[Run]) -> pa.Table:
-    """The rows of those of these runs that uploaded a summary. Raises StoreError."""
+    """The rows of these runs, for those that have uploaded a summary. Raises StoreError."""
     with ThreadPoolExecutor(THREADS, 'lake-missions') as pool:
         found = [row for row in pool.map(lambda run: _row(source, *run), sorted(runs)) if row is not None]
     return pa.Table.from_pylist(found, schema=MISSION_ROWS.schema)

@@ -1,8 +1,8 @@
-"""The lake's Delta tables: where they are, their schemas, and the SQL engine that reads them (docs/decisions/0025).
+"""The lake's Delta tables: their locations and schemas, and the SQL engine that reads them (docs/decisions/0025).
 
-Robots write rows; only the lake writes tables. On an S3 server with a bucket ``lake`` the tables are shared: every reader opens
-the same ones. Otherwise they are below ``SHADOWHOUND_HOME/lake/``, one folder for each store, and can be deleted at any time.
-All tables are partitioned by date (UTC) and robot, and a row is never stored twice: its identity tells it from all others.
+Robots write rows; only the lake writes tables. On an S3 server with a bucket ``lake``, the tables are shared by all readers.
+Otherwise they are in ``SHADOWHOUND_HOME/lake/``, in one folder per store, and can be deleted at any time. All tables are
+partitioned by date (UTC) and robot. A row, identified by the columns of its table's identity, is never stored twice.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.stores.s3_obstore import proxy_options
 
 BUCKET: Final = 'lake'
-"""Of the shared tables; robots cannot write it."""
+"""The bucket of the shared tables; robots cannot write to it."""
 NO_BUCKET: Final = 'NoSuchBucket'
-"""S3's own word, in what a put to a bucket that does not exist is answered with."""
+"""S3's error code for a bucket that does not exist."""
 _COLORS: Final = re.compile(r'\x1b\[\d*m|\u21b3')
-"""In the library's messages, which are made for terminals."""
+"""Terminal codes in the library's messages."""
 LOG: Final = '_delta_log'
-"""The folder that makes a folder a table."""
+"""A folder that contains this folder is a table."""
 DATE, ROBOT, PART = 'date', 'robot', 'part'
 PARTITIONS: Final = (DATE, ROBOT)
 INGEST: Final = 'ingest'
 """The application of the Delta transactions that add rows: of two that start from the same version, one fails."""
 VERSIONS_AT_A_TIME: Final = 50
-"""Of a table's changes that are read together."""
+"""Versions of a table whose changes are read together."""
 GROUP_ROWS: Final = 16_384
-"""Of a row group: statistics can rule out whole groups."""
+"""Rows per row group, because statistics can exclude whole groups."""
 _KEPT: Final = {
     'delta.enableChangeDataFeed': 'true', 'delta.deletedFileRetentionDuration': 'interval 30 days',
     'delta.logRetentionDuration': 'interval 30 days',
 }  # fmt: skip
-"""For so long a table can be read as of a time in the past; vacuum deletes no file that a newer version needs."""
+"""How far back a table can be read as of a time; vacuum keeps the files that these versions use."""
 _KINDS: Final = {
     STRING: pa.string(), INT32: pa.int32(), INT64: pa.int64(), DOUBLE: pa.float64(), TIME: pa.timestamp('us', tz='UTC'),
 }  # fmt: skip
@@ -62,21 +62,21 @@ _KINDS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """One table: its name in SQL, its columns and what tells its rows apart."""
+    """A table: its name in SQL, its columns, and the identity of its rows."""
 
     name: str
     schema: pa.Schema
     identity: tuple[str, ...]
-    """Columns; a row in which all of them are equal is the same row."""
+    """Rows with equal values in these columns are the same row."""
     time: str
-    """The column by which its files are ordered."""
+    """The sort column of the files."""
     dated: str
-    """The time whose UTC date is the row's partition; a row without it belongs to 1970-01-01."""
+    """The column whose UTC date is the row's partition; a row without a value belongs to 1970-01-01."""
     partitions: tuple[str, ...] = PARTITIONS
 
 
 def arrow_schema(of: TableSchema = OBJECTS) -> pa.Schema:
-    """The columns of rows of a table, as they are in row files."""
+    """The columns of a table's rows in row files."""
     return pa.schema([pa.field(name, _KINDS[kind], nullable=name not in of.required) for name, kind in of.columns.items()])
 
 
@@ -95,7 +95,7 @@ INGESTED: Final = Table(
     ]),
     (PART, 'etag'), 'ingested', 'ingested', (DATE,),
 )  # fmt: skip
-"""Which row files the other tables contain: a row here is committed after all rows of its file."""
+"""The row files that the other tables contain; a row is committed here after all rows of its file."""
 MISSION_ROWS: Final = Table(
     'missions',
     pa.schema([
@@ -107,7 +107,7 @@ MISSION_ROWS: Final = Table(
     ]),
     ('run_id',), 'start_ns', 'start_ns',
 )  # fmt: skip
-"""How missions ended (lake/summaries.py). No row file has its rows: ingest makes them of the missions' summaries."""
+"""How missions ended (lake/summaries.py). Its rows are not in row files: ingest derives them from the missions' summaries."""
 TABLES: Final[Mapping[str, Table]] = {
     OBJECTS.folder: OBJECT_ROWS,
     KEPT.folder: _table('kept', KEPT, ('bucket', 'key', 'where', 'bytes'), 't_start_ns'),
@@ -117,41 +117,41 @@ TABLES: Final[Mapping[str, Table]] = {
     MISSION_ROWS.name: MISSION_ROWS,
     LABELS.folder: _table('labels', LABELS, ('id', 'made_ns', 'what'), 'since_ns', 'made'),
 }
-"""By the folder of the row files in the store; that of missions, which have none, by its name."""
+"""The tables by the folder of their row files in the store; ``missions``, which has no row files, by its name."""
 SCHEMAS: Final[Mapping[str, TableSchema]] = {
     each.folder: each for each in (OBJECTS, KEPT, FORGOTTEN, GAPS, STATISTICS, LABELS)
 }  # fmt: skip
 
 
 def narrow(columns: Iterable[str], of: TableSchema = OBJECTS) -> pa.Schema:
-    """The schema of these columns of a table."""
+    """The schema of a table with only these columns."""
     schema = TABLES[of.folder].schema
     return pa.schema([schema.field(name) for name in columns])
 
 
 class TableVersion(NamedTuple):
-    """How far a reader of a table's changes has come."""
+    """A version of a table, up to which a reader has read its changes."""
 
     table: str
-    """The table's own id."""
+    """The table's id, which changes when the table is recreated."""
     number: int
 
 
 class Conflict(Exception):
-    """Another process added rows since the table was opened: open it again and look which rows are still missing."""
+    """Another process added rows since the table was opened: reopen it and determine the missing rows again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """The tables of one store. A value: every call opens what it needs.
+    """The tables of one store. A value: every call opens the tables that it needs.
 
-    Nothing but a StoreError, LakeError or Conflict leaves it.
+    Raises only StoreError, LakeError and Conflict.
     """
 
     root: str
     """A folder, or a URL such as ``s3://lake``."""
     server: StoreSettings | None = field(default=None, repr=False)
-    """The S3 server of tables that are shared with other machines."""
+    """The S3 server of shared tables; None for local ones."""
 
     @property
     def is_shared(self) -> bool:
@@ -159,7 +159,7 @@ class Tables:
 
     @classmethod
     def of(cls, source: Bucket) -> Tables:
-        """Those of the store of this bucket: the shared ones if the server has them. Raises StoreError."""
+        """The tables of a bucket's store: the shared ones if they exist, otherwise local ones. Raises StoreError."""
         if source.settings.endpoint_url:
             shared = cls.shared(source.settings)
             if shared.exists(INGESTED):
@@ -168,7 +168,7 @@ class Tables:
 
     @classmethod
     def for_ingest(cls, source: Bucket) -> Tables:
-        """Those that rows of this bucket are ingested into, created where they do not exist yet. Raises StoreError, LakeError."""
+        """The tables into which the rows of this bucket are ingested, created if missing. Raises StoreError, LakeError."""
         if source.settings.endpoint_url:
             found = cls.shared(source.settings)
             try:
@@ -184,28 +184,28 @@ class Tables:
 
     @classmethod
     def shared(cls, settings: StoreSettings) -> Tables:
-        """Those in the bucket ``lake`` of an S3 server, whether or not they exist yet."""
+        """The tables in the bucket ``lake`` of an S3 server, which may not exist yet."""
         return cls(f's3://{BUCKET}', settings)
 
     @classmethod
     def local(cls, source: Bucket) -> Tables:
-        """Those of this user for one bucket."""
+        """This user's tables for one bucket."""
         place = source.settings.endpoint_url or str(source.settings.directory.absolute())
         name = hashlib.sha256(f'{place}\n{source.name}'.encode()).hexdigest()[:16]
         return cls(str(home(os.environ) / 'lake' / name))
 
     def exists(self, table: Table) -> bool:
-        """False as well for a bucket that does not exist or may not be read. Raises StoreError."""
+        """Whether a table exists; False also if its bucket does not exist or must not be read. Raises StoreError."""
         if self.server is None:
             return Path(self._uri(table), LOG).is_dir()
         bucket, _, prefix = f'{self.root.removeprefix("s3://")}/'.partition('/')
-        try:  # DeltaTable.is_deltatable() holds the interpreter's lock while it waits
+        try:  # not DeltaTable.is_deltatable(), which holds the GIL while it waits
             return LOG in Bucket(self.server, bucket).folders(f'{prefix}{table.name}/')
         except (AccessDenied, BucketMissing):
             return False
 
     def create(self) -> None:
-        """The tables that do not exist yet; the one that says that all others do comes last."""
+        """Create missing tables; ``ingested`` last, because its existence means that all others exist."""
         with translated():
             for table in (*TABLES.values(), INGESTED):
                 if not self.exists(table):
@@ -217,7 +217,7 @@ class Tables:
                     )  # fmt: skip
 
     def open(self, table: Table, as_of: datetime | int | None = None) -> DeltaTable:
-        """A table at its newest version, at that of a time, or at a version by number."""
+        """Open a table at its newest version, at the version of a time, or at a version by number."""
         with translated():
             found = DeltaTable(self._uri(table), storage_options=self._options())
             if as_of is not None:
@@ -225,7 +225,7 @@ class Tables:
             return found
 
     def append(self, opened: DeltaTable, table: Table, rows: pa.Table) -> None:
-        """Add rows that the opened version lacks. Raises Conflict if another process added rows since it was opened."""
+        """Add rows that the opened version does not have. Raises Conflict if another process has added rows since then."""
         if not len(rows):
             return
         version = (opened.transaction_version(INGEST) or 0) + 1
@@ -236,9 +236,9 @@ class Tables:
             )  # fmt: skip
 
     def added(self, table: Table, since: TableVersion | None = None) -> Iterator[tuple[pa.RecordBatch | None, TableVersion]]:
-        """The rows added after a version, some versions at a time; a batch of None says that all up to a version were yielded.
+        """The rows added after a version, some versions at a time; a batch of None means that all up to its version were yielded.
 
-        All rows of the newest version for another table than the version is of, or if its files were deleted meanwhile.
+        Yields all rows of the newest version if ``since`` is the version of another table, or if its files were deleted.
         """
         opened = self.open(table)
         newest = TableVersion(str(opened.metadata().id), opened.version())
@@ -260,7 +260,7 @@ class Tables:
             yield None, TableVersion(newest.table, last)
 
     def delete_local(self) -> None:
-        """Local tables are derived from the store: they are made again when they are needed."""
+        """Delete local tables; they are rebuilt from the store when needed."""
         if not self.is_shared:
             shutil.rmtree(self.root, ignore_errors=True)
 
@@ -272,7 +272,7 @@ class Tables:
 
 
 def storage_options(settings: StoreSettings) -> dict[str, str]:
-    """As delta-rs has them. Commits are puts that fail if the version exists, so they need no other coordination."""
+    """The options of delta-rs. Commits are conditional puts that fail if the version exists; no other coordination is needed."""
     options = {
         'AWS_ENDPOINT_URL': settings.endpoint_url or '', 'AWS_REGION': settings.region, 'AWS_ALLOW_HTTP': 'true',
         'AWS_VIRTUAL_HOSTED_STYLE_REQUEST': 'false', 'conditional_put': 'etag',
@@ -290,7 +290,7 @@ def storage_options(settings: StoreSettings) -> dict[str, str]:
 
 
 def writer() -> WriterProperties:
-    """How all files of the tables are written."""
+    """The options for writing all files of the tables."""
     return WriterProperties(compression='ZSTD', max_row_group_size=GROUP_ROWS)
 
 
@@ -299,7 +299,7 @@ def writer() -> WriterProperties:
 
 @contextmanager
 def engine(views: Mapping[str, DeltaTable | pa.Table]) -> Iterator[QueryBuilder]:
-    """An engine that knows these tables; rows in memory are written to a temporary table, which takes some 4 ms."""
+    """An engine with these tables; rows in memory are written to a temporary table, which takes about 4 ms."""
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
         found = QueryBuilder()
         for name, view in views.items():
@@ -312,7 +312,7 @@ def engine(views: Mapping[str, DeltaTable | pa.Table]) -> Iterator[QueryBuilder]
 
 
 def batches(opened: QueryBuilder, sql: str) -> Iterator[pa.RecordBatch]:
-    """The answer piece by piece, as it is computed. Raises LakeError for what is not SQL or names no column."""
+    """The result, in batches. Raises LakeError for invalid SQL or an unknown column."""
     with translated():
         found = pa.RecordBatchReader.from_stream(opened.execute(sql))
         schema = _plain(found.schema)
@@ -321,14 +321,14 @@ def batches(opened: QueryBuilder, sql: str) -> Iterator[pa.RecordBatch]:
 
 
 def answer(opened: QueryBuilder, sql: str) -> pa.Table:
-    """The whole answer. Raises LakeError."""
+    """The complete result. Raises LakeError."""
     with translated():
         found = pa.RecordBatchReader.from_stream(opened.execute(sql))
         return found.read_all().cast(_plain(found.schema))
 
 
 def missing(opened: DeltaTable, table: Table, rows: pa.Table) -> pa.Table:
-    """The first of each of these rows that the table does not have at the opened version."""
+    """The rows that the opened version of the table does not have, without duplicates."""
     if not len(rows):
         return rows
     names = [*table.partitions, *table.identity]
@@ -340,7 +340,7 @@ def missing(opened: DeltaTable, table: Table, rows: pa.Table) -> pa.Table:
     with engine({'known': opened}) as ready:
         known = answer(ready, f'SELECT {columns} FROM known WHERE {" AND ".join(where)}')  # noqa: S608 - names and quoted literals
     new = rows.select(names)
-    # A group, unlike a join, has nulls that are equal: known rows come first, so that the groups they are in begin below zero.
+    # Grouping, unlike a join, treats nulls as equal. Known rows have negative numbers, so groups that contain one are dropped.
     every = pa.concat_tables([known.cast(new.schema), new])
     every = every.append_column('_row', pa.array(range(-len(known), len(new)), pa.int64()))
     places = every.group_by(names).aggregate([('_row', 'min')])['_row_min']
@@ -348,7 +348,7 @@ def missing(opened: DeltaTable, table: Table, rows: pa.Table) -> pa.Table:
 
 
 def among(column: str, values: Iterable[Any]) -> str:
-    """A condition in SQL: one of these texts or numbers, None among them."""
+    """A condition in SQL: the column is one of these texts or numbers; None stands for null."""
     found = list(values)
     known = ', '.join(literal(value) for value in found if value is not None)
     either = ([f'{column} IN ({known})'] if known else []) + ([f'{column} IS NULL'] if None in found else [])
@@ -368,14 +368,14 @@ def quoted(name: str) -> str:
 
 
 def _plain(schema: pa.Schema) -> pa.Schema:
-    """The engine's views of texts as texts."""
+    """The schema with plain strings instead of the engine's string views."""
     kinds = {pa.string_view(): pa.string(), pa.binary_view(): pa.binary()}
     return pa.schema([each.with_type(kinds.get(each.type, each.type)) for each in schema])
 
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Errors of the library as ours: Conflict for a commit that another one prevented, else LakeError."""
+    """Translate the library's exceptions: a failed commit to Conflict, others to LakeError."""
     try:
         yield
     except CommitFailedError as error:

@@ -1,6 +1,6 @@
-"""What one sensor of one robot stored, in the order of time: which objects can hold the message that is nearest to a moment.
+"""The objects of one sensor of one robot, ordered by time: finds those that can contain the message nearest to a given time.
 
-Columns of numpy and Arrow, because a data set of a million objects is handed to every worker process.
+Stored as numpy and Arrow columns, because a dataset of a million objects is copied to every worker process.
 """
 
 from __future__ import annotations
@@ -18,58 +18,59 @@ if TYPE_CHECKING:
 
 NEEDED: Final = ('robot', 'sensor', 'type', 'bucket', 'key', 'bytes', 'sha256', 't_start', 't_start_ns', 't_end_ns', 'count',
                  'x', 'y', 'yaw', 'battery_pct', 'clock_offset_ns')  # fmt: skip
-"""Columns of the catalogue."""
+"""Required columns of the catalog."""
 RECEIVED: Final = ('received_start_ns', 'received_end_ns')
-"""Two more, for those who need the arrival of single messages (``Track.received_ns``)."""
+"""Additional columns if the arrival of single messages is needed (``Track.received_ns``)."""
 _WORDS: Final = ('robot', 'sensor', 'type', 'bucket')
-"""Those of which many rows have the same text."""
+"""Columns in which many rows have the same text."""
 _DIGEST: Final = pa.binary(32)
 
 
 class Object(NamedTuple):
-    """One object as the catalogue has it."""
+    """One object, as described by the catalog."""
 
     bucket: str
     key: str
     size: int
     sha256: str
-    """Empty where it is not known."""
+    """Empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Objects by their first message. ``of`` makes one; a repeat is an object of its own with the key that holds its content."""
+    """Objects ordered by their first message. A repeat is a separate object with the key of its content. Created by ``of``."""
 
     robot: str
     sensor: str
     kind: str
     bucket: pa.Array
-    """Text by a dictionary."""
+    """Dictionary-encoded text."""
     key: pa.Array
     """Text."""
     size: NDArray[np.signedinteger[Any]]
     sha256: pa.Array
-    """32 bytes, or null where it is not known."""
+    """32 bytes; null if unknown."""
     start_ns: NDArray[np.int64]
     end_ns: NDArray[np.int64]
-    """The same array as ``start_ns`` where all objects are of one message, and so is ``latest_ns``."""
+    """The same array as ``start_ns`` if all objects have one message; then ``latest_ns`` is the same, too."""
     count: NDArray[np.signedinteger[Any]]
     offset_ns: NDArray[np.signedinteger[Any]]
-    """To be added to the times in the content."""
+    """Must be added to the times in the content."""
     pose: NDArray[np.float64]
-    """(n, 3): x y yaw in the middle of the object's time; NaN where it is not known."""
+    """(n, 3): x, y and yaw in the middle of the object's time; NaN if unknown."""
     battery_pct: NDArray[np.float64]
     latest_ns: NDArray[np.int64] = field(repr=False)
-    """The latest end of this object and those before it."""
+    """The latest end of this object and all before it."""
     received_ns: NDArray[np.int64] | None = None
-    """(n, 2): when the first and the last message of each object arrived, 0 where that is unknown; None without ``RECEIVED``."""
+    """(n, 2): arrival of the first and last message of each object, 0 if unknown; None without the columns ``RECEIVED``."""
     stamp_ns: NDArray[np.int64] | None = None
-    """Of a track by arrival, the stamp of each object's first message; None of one by stamps."""
+    """In a track by arrival, the stamp of each object's first message; None in a track by stamps."""
 
     @classmethod
     def of(cls, rows: pa.Table) -> Track:
-        """Of rows of one robot and sensor, at least one, each once even where it is in two parts; the columns are ``NEEDED``,
-        and ``RECEIVED`` where arrivals are needed.
+        """Build a track from rows of one robot and sensor, at least one; duplicates are dropped.
+
+        The rows have the columns ``NEEDED``, and ``RECEIVED`` if arrivals are needed.
         """
         if rows.schema.field('sha256').type != _DIGEST:
             rows = packed(rows)
@@ -104,7 +105,7 @@ class Track:
         return len(self.key)
 
     def only(self, numbers: NDArray[np.intp]) -> Track:
-        """These objects of it, in their order."""
+        """A track with only these objects, in this order."""
         columns = {
             each.name: getattr(self, each.name)
             for each in fields(self)
@@ -117,7 +118,7 @@ class Track:
         return replace(self, **kept)
 
     def by_arrival(self) -> Track:
-        """The same objects in the order of their arrival; one whose arrival is unknown keeps its time. It needs ``RECEIVED``."""
+        """The same objects ordered by arrival; an object with unknown arrival keeps its time. Requires ``RECEIVED``."""
         assert self.received_ns is not None
         first, last = self.received_ns.T
         start, end = (np.where(first > 0, one, other) for one, other in ((first, self.start_ns), (last, self.end_ns)))
@@ -125,6 +126,7 @@ class Track:
         return moved.only(np.argsort(start, kind='stable'))
 
     def object(self, number: int) -> Object:
+        """An object by its index."""
         return Object(
             self.bucket[int(number)].as_py(),
             self.key[int(number)].as_py(),
@@ -133,25 +135,25 @@ class Track:
         )
 
     def stamps_ns(self, number: int) -> NDArray[np.int64]:
-        """Of the messages of an object, evenly spread where there are several."""
+        """The stamps of an object's messages, evenly spread if there are several."""
         first, count = self.start_ns[number], int(self.count[number])
         return np.asarray(first + np.arange(count) * (self.end_ns[number] - first) // max(count - 1, 1), np.int64)
 
     def within(self, first_ns: int, last_ns: int) -> NDArray[np.intp]:
-        """The objects that have messages in this time, both ends included."""
+        """The indices of objects with messages in this time, both ends inclusive."""
         low = int(np.searchsorted(self.latest_ns, first_ns, 'left'))
         high = int(np.searchsorted(self.start_ns, last_ns, 'right'))
         return low + np.flatnonzero(self.end_ns[low:high] >= first_ns)
 
     def nearest(self, stamp_ns: int, before_ns: int, after_ns: int) -> Iterator[tuple[int, int]]:
-        """(least distance in ns, object) of those that can have a message so long before it, or after it, the nearest first."""
+        """(minimum distance in ns, index) of the objects that can have a message this long before or after, the nearest first."""
         found = self.within(stamp_ns - before_ns, stamp_ns + after_ns)
         away = np.maximum(np.maximum(self.start_ns[found] - stamp_ns, stamp_ns - self.end_ns[found]), 0)
         for place in np.argsort(away, kind='stable'):
             yield int(away[place]), int(found[place])
 
     def pose_at(self, number: int, stamp_ns: int, gap_ns: int) -> NDArray[np.float64]:
-        """X y yaw at a moment in the object: its own, of a single message; else straight on between it and its neighbour's."""
+        """x, y and yaw at a time in an object: its own pose for a single message, otherwise interpolated to the neighbor's."""
         own: NDArray[np.float64] = self.pose[number]
         if self.count[number] == 1:
             return own
@@ -167,9 +169,9 @@ class Track:
 
 
 def packed(rows: pa.Table) -> pa.Table:
-    """A copy in half of the memory: words by a dictionary, checksums as bytes.
+    """A copy that takes half of the memory: dictionary-encoded words, checksums as bytes.
 
-    All columns are copied, because what comes from Daft stays in memory as a whole as long as one column of it is used.
+    All columns are copied, because the original batch stays in memory as long as one of its columns is used.
     """
     made = {}
     for name in rows.column_names:
@@ -178,14 +180,14 @@ def packed(rows: pa.Table) -> pa.Table:
             made[name] = pa.array(map(_digest, column.to_pylist()), _DIGEST)
         elif name in _WORDS:
             made[name] = column.cast(pa.large_string()).dictionary_encode()
-        elif name != 't_start':  # it only says that there is a date
+        elif name != 't_start':  # only needed to detect objects without a date
             plain = column.cast(pa.large_string()) if name == 'key' else column
             made[name] = pa.concat_arrays([plain, plain[:0]])
     return pa.table(made)
 
 
 def _digest(text: str | None) -> bytes | None:
-    """None where it is not known; zeros, which no content has, for what is not a SHA-256 in hex."""
+    """32 bytes; None if unknown, and zeros, which match no content, for an invalid SHA-256."""
     if not text:
         return None
     try:
@@ -196,7 +198,7 @@ def _digest(text: str | None) -> bytes | None:
 
 
 def _order(rows: pa.Table) -> pa.Array | None:
-    """The places of the rows by time, each object and time once; None where they lie so, as in a compacted catalogue."""
+    """The indices of the rows ordered by time, without duplicates; None if the rows are already in this order."""
     start = rows['t_start_ns'].to_numpy()
     if (start[1:] > start[:-1]).all():
         return None
@@ -207,7 +209,7 @@ def _order(rows: pa.Table) -> pa.Array | None:
 
 
 def _taken(rows: pa.Table, name: str, order: pa.Array | None) -> pa.Array:
-    """One column in an order."""
+    """One column in the given order."""
     found = rows[name].unify_dictionaries().combine_chunks()
     if order is not None:
         found = found.take(order)
@@ -215,19 +217,19 @@ def _taken(rows: pa.Table, name: str, order: pa.Array | None) -> pa.Array:
 
 
 def _narrow(numbers: NDArray[np.int64]) -> NDArray[np.signedinteger[Any]]:
-    """In the smallest type that holds them all."""
-    least, most = int(numbers.min()), int(numbers.max())
+    """The numbers in the smallest sufficient integer type."""
+    low, high = int(numbers.min()), int(numbers.max())
     kinds = (np.int8, np.int16, np.int32, np.int64)
-    return numbers.astype(next(kind for kind in kinds if np.iinfo(kind).min <= least and most <= np.iinfo(kind).max))
+    return numbers.astype(next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max))
 
 
 def _shared(numbers: NDArray[np.int64], like: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The other array where they are equal: then there is only one, also in a pickle."""
+    """Return the other array if both are equal, so that only one is in memory and in a pickle."""
     return like if np.array_equal(numbers, like) else numbers
 
 
 def _is_first(rows: pa.Table, order: pa.Array) -> pa.Array:
-    """Which rows, in this order, are not the same object and time as the one before."""
+    """Which rows, in this order, differ from the previous one in object or time."""
     first = np.ones(len(order), bool)
     if len(order) > 1:
         same = np.ones(len(order) - 1, bool)

@@ -1,8 +1,8 @@
-"""What a model was trained on: the digest of a data set, and the mark of it in a run of MLflow.
+"""Records what a model was trained on: computes the digest of a dataset, and sets it as a tag of an MLflow run.
 
-A digest stands for everything in a data set of ``shadowhound-data export``: ``info.json`` says how it was made, the table of
-sources has the SHA-256 of every object that a value came from, and that of gaps what was known to be missing. In a data set with
-labels it also stands for those that were there when its episodes were made.
+A digest identifies everything in a dataset of ``shadowhound-data export``: ``info.json`` has the options, the table of sources
+the SHA-256 of every source object, the table of gaps what was known to be missing, and the table of labels, if any, the labels at
+the time of the export.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shadowhound_data_logger.missions.tracking import MlflowTracking
 INFO: Final = 'meta/info.json'
 DIGEST_FILES: Final = (INFO, 'meta/shadowhound_sources.parquet', 'meta/shadowhound_gaps.parquet')
 LABEL_TABLE: Final = 'meta/shadowhound_labels.parquet'
-"""Only of data sets with labels; part of their digest."""
+"""Exists only in datasets with labels, as part of their digest."""
 DIGEST_TAG: Final = 'shadowhound_dataset_digest'
 NAME_TAG: Final = 'shadowhound_dataset'
 
@@ -30,15 +30,15 @@ NAME_TAG: Final = 'shadowhound_dataset'
 def digest_of(folder: Path, info: bytes | None = None) -> str:
     """SHA-256 (hex) over ``DIGEST_FILES`` and the table of labels. Raises LakeError.
 
-    ``info`` stands for ``info.json`` while that is not written yet.
+    ``info`` is the content of ``info.json`` before it is written.
     """
     whole = hashlib.sha256()
     for name in (*DIGEST_FILES, *((LABEL_TABLE,) if (folder / LABEL_TABLE).is_file() else ())):
         try:
             body = info if info is not None and name == INFO else (folder / name).read_bytes()
         except OSError as error:
-            raise LakeError(f'{folder} is no data set of this program: {name}: {error.strerror}',
-                            remedy='name a folder that export lerobot wrote') from error  # fmt: skip
+            raise LakeError(f'{folder} is not a dataset of this program: {name}: {error.strerror}',
+                            remedy='pass a folder that export lerobot wrote') from error  # fmt: skip
         whole.update(f'{name} {hashlib.sha256(body).hexdigest()}\n'.encode())
     return whole.hexdigest()
 
@@ -66,7 +66,7 @@ def log_dataset(run: Any, folder: Path | str) -> str:
 
 
 def runs_trained_on(digests: Iterable[str]) -> dict[str, list[str]]:
-    """Digest -> the ids of the runs that ``log_dataset`` marked with it. Raises TrackingUnavailable, TrackingRefused."""
+    """Digest -> ids of the runs that ``log_dataset`` tagged with it. Raises TrackingUnavailable, TrackingRefused."""
     wanted = sorted(set(digests))
     tracking = _tracking() if wanted else None
     return {digest: tracking.tagged(DIGEST_TAG, digest) for digest in wanted} if tracking else {}

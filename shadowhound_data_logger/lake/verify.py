@@ -1,10 +1,9 @@
-"""The objects that a store must have: every object with a row, for ``shipping/audit.py`` to check.
+"""The objects that a store must have, which ``shipping/audit.py`` checks: every object with a row.
 
-A store that lost rows does not know which objects it lost with them. Therefore the rows of another store, fetched into a folder,
+If a store lost rows, it is unknown which objects it lost with them. Therefore the rows of another store, fetched into a folder,
 can be added.
 
-An audit that was interrupted, by a kill or because the store was unreachable, continues where it stopped: a file records which
-objects were valid.
+An audit that was interrupted by a kill or an unreachable store continues where it stopped: a file records the valid objects.
 """
 
 from __future__ import annotations
@@ -34,28 +33,28 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PAGE: Final = 1_000
-"""Objects checked between two records; at most so many are checked again after an interruption."""
+"""Objects checked between two records; after an interruption, at most this many are checked again."""
 DIGEST_BYTES: Final = 16
 KEEP_S: Final = 7 * 86_400.0
-"""For so long an interrupted audit can be continued."""
+"""How long an interrupted audit can be continued."""
 _KEY: Final = ('bucket', 'key')
-_SAID: Final = (*_KEY, 'bytes', 'sha256')
+_DESCRIPTION: Final = (*_KEY, 'bytes', 'sha256')
 
 
 def rows(source: Bucket, findings: Findings, **flags: Any) -> Rows:
     """The rows of one store; ``flags`` are those of ``lake.objects``. Raises SettingError, LakeError, StoreError."""
-    return Rows(query.objects(source, findings=findings, columns=_SAID, distinct=True, **flags))
+    return Rows(query.objects(source, findings=findings, columns=_DESCRIPTION, distinct=True, **flags))
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Objects as their rows describe them, in the order of their keys: some 200 bytes of memory each.
+    """Objects as described by their rows, ordered by key: about 200 bytes of memory each.
 
     An object with two contradicting rows is checked against both.
     """
 
     table: pa.Table
-    """Bucket, key, bytes, sha256; no row twice."""
+    """Bucket, key, bytes and sha256, without duplicates."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -65,22 +64,23 @@ class Rows:
         for start in range(0, len(ordered), PAGE):
             yield list(enumerate(_infos(ordered.slice(start, PAGE)), start))
 
-    def unproved(self) -> int:
-        """How many have no SHA-256: only their sizes are compared."""
+    def unverified(self) -> int:
+        """The number of objects without a SHA-256: only their sizes are compared."""
         return int(self.table['sha256'].null_count)
 
     def joined(self, other: Rows) -> Rows:
-        """The rows of either."""
-        return Rows(pa.concat_tables([self.table, other.table]).group_by(list(_SAID)).aggregate([]).select(_SAID))
+        """The union of the rows of both."""
+        columns = list(_DESCRIPTION)
+        return Rows(pa.concat_tables([self.table, other.table]).group_by(columns).aggregate([]).select(columns))
 
     def lacking(self, other: Rows) -> list[ObjectInfo]:
-        """Those that have no row in the other."""
+        """The objects that have no row in the other."""
         left = self.table.join(other.table.select(_KEY), keys=list(_KEY), join_type='left anti')
         return _infos(left.sort_by([(name, 'ascending') for name in _KEY]))
 
 
 class Unfinished:
-    """The rows of objects that no earlier run of the same query found valid, and a file of the others: 16 bytes per row.
+    """The rows of objects that no earlier run of the same query found valid. A file records the valid ones, 16 bytes per row.
 
     Lifecycle: enter once; read by one thread; ``finish`` when all are checked; exit once. Without a writable folder nothing is
     recorded.
@@ -108,7 +108,7 @@ class Unfinished:
             return self
         if not lock(file, wait=False):
             file.close()
-            raise LakeError('the same objects are being verified by another process', remedy='wait for it')
+            raise LakeError('another process is verifying the same objects', remedy='wait until it has finished')
         self._file = file
         file.seek(0)
         found = file.read()
@@ -122,7 +122,7 @@ class Unfinished:
             self._file.close()
 
     def earlier(self) -> int:
-        """How many of the rows an earlier run found valid."""
+        """The number of rows that an earlier run found valid."""
         return sum(_digest(info) in self._known for page in self._rows.pages() for _, info in page) if self._known else 0
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
@@ -132,7 +132,7 @@ class Unfinished:
                 yield left
 
     def set_verified(self, ids: Iterable[int]) -> None:
-        """Record that these are valid."""
+        """Record that these objects are valid."""
         if self._file is not None:
             try:
                 self._file.write(b''.join(self._page[number] for number in ids))
@@ -142,15 +142,15 @@ class Unfinished:
                 self._file = None
 
     def finish(self) -> None:
-        """The audit is complete: the next one starts from the beginning."""
+        """Record that the audit is complete, so that the next one starts from the beginning."""
         if self._file is not None:
             self._path.unlink(missing_ok=True)
 
 
 def _digest(info: ObjectInfo) -> bytes:
-    said = json.dumps((info.bucket, info.key, info.size, info.sha256))
-    return hashlib.blake2b(said.encode(), digest_size=DIGEST_BYTES).digest()
+    description = json.dumps((info.bucket, info.key, info.size, info.sha256))
+    return hashlib.blake2b(description.encode(), digest_size=DIGEST_BYTES).digest()
 
 
 def _infos(table: pa.Table) -> list[ObjectInfo]:
-    return [ObjectInfo(*row) for row in zip(*(table[name].to_pylist() for name in _SAID), strict=True)]
+    return [ObjectInfo(*row) for row in zip(*(table[name].to_pylist() for name in _DESCRIPTION), strict=True)]

@@ -1,7 +1,7 @@
-"""What a query sees: every row exactly once, from the tables at one version and the row files that this version lacks.
+"""The views that a query reads: every row exactly once, from one version of the tables and the row files not in this version.
 
-On a shared lake rows that are not ingested yet are read from their files and joined to the tables for this query alone. Without
-one, a query first ingests what it needs into the tables of this user. With ``as_of`` it sees the tables as of that time.
+On a shared lake, rows that are not ingested yet are read from their files and added for this query only. Otherwise a query first
+ingests what it needs into this user's tables. With ``as_of`` it reads only the tables as of that time.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def views(source: Bucket, of: Sequence[TableSchema], findings: Findings, *, robo
           more: Mapping[str, pa.Table] | None = None, by: str = BY_STAMP) -> Iterator[QueryBuilder]:  # fmt: skip
     """An engine with a view of each of these tables, such as ``all_objects``, and ``more`` tables.
 
-    With ``by`` ``received``, the times of objects and gaps (``t_start``, ``from_ns``, ...) are those of arrival.
+    If ``by`` is ``received``, the times of objects and gaps (``t_start``, ``from_ns``, ...) are arrival times.
 
-    ``robot`` and ``has_date`` say which rows are needed: there may be others. ``all_objects`` omits what was deleted on purpose.
-    Raises StoreError, LakeError.
+    ``robot`` and ``has_date`` restrict which rows must be in the views; others may be, too. ``all_objects`` does not contain
+    objects that ``lake prune`` deleted. Raises StoreError, LakeError.
     """
     of = tuple(dict.fromkeys((*of, FORGOTTEN))) if OBJECTS in of else tuple(of)
     scope = Scope(of, robot, has_date)
@@ -63,7 +63,7 @@ def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str |
             has_date: Callable[[str], bool] | None = None, where: str = 'true',
             columns: Sequence[str] = (), order: str = '', limit: int | None = None,
             by: str = BY_STAMP) -> pa.Table:  # fmt: skip
-    """The rows of one table for which a condition holds, with the columns of its schema. Raises StoreError, LakeError."""
+    """The rows of one table that satisfy a condition, with the columns of its schema. Raises StoreError, LakeError."""
     table = TABLES[of.folder]
     names = ', '.join(f'"{name}"' for name in columns or of.columns)
     of_robot = 'true' if robot is None else f'robot = {literal(robot)}'
@@ -74,7 +74,7 @@ def rows_of(source: Bucket, of: TableSchema, findings: Findings, *, robot: str |
 
 
 def dates(source: Bucket, robot: str, of: Sequence[TableSchema], findings: Findings) -> list[str]:
-    """The UTC dates for which one of these tables has rows of a robot. Raises StoreError, LakeError."""
+    """The UTC dates with rows of a robot in one of these tables. Raises StoreError, LakeError."""
     scope = Scope(tuple(of), robot)
     tables = current(source, scope, findings)
     ingested = tables.open(INGESTED)
@@ -85,7 +85,7 @@ def dates(source: Bucket, robot: str, of: Sequence[TableSchema], findings: Findi
 
 
 def current(source: Bucket, scope: Scope, findings: Findings) -> Tables:
-    """The tables of a store; those of this user have all row files of the scope. Names what was rejected of these."""
+    """The tables of a store; local ones contain all row files of the scope. Reports the rejected rows of these files."""
     tables = Tables.of(source)
     if not tables.is_shared:
         _catch_up(source, tables, scope, findings)
@@ -95,9 +95,9 @@ def current(source: Bucket, scope: Scope, findings: Findings) -> Tables:
 
 
 def _catch_up(source: Bucket, tables: Tables, scope: Scope, findings: Findings) -> None:
-    """Ingest what this user's tables lack; if the store lost files that they contain, it is another store: begin again."""
+    """Ingest the files that local tables lack. If the store lost files that they contain, rebuild them: it is another store."""
     tables.create()
-    opened = tables.open(INGESTED)  # before the listing: what another process ingests after it is not missing there
+    opened = tables.open(INGESTED)  # before the listing: files that another process ingests later must not seem lost
     files, known = row_files(source, findings, scope), known_files(opened, scope)
     if not {(each.part, each.etag) for each in known} <= {(file.entry.key, file.entry.etag) for file in files}:
         tables.delete_local()

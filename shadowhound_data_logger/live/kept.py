@@ -164,7 +164,7 @@ class StoreKept:
             wide = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
             known = self._rows = robot, begin_ns, end_ns, now_s, pull.known(self._source, robot, wide, self._findings).to_pylist()
         want = KeptFilter(since_ns=begin_ns, until_ns=end_ns)
-        return [row for row in known[4] if row['t_start_ns'] is not None and pull.takes(want, row)]
+        return [row for row in known[4] if row['t_start_ns'] is not None and pull.matches(want, row)]
 
     def mbps(self, robot: str) -> float | None:
         """Raises StoreError."""
@@ -191,7 +191,7 @@ class StoreKept:
         from shadowhound_data_logger.lake import pull  # noqa: PLC0415 - the extra lake
 
         with closing(open_store(self._settings, UploadSettings())) as store:
-            return pull.ask(store, self._source, robot, want, by=by).id
+            return pull.put_request(store, self._source, robot, want, by=by).id
 
     def cancel(self, robot: str, request: str, by: str) -> None:
         """Raises StoreError, LakeError."""

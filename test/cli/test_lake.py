@@ -50,7 +50,7 @@ def test_ingest_adds_each_row_once_and_names_what_it_rejects(home: Path) -> None
     (home / 'store/sensor-data/thor/_catalog/date=2026-10-28/bad.jsonl.zst').write_bytes(b'hello')
     bad = run(home, 'ingest')
     assert '1 row rejected' in bad.stdout
-    assert 'bad.jsonl.zst is left out' in bad.stderr
+    assert 'bad.jsonl.zst is skipped' in bad.stderr
 
 
 def test_an_empty_store_is_no_error(tmp_path: Path) -> None:

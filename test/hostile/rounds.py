@@ -307,14 +307,14 @@ def fetched_objects(shop: Shop) -> Round:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
         settings = StoreSettings(directory=shop.input)
-        wishes = [
+        requests = [
             FetchRequest(rng.choice((schema.BUCKET, schema.BUCKET, schema.BUCKET, '..', '.')),
                  rng.choice((*bodies, *TEXTS, '../' * 5 + 'x')),
                  rng.choice((7, 3000, *NUMBERS)), rng.choice((None, 'ab', 64 * '0')))
             for _ in range(4)
         ] + [FetchRequest(schema.BUCKET, key, len(body)) for key, body in bodies.items() if rng.random() < 0.5]  # fmt: skip
         with shop.reading():
-            found = fetch_objects(wishes, shop.target, DirectoryStore(settings.directory), threads=2)
+            found = fetch_objects(requests, shop.target, DirectoryStore(settings.directory), threads=2)
         return f'{found.moved} moved'
 
     return one

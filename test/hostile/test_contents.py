@@ -248,7 +248,7 @@ def test_an_object_of_which_a_row_claims_a_million_messages_is_left_out(tmp_path
     bad_parts.put(folder_store(tmp_path), parts.encode(rows))
     frames = lake.MissionDataset(Bucket(folder_store(tmp_path), schema.BUCKET))
     assert len(frames) == 1
-    assert len(frames.left_out) == 2
+    assert len(frames.skipped) == 2
     assert np.array_equal(frames.stamps_ns, [NOON_NS])
 
 

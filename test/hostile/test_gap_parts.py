@@ -76,7 +76,7 @@ def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kind: str) -> None:
     assert [one.key for one in findings] == [key]
     found = run(query, home, 'SELECT cause FROM gaps', '--json')
     assert (json.loads(found.stdout), found.return_value) == ([{'cause': 'transport'}], 1)
-    assert f'{key} is left out: ' in found.stderr
+    assert f'{key} is skipped: ' in found.stderr
     times = '--since', '2026-10-28T12:00', '--until', '2026-10-28T13:00'
     found = run(lake_command, home, 'coverage', *times, '--json')
     assert (json.loads(found.stdout)[0]['hours'][0]['seconds'], found.return_value) == ({'stored': 3540.0, 'transport': 60.0}, 1)
@@ -89,7 +89,7 @@ def test_ingest_leaves_it_alone(home: Path) -> None:
     source = Bucket(folder_store(home), schema.BUCKET)
     before = known('thor', '/imu', NOON_NS, END_NS, source=source, findings=Findings(lambda _: None))
     found = run(lake_command, home, 'ingest', '--delete-after', '0s')
-    assert (found.return_value, f'{key} is left out: ' in found.stderr) == (1, True)
+    assert (found.return_value, f'{key} is skipped: ' in found.stderr) == (1, True)
     assert key in [entry.key for entry in source.list('thor/_gaps/')]
     assert known('thor', '/imu', NOON_NS, END_NS, source=source, findings=Findings(lambda _: None)) == before
 

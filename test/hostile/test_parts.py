@@ -102,7 +102,7 @@ def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[st
     found = run(query, home, '--format', 'keys')
     assert sorted(line.removeprefix('sensor-data/') for line in found.stdout.splitlines()) == before
     assert found.return_value == 1
-    assert [key for key in keys if f'{key} is left out: ' not in found.stderr] == []
+    assert [key for key in keys if f'{key} is skipped: ' not in found.stderr] == []
     assert f'{len(keys)} of the catalog are left out' in found.stderr
     assert run(query, home, '--robot', 'tachi').return_value == 0
 
@@ -149,8 +149,8 @@ def test_a_data_set_says_what_it_leaves_out(home: Path) -> None:
     key = bad_parts.put(folder_store(home), b'')
     frames = lake.MissionDataset(source)
     assert len(frames) == count > 0
-    assert [one.key for one in frames.left_out] == [key]
-    assert not len(pickle.loads(pickle.dumps(frames)).left_out)  # noqa: S301 - our own
+    assert [one.key for one in frames.skipped] == [key]
+    assert not len(pickle.loads(pickle.dumps(frames)).skipped)  # noqa: S301 - our own
 
 
 def test_no_robot_speaks_for_another_by_the_name_of_a_folder(home: Path) -> None:
@@ -180,7 +180,7 @@ def test_a_bomb_is_left_out_in_little_memory(home: Path) -> None:
     for arguments in (('query', '--format', 'keys'), ('lake', 'ingest')):
         ran = in_little_memory(home, *arguments)
         assert (ran.returncode, 'Traceback' in ran.stderr) == (1, False), ran.stderr
-        assert f'{key} is left out: ' in ran.stderr
+        assert f'{key} is skipped: ' in ran.stderr
         shutil.rmtree(home / 'lake')
 
 

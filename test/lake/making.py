@@ -18,7 +18,7 @@ from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.ingest import ingest, maintain
 from shadowhound_data_logger.lake.tables import Tables
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -161,4 +161,4 @@ def merge(settings: StoreSettings) -> int:
     source = Bucket(settings, schema.BUCKET)
     tables = Tables.for_ingest(source)
     ingest(source, tables, Findings(lambda _: None))
-    return tend(source, tables, Findings(lambda _: None)).merged
+    return maintain(source, tables, Findings(lambda _: None)).merged

@@ -231,8 +231,8 @@ def test_a_fetched_folder_gives_the_same(tmp_path: Path, frames: str) -> None:
     source, to = drive(tmp_path, frames=frames), tmp_path / 'data'
     for flags in ({'sensor': 'camera'}, {'robot': 'thor'}):
         rows = query.objects(source, **flags).to_pylist()
-        wishes = [FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
-        fetch(wishes, to, DirectoryStore(source.settings.directory))
+        requests = [FetchRequest(row['bucket'], row['key'], row['bytes'], row['sha256']) for row in rows]
+        fetch(requests, to, DirectoryStore(source.settings.directory))
         keep_rows(to, rows)
     store, folder = MissionDataset(source, align=ALIGN), MissionDataset(to, align=ALIGN)
     assert len(store) == len(folder) > 0
@@ -244,7 +244,7 @@ def test_a_folder_without_rows_is_no_data_set(tmp_path: Path) -> None:
     """It is not there, or its files were fetched by prefix: an empty data set would say that there are no frames."""
     (tmp_path / 'data' / 'thor' / 'camera').mkdir(parents=True)
     for folder in ('nowhere', 'data'):
-        with pytest.raises(LakeError, match=f'{folder} has no catalogue'):
+        with pytest.raises(LakeError, match=f'{folder} has no catalog'):
             MissionDataset(tmp_path / folder)
 
 
@@ -252,7 +252,7 @@ def test_a_sensor_of_which_nothing_is_known_is_no_neighbour(tmp_path: Path) -> N
     """Misspelt, or not fetched with the frames: an error, not a column of NaN."""
     source = drive(tmp_path, without=['imu'])
     for name in ('odometer', 'imu'):
-        with pytest.raises(LakeError, match=f'{name} has no object about the time of the camera'):
+        with pytest.raises(LakeError, match=f'{name} has no object in the time of camera'):
             MissionDataset(source, align={'odom': 0.5, name: 0.5})
 
 
@@ -301,7 +301,7 @@ def test_content_that_is_not_what_was_stored(tmp_path: Path) -> None:
     dataset = MissionDataset(source)
     path = source.settings.directory / BUCKET / 'thor/camera/20261028/120000_front.jpg'
     path.write_bytes(jpeg(1))
-    with pytest.raises(LakeError, match=r'120000_front\.jpg is not what was stored'):
+    with pytest.raises(LakeError, match=r'120000_front\.jpg is damaged'):
         dataset[0]
     path.unlink()
     with pytest.raises(ObjectRefused, match=r'120000_front\.jpg'):

@@ -128,7 +128,7 @@ def test_what_is_read_ahead_is_bounded(source: Bucket, monkeypatch: pytest.Monke
     """After the first sample no more is asked for than the bound and one object."""
     frames = MissionDataset(source)
     size = int(frames._selection.anchors[0].size[0])
-    monkeypatch.setattr(dataset, 'AHEAD_BYTES', 3 * size)
+    monkeypatch.setattr(dataset, 'PREFETCH_BYTES', 3 * size)
     asked: list[str] = []
     read = frames._place.read
     frames._place = types.SimpleNamespace(read=lambda bucket, key, most: (asked.append(key), read(bucket, key, most))[1])  # type: ignore[assignment]

@@ -75,8 +75,8 @@ class Real(ObstoreStore):
 
 def run(store: Asked | Real, to: Path, **how: Any) -> FetchResult:
     """Everything under the prefix."""
-    wishes = how.pop('wishes', None) or under(Bucket(store.settings, BUCKET), PREFIX)
-    return fetch(wishes, to, store, **how)
+    requests = how.pop('requests', None) or under(Bucket(store.settings, BUCKET), PREFIX)
+    return fetch(requests, to, store, **how)
 
 
 def whole(to: Path) -> bool:
@@ -97,7 +97,7 @@ def test_a_prefix_keeps_its_layout_and_a_second_run_moves_nothing(settings: Stor
 def test_a_prefix_need_not_end_at_a_folder(settings: StoreSettings, prefix: str) -> None:
     """As in S3."""
     expected = sorted(key for key in [*OBJECTS, 'thor/camera/20261029/000000_front.jpg'] if key.startswith(prefix))
-    assert [wish.key for wish in under(Bucket(settings, BUCKET), prefix)] == expected
+    assert [request.key for request in under(Bucket(settings, BUCKET), prefix)] == expected
 
 
 def test_what_was_changed_on_this_side_is_fetched_again(settings: StoreSettings, tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings
 def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Path) -> None:
     """An object that is not what its row says is a failure, whatever it says of itself."""
     key = next(iter(OBJECTS))
-    found = run(Asked(settings), tmp_path / 'data', wishes=[FetchRequest(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
+    found = run(Asked(settings), tmp_path / 'data', requests=[FetchRequest(BUCKET, key, len(OBJECTS[key]), sha256='0' * 64)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
 
 
@@ -184,7 +184,7 @@ def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings
 def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path, key: str) -> None:
     """Anybody may have written to a bucket."""
     source = Asked(settings)
-    found = run(source, tmp_path / 'data', wishes=[FetchRequest(BUCKET, key, 3)])
+    found = run(source, tmp_path / 'data', requests=[FetchRequest(BUCKET, key, 3)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
     assert source.asked == []
 
@@ -203,8 +203,8 @@ def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_
     keys = list(OBJECTS)
     to = tmp_path / 'data'
     (to / keys[0]).mkdir(parents=True)
-    wishes = [*under(Bucket(settings, BUCKET), PREFIX), FetchRequest(BUCKET, 'thor/gone', 3), FetchRequest('other', keys[1], 3)]
-    found = run(Asked(settings), to, wishes=wishes)
+    requests = [*under(Bucket(settings, BUCKET), PREFIX), FetchRequest(BUCKET, 'thor/gone', 3), FetchRequest('other', keys[1], 3)]
+    found = run(Asked(settings), to, requests=requests)
     assert found.moved == COUNT - 1
     assert set(found.failed) == {f'{BUCKET}/{keys[0]}', f'{BUCKET}/thor/gone', f'other/{keys[1]}'}
     assert all(found.failed.values())
@@ -222,14 +222,14 @@ def test_a_store_that_is_away_ends_it(settings: StoreSettings, tmp_path: Path, m
             raise error
 
     source = Away(settings)
-    wishes = [FetchRequest(BUCKET, f'thor/{number}', 3) for number in range(2000)]
+    requests = [FetchRequest(BUCKET, f'thor/{number}', 3) for number in range(2000)]
     error: Exception = StoreUnavailable('away')
     with pytest.raises(StoreUnavailable):
-        run(source, tmp_path / 'data', wishes=wishes, threads=2)
+        run(source, tmp_path / 'data', requests=requests, threads=2)
     assert tried < 200
     error = CredentialsRejected('no')
     with pytest.raises(CredentialsRejected):
-        run(source, tmp_path / 'data', wishes=wishes, threads=2)
+        run(source, tmp_path / 'data', requests=requests, threads=2)
 
 
 def test_two_do_not_write_to_one_folder(settings: StoreSettings, tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_from_a_real_server(real: Tower, tmp_path: Path) -> None:
     source, to = Real(real.store_settings()), tmp_path / 'data'
     assert run(source, to).moved == COUNT
     assert whole(to)
-    assert run(source, to, wishes=under(Bucket(source.settings, BUCKET), 'thor/rosbags/large/')) == FetchResult(
+    assert run(source, to, requests=under(Bucket(source.settings, BUCKET), 'thor/rosbags/large/')) == FetchResult(
         moved=2, bytes=5 << 20
     )
     source.asked.clear()

@@ -21,7 +21,7 @@ from shadowhound_data_logger.formats.rows.gaps import GAP, WITHDRAWN, Statement,
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import gaps
 from shadowhound_data_logger.lake.bucket import Bucket
-from shadowhound_data_logger.lake.gaps import MOST_CAUSES, Stretch, coverage, known, of_rows
+from shadowhound_data_logger.lake.gaps import MAX_CAUSES, Stretch, coverage, known, of_rows
 from shadowhound_data_logger.stores import open_store
 
 
@@ -266,7 +266,7 @@ def test_a_part_with_a_cause_for_each_row_is_answered_with_few() -> None:
     """What a part says is hostile: a list of all causes at each time would take hours, and all memory."""
     rows = [lost(f'{number}', number, 5000 - number, cause=f'cause-{number}') for number in range(1000)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 5000 * SECOND, rows)
-    assert max(len(each.causes) for each in found.stretches) == MOST_CAUSES + 1
+    assert max(len(each.causes) for each in found.stretches) == MAX_CAUSES + 1
     assert found.stretches[0].causes == ('cause-0',)
     assert found.stretches[-1].causes == ('cause-0',)
 

@@ -24,7 +24,7 @@ from shadowhound_data_logger.formats.rows.gaps import GAPS
 from shadowhound_data_logger.lake import ingest as library
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import Scope, fresh, ingest, pending, row_files, tend
+from shadowhound_data_logger.lake.ingest import Scope, fresh, ingest, maintain, pending, row_files
 from shadowhound_data_logger.lake.tables import INGESTED, MISSION_ROWS, OBJECT_ROWS, TABLES, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
 
@@ -248,7 +248,7 @@ def test_two_ingesters_and_a_compaction_at_a_time_add_every_row_once(tmp_path: P
             add_part(store, made, f'b{number}', tmp_path / 'tmp')
             rows += made
             ingest(source, tables, Findings())
-            tend(source, tables, Findings())
+            maintain(source, tables, Findings())
         assert [each.wait(60) for each in others] == [0, 0]
     ingest(source, tables, Findings())
     assert Counter(table_keys(tables)) == Counter(keys(rows))
@@ -264,11 +264,11 @@ def test_upkeep_makes_one_ordered_file_of_a_day_that_has_ended(tmp_path: Path, t
             add_part(store, [row('camera', NOON_NS - 40 * 86400 * SECOND + number * SECOND)], f'a{number}', tmp_path / 'tmp')
             ingest(source, tables, Findings())
     before = table_keys(tables)
-    done = tend(source, tables, Findings())
+    done = maintain(source, tables, Findings())
     assert done.merged >= 3
     assert table_keys(tables) == before
     assert len(tables.open(OBJECT_ROWS).file_uris()) == 1
-    assert tend(source, tables, Findings()).merged == 0
+    assert maintain(source, tables, Findings()).merged == 0
     with engine({'objects': tables.open(OBJECT_ROWS)}) as ready:
         stamps = answer(ready, 'SELECT t_start_ns FROM objects')['t_start_ns'].to_pylist()
     assert stamps == sorted(stamps)
@@ -298,10 +298,10 @@ def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path:
         add(store, tmp_path / 'tmp', newer, parts.encode([{**rows[0], 'color': 'red'}]))
     only = Scope(robot=robot)
     assert ingest(source, tables, Findings(lambda _: None), row_files(source, Findings(), only)).rows == 3
-    assert tend(source, tables, Findings()).expired == 0
+    assert maintain(source, tables, Findings()).expired == 0
     assert len(row_files(source, Findings(), only)) == 3
     later = datetime.now(timezone.utc) + timedelta(hours=2)
-    assert tend(source, tables, Findings(), now=later).expired == 1
+    assert maintain(source, tables, Findings(), now=later).expired == 1
     assert [file.entry.key for file in row_files(source, Findings(), only)] == [bad, newer]
     assert table_keys(tables) == keys(rows)
 

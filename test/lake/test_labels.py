@@ -70,7 +70,7 @@ def test_labels_choose_objects(lake: Bucket) -> None:
     """Of a time all that reaches into it, of an object that alone; with other flags beside it, and as a view of SQL."""
     said(lake, STAIRS)
     boxes = [BOX, replace(BOX, key='thor/camera/none.jpg')]
-    kept, absent = labels.timed(lake, boxes, Findings())
+    kept, absent = labels.with_times(lake, boxes, Findings())
     assert absent == ['thor/camera/none.jpg']
     said(lake, *kept)
     found = query.objects(lake, label='stairs', sensor='camera').to_pydict()

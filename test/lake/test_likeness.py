@@ -86,11 +86,11 @@ def test_the_likest_come_first(lake: Lake, pair: Path) -> None:
     found = embed(lake.store, lake.source, model)
     assert (found.pictures, found.known, found.made, dict(found.refused)) == (4, 0, 4, {})
     assert len(lake.parts()) == 2, 'one a day'
-    reddish = model.of_pictures([Image.new('RGB', (100, 40), (200, 30, 30))])[0]
+    reddish = model.embed_images([Image.new('RGB', (100, 40), (200, 30, 30))])[0]
     assert set(lake.most_similar(model, reddish)[:2]) == {'red', 'dark red'}
-    assert lake.most_similar(model, model.of_text('blue'))[0] == 'blue'
+    assert lake.most_similar(model, model.embed_text('blue'))[0] == 'blue'
     assert lake.most_similar(model, reddish, until='2026-10-29') == ['red', 'blue']
-    answer = like(lake.source, model, model.of_text('green'), limit=1)
+    answer = like(lake.source, model, model.embed_text('green'), limit=1)
     assert answer.rows['likeness'].to_pylist() == pytest.approx([0.99], abs=0.02)
     assert (answer.pictures, answer.without, len(answer.rows)) == (4, 0, 1)
 
@@ -110,7 +110,7 @@ def test_another_model_has_vectors_of_its_own(lake: Lake, pair: Path, tmp_path: 
     embed(lake.store, lake.source, OnnxPair.open(pair))
     changed = OnnxPair.open(make_pair(tmp_path / 'colours', scale=2.0))
     assert changed.digest != OnnxPair.open(pair).digest
-    answer = like(lake.source, changed, changed.of_text('red'), limit=10)
+    answer = like(lake.source, changed, changed.embed_text('red'), limit=10)
     assert (answer.pictures, answer.without, len(answer.rows)) == (4, 4, 0)
     assert embed(lake.store, lake.source, changed).made == 4
 
@@ -133,19 +133,19 @@ def test_without_a_model_it_is_the_perceptual_hash(lake: Lake) -> None:
     ramp.save(out, 'JPEG', quality=60)
     lake.add('ramp', out.getvalue(), NOON_NS + 200 * SECOND)
     assert embed(lake.store, lake.source, model).made == 5
-    wanted = model.of_pictures([ramp.resize((320, 240))])[0]
+    wanted = model.embed_images([ramp.resize((320, 240))])[0]
     rows = like(lake.source, model, wanted, limit=1).rows.to_pylist()
     assert rows[0]['key'] == lake.keys['ramp']
     assert rows[0]['likeness'] > 0.9
     with pytest.raises(LakeError, match='needs a text model'):
-        model.of_text('door')
+        model.embed_text('door')
 
 
 def test_the_hash_is_the_published_one() -> None:
     """A pixel that is brighter than the one to its left is a one."""
     pixels = np.zeros((8, 9), np.uint8)
     pixels[:, 4] = 200
-    found = DifferenceHash().of_pictures([Image.fromarray(pixels).convert('RGB')])[0].reshape(8, 8)
+    found = DifferenceHash().embed_images([Image.fromarray(pixels).convert('RGB')])[0].reshape(8, 8)
     assert (found[:, 3] == 0.125).all()
     assert (np.delete(found, 3, axis=1) == -0.125).all()
 
@@ -160,12 +160,12 @@ def test_parts_that_are_none_are_left_out_and_named(lake: Lake, pair: Path, faul
     path = lake.home / 'store' / 'sensor-data' / first
     spoil(path, fault)
     findings = Findings(lambda _: None)
-    answer = like(lake.source, model, model.of_text('red'), limit=10, findings=findings)
+    answer = like(lake.source, model, model.embed_text('red'), limit=10, findings=findings)
     assert [each.key for each in findings] == [first]
     assert (len(answer.rows), answer.without) == (2, 2)
     again = embed(lake.store, lake.source, model, findings=Findings(lambda _: None))
     assert (again.known, again.made) == (2, 2)
-    answer = like(lake.source, model, model.of_text('red'), limit=10, findings=findings)
+    answer = like(lake.source, model, model.embed_text('red'), limit=10, findings=findings)
     assert (len(answer.rows), answer.without) == (4, 0)
     assert second in lake.parts()
 
@@ -210,11 +210,11 @@ def test_folders_that_are_no_model_are_refused(tmp_path: Path, pair: Path) -> No
         OnnxPair.open(outside)
     silent = make_pair(tmp_path / 'silent', with_text=False)
     with pytest.raises(LakeError, match='has no text model'):
-        OnnxPair.open(silent).of_text('red')
+        OnnxPair.open(silent).embed_text('red')
     strange = shutil.copytree(pair, tmp_path / 'strange')
     (strange / 'preprocessor_config.json').write_text('{"size": 999999}')
     with pytest.raises(LakeError, match='does not say how a picture is prepared'):
-        OnnxPair.open(strange).of_pictures([Image.new('RGB', (8, 8))])
+        OnnxPair.open(strange).embed_images([Image.new('RGB', (8, 8))])
 
 
 def refer_outside(path: Path) -> None:
@@ -239,14 +239,14 @@ def test_a_model_that_a_package_ships(tmp_path: Path) -> None:
         model.graph.output.remove(model.graph.output[0])
         model.graph.output.append(onnx.helper.make_tensor_value_info('flat', onnx.TensorProto.FLOAT, [1, 1000]))
     (folder / 'image.onnx').write_bytes(model.SerializeToString())
-    found = OnnxPair.open(folder).of_pictures([Image.new('RGB', (320, 240), 'teal'), Image.new('RGB', (50, 500), 'red')])
+    found = OnnxPair.open(folder).embed_images([Image.new('RGB', (320, 240), 'teal'), Image.new('RGB', (50, 500), 'red')])
     assert found.shape == (2, 1000)
     assert np.linalg.norm(found, axis=1) == pytest.approx([1, 1])
 
 
 def test_a_long_picture_is_refused_before_it_is_large(pair: Path) -> None:
     with pytest.raises(ValueError, match='too long'):
-        OnnxPair.open(pair).of_pictures([Image.new('RGB', (SIDE * 8192, 1))])
+        OnnxPair.open(pair).embed_images([Image.new('RGB', (SIDE * 8192, 1))])
 
 
 finite = st.floats(-1, 1, width=16, allow_subnormal=False)
@@ -269,7 +269,7 @@ def test_pictures_of_one_content_are_all_answers(lake: Lake, pair: Path) -> None
     model = OnnxPair.open(pair)
     found = embed(lake.store, lake.source, model)
     assert (found.pictures, found.made, found.known) == (5, 4, 1)
-    assert set(lake.most_similar(model, model.of_text('red'))[:2]) == {'red', 'red again'}
+    assert set(lake.most_similar(model, model.embed_text('red'))[:2]) == {'red', 'red again'}
 
 
 def test_a_death_in_the_middle_costs_no_vector(lake: Lake, pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -178,13 +178,13 @@ def test_the_gap_journal_says_what_was_deleted(settings: StoreSettings, tmp_path
 def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
     """A data set, a label of a time or of an object, and a request that is open, each counted and named; force overrides."""
     source = _source(settings)
-    exported, labelled, asked = (row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 7))
+    exported, labeled, asked = (row('camera', NOW_NS - age * DAY_NS) for age in (9, 8, 7))
     at_ns = NOW_NS - 6 * DAY_NS
     with closing(open_store(settings, UploadSettings())) as store:
-        of_object = labels.Label(robot='thor', label='door', since_ns=0, until_ns=0, bucket=schema.BUCKET, key=labelled['key'])
+        of_object = labels.Label(robot='thor', label='door', since_ns=0, until_ns=0, bucket=schema.BUCKET, key=labeled['key'])
         of_time = labels.Label(robot='thor', label='stairs', since_ns=at_ns - SECOND, until_ns=at_ns + SECOND)
         labels.write(store, 'thor', [of_object, of_time], by='me')
-        request = pull.ask(store, source, 'thor', KeptFilter(keys=frozenset({asked['key']})), by='me')
+        request = pull.put_request(store, source, 'thor', KeptFilter(keys=frozenset({asked['key']})), by='me')
     how: dict[str, Any] = {'exported': {(exported['bucket'], exported['key']): 'patrols'}}
     made = _plan(settings, **how)
     camera = made.sensors['camera']
@@ -192,7 +192,7 @@ def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
     assert camera.referrers == {'data set patrols', 'label door', 'label stairs', f'request {request.id}'}
     assert _run(settings, **how).objects == 7
     left = _stored(settings, 'camera')
-    assert {exported['key'], labelled['key'], asked['key']} <= {*left}
+    assert {exported['key'], labeled['key'], asked['key']} <= {*left}
     assert len(left) == 23
     _check(settings)
     assert _run(settings, **how, is_forced=True).objects == 5
@@ -287,11 +287,11 @@ def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
     per_day = sum(len(content(sensor, NOW_NS)) for sensor in ('camera', 'odom')) * 3
     camera = len(content('camera', NOW_NS)) * 3
     total = per_day * len(AGES)
-    made = _plan(settings, 'camera 30d, odom forever', most_bytes=total - 2 * camera + 1)
+    made = _plan(settings, 'camera 30d, odom forever', max_bytes=total - 2 * camera + 1)
     assert (made.going, made.over_bytes) == (6, 0)
-    made = _plan(settings, 'camera 30d, odom forever', most_bytes=0)
+    made = _plan(settings, 'camera 30d, odom forever', max_bytes=0)
     assert (made.going, made.sensors['camera'].is_all, made.over_bytes) == (30, True, total - 10 * camera)
-    _run(settings, 'camera 30d, odom forever', most_bytes=total - 2 * camera)
+    _run(settings, 'camera 30d, odom forever', max_bytes=total - 2 * camera)
     assert len(_stored(settings, 'camera')) == 24
     assert len(_stored(settings, 'odom')) == 30
     _check(settings)
@@ -377,7 +377,7 @@ def test_without_the_right_to_delete_it_says_whose_it_takes(settings: StoreSetti
     with closing(open_store(settings, UploadSettings())) as store, pytest.raises(LakeError, match='may not prune') as denied:
         _run(settings, store=Denying(store, 1000))
     assert 'prune' in denied.value.remedy
-    assert _run(settings).mended == 12
+    assert _run(settings).resumed == 12
     _check(settings)
 
 
@@ -394,7 +394,7 @@ def test_any_label_protects_what_it_reaches_into() -> None:
     rng = random.Random(7)
     for _ in range(300):
         spans = [(begin, begin + rng.randrange(30)) for begin in (rng.randrange(100) for _ in range(rng.randrange(8)))]
-        shield = prune.Protection(labelled=[_span(*span) for span in spans])
+        shield = prune.Protection(labeled=[_span(*span) for span in spans])
         begin = rng.randrange(130)
         end = begin + rng.randrange(20)
         each = {**row('camera', begin), 't_end_ns': end}

@@ -282,9 +282,9 @@ def test_a_data_set_asks_for_what_is_kept(field: Field, tmp_path: Path, monkeypa
     made = MissionDataset(field.source, since=NOON, near=(3.0, 0.0, 1.0), pull=True)
     assert made.stamps_ns.tolist() == [NOON_NS + number * SECOND for number in (2, 3, 4)]
     assert field.kept() == [0, 1, 5]
-    assert lake.bring(field.source, {'since': NOON}) == 3
+    assert lake.request_and_wait(field.source, {'since': NOON}) == 3
     assert field.kept() == []
-    assert lake.bring(field.source, {'since': NOON}) == 0
+    assert lake.request_and_wait(field.source, {'since': NOON}) == 0
     (tmp_path / 'folder' / 'thor' / '_catalog').mkdir(parents=True)
     with pytest.raises(SettingError, match='pull'):
         MissionDataset(tmp_path / 'folder', pull=True)
@@ -302,7 +302,7 @@ def test_a_pull_that_a_robot_does_not_finish_is_said(field: Field, monkeypatch: 
     monkeypatch.setattr(lake.time, 'sleep', sleep)
     monkeypatch.setattr(lake.time, 'time_ns', lambda: field.clock.now_ns)
     with pytest.raises(LakeError, match='expired, 0 of 1 objects'):
-        lake.bring(field.source, {'since': NOON})
+        lake.request_and_wait(field.source, {'since': NOON})
 
 
 def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:

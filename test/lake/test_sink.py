@@ -291,7 +291,7 @@ def test_what_passes_is_tried_again(url: str, settings: StoreSettings, tmp_path:
 def test_a_server_that_stays_away(url: str, settings: StoreSettings, tmp_path: Path) -> None:
     """Is told, with what to do; what it took before is noted."""
     with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
-        with pytest.raises(SinkUnavailable, match='asks to wait'):
+        with pytest.raises(SinkUnavailable, match='is overloaded or unavailable'):
             send(proxy, settings, tmp_path)
         assert SinkUnavailable.DEFAULT_REMEDY.startswith('run it again')
 
@@ -347,7 +347,7 @@ def test_a_request_that_is_too_large_is_halved(url: str, settings: StoreSettings
     with between(url, lambda _, body: (413, b'{}') if b'thor/camera' in body else None) as (proxy, _):
         fresh = tmp_path / 'other'
         fresh.mkdir()
-        assert list(send(proxy, settings, fresh).refused) == ['the server takes no document of this size']
+        assert list(send(proxy, settings, fresh).refused) == ['the server does not accept a document of this size']
 
 
 @pytest.mark.parametrize('answer', [b'<html>', b'{"items": []}', b'{"items": [1]}'])

@@ -272,7 +272,7 @@ LIES: list[dict[str, Any]] = [
 
 
 def test_statistics_that_contradict_themselves_are_told(tmp_path: Path) -> None:
-    """Their object is as one without statistics, never one without the field, and the others are judged as ever."""
+    """Their object is as one without statistics, never one without the field, and the others are evaluate as ever."""
     source = filled(tmp_path, [BATCHES[-1]] * (len(LIES) + 3), [True] * (len(LIES) + 3))
     first, second = sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))
     second.unlink()

@@ -23,7 +23,7 @@ from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import prune
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.ingest import ingest, tend
+from shadowhound_data_logger.lake.ingest import ingest, maintain
 from shadowhound_data_logger.lake.tables import OBJECT_ROWS, TABLES, Tables, answer, engine
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -73,7 +73,7 @@ def test_before_during_and_after_ingestion_a_reader_sees_each_row_once(server: T
     assert found(reader) == keys([*rows, *late])
     ingest(owner, tables, Findings())
     later = datetime.now(timezone.utc) + timedelta(hours=2)
-    assert tend(owner, tables, Findings(), now=later).expired == 49
+    assert maintain(owner, tables, Findings(), now=later).expired == 49
     assert reader.list('thor/_catalog/') == []
     assert found(reader) == keys([*rows, *late])
 
@@ -124,7 +124,7 @@ def test_an_object_is_deleted_after_the_tables_name_it_as_deleted(server: Tower,
         prune.apply(owner, watching, made, now_ns=NOON_NS + 9 * DAY_NS, findings=Findings())
     cameras = {row['key'] for row in rows if row['sensor'] == 'camera'}
     assert named == [cameras] * len(cameras)
-    tend(owner, tables, Findings(), now=datetime.now(timezone.utc) + timedelta(hours=2))
+    maintain(owner, tables, Findings(), now=datetime.now(timezone.utc) + timedelta(hours=2))
     assert len(owner.list('_forgotten/thor/')) == 2
     assert found(owner) == sorted({row['key'] for row in rows} - cameras)
 

@@ -251,7 +251,7 @@ def test_a_mailbox_is_read_by_its_robot_and_written_by_spark(server: Tower, as_u
         other.open()
         with ThreadPoolExecutor(6) as pool:
             wants = [KeptFilter(sensor=f'camera{number}') for number in range(12)]
-            asked = set(pool.map(lambda want: pull.ask(other, source, 'thor', want, by='spark').id, wants))
+            asked = set(pool.map(lambda want: pull.put_request(other, source, 'thor', want, by='spark').id, wants))
         found = robot.changed('sensor-data', place['Key'], '', 1 << 20)
         assert found
         assert {entry['id'] for entry in decode_inbox(found[0])} == asked
