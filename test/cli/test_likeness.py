@@ -80,7 +80,7 @@ def test_without_a_model(home: Path) -> None:
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [
-    (['--like-text', 'door'], 'a question in words needs a text model'),
+    (['--like-text', 'door'], 'a query in words requires a text model'),
     (['--like', 'red.png', '--like-text', 'door'], 'asks for pictures'), (['--model', '.'], 'asks for pictures'),
     (['--like', 'red.png', '--order', 'bytes'], 'asks for pictures'),
     (['--like', 'red.png', '--model', '.'], 'has no image model'),

@@ -151,7 +151,7 @@ def _dying(act: Any, after: int) -> Any:
 
 
 def test_new_keys_from_where_only_the_root_is(team: Team) -> None:
-    """What is in force goes on; where something was signed, what others signed with a copy of its key ends, and is said."""
+    """The lists in force stay; if something was signed here, what others signed with a copy of the key ends, and is reported."""
     team.run('keys')
     robot = team.robot('thor')
     shutil.copytree(team.keys, team.home / 'copy')
@@ -215,7 +215,7 @@ def test_another_key_signs_some_policies(team: Team) -> None:
 
 
 def test_a_public_key_is_of_who_has_the_private_one(team: Team) -> None:
-    """A file that somebody else changed, or that names another key as its own, is refused."""
+    """A file that was changed, or that claims another key, is refused."""
     team.run('keys')
     for name in ('eve', 'alice'):
         team.run('keys', '--person', name, '--keys', team.home / 'people')
@@ -244,7 +244,7 @@ def test_a_version_is_withdrawn(team: Team) -> None:
 
 
 def test_two_who_sign_at_once(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second one is told, and does it once more: neither is lost."""
+    """The second one gets an error and repeats it: neither change is lost."""
     team.run('keys')
     team.publish('go2/go2_patrol/1')
     one = Repository(team.keys, team.store, lambda _: '')
@@ -282,7 +282,7 @@ def test_a_robot_that_received_nothing_fresh_says_so(team: Team, tmp_path: Path,
     path = robot.path / 'metadata' / 'timestamp.json'
     old = Metadata[Timestamp].from_bytes(path.read_bytes())
     old.signed.expires = datetime.now(timezone.utc) - timedelta(days=1)
-    path.write_bytes(old.to_bytes())  # as it is a fortnight later
+    path.write_bytes(old.to_bytes())  # the state of a fortnight ago
     assert said() == [True] * 4
 
 
@@ -314,7 +314,7 @@ def test_signing_answers_in_json(team: Team) -> None:
 
 
 def test_a_robot_answers_in_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The verbs that choose the active version, and the report by which it is rolled back (exit code 1)."""
+    """The verbs that select the active version, and the report that rolls it back (exit code 1)."""
     monkeypatch.setattr(sync, 'run_smoke', lambda *_: SmokeRun(1.0, SANDBOX))
     scene = Scene(tmp_path)
     ids = [(scene.publish(version), scene.robot.run())[0] for version in (1, 2)]

@@ -1,4 +1,4 @@
-"""Statements of the gap journal of a robot ``thor``, told in seconds after ``NOON_NS``, and parts that have them."""
+"""Statements of the gap journal of a robot ``thor``, in seconds after ``NOON_NS``, and files with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pairs of small ONNX models in the layout of Hugging Face's exports: what a picture's colours are, and words for these."""
+"""Pairs of small ONNX models in the layout of Hugging Face's exports: the colors of an image, and words for them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLOURS = np.array([[0.3, 0.3, 0.3], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float3
 
 
 def make_pair(folder: Path, *, scale: float = 1.0, with_text: bool = True) -> Path:
-    """``image_embeds`` is the picture's mean colour, ``text_embeds`` that of the words; ``scale`` makes another model of it."""
+    """``image_embeds`` is the image's mean color, ``text_embeds`` that of the words; another ``scale`` is another model."""
     (folder / 'onnx').mkdir(parents=True)
     pixels = helper.make_tensor_value_info('pixel_values', TensorProto.FLOAT, ['batch', 3, SIDE, SIDE])
     embeds = helper.make_tensor_value_info('image_embeds', TensorProto.FLOAT, ['batch', 3])

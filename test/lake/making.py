@@ -1,4 +1,4 @@
-"""A small lake for the tests: two days of a robot in a house, with two patrols of which one failed, and who asks for what."""
+"""A small lake for the tests: two days of a robot, with two patrols, one of them failed, and a bucket that counts requests."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def minutes(days: Sequence[int] = (0, 1), hours: Sequence[int] = (11, 12), robot
 
 
 def add_part(store: ObjectStore, rows: Sequence[schema.Row], name: str, folder: Path) -> str:
-    """A part of the catalogue, as the robot delivers it."""
+    """A row file, as the robot delivers it."""
     robot = str(rows[0]['robot'])
     key = schema.OBJECTS.part_key(robot, schema.date_of(rows[0]), name)
     add(store, folder, key, parts.encode(rows), {'robot': robot})
@@ -90,7 +90,7 @@ def add(store: ObjectStore, folder: Path, key: str, body: bytes, metadata: dict[
 
 
 def fill(settings: StoreSettings, folder: Path, **which: Any) -> list[schema.Row]:
-    """The parts of some minutes, and the missions' summaries; the rows that the catalogue has then."""
+    """Deliver the row files of some minutes, and the missions' summaries; returns the rows of the catalog."""
     every: list[schema.Row] = []
     with closing(open_store(settings, UploadSettings())) as store:
         for begin_ns, rows in minutes(**which):
@@ -108,7 +108,7 @@ def folder_store(root: Path) -> StoreSettings:
 
 
 class Watched:
-    """A bucket that remembers what it was asked for, and may be told to fail."""
+    """A bucket that records the requests, and can fail on request."""
 
     def __init__(self, inner: Bucket) -> None:
         self.inner = inner

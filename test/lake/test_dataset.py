@@ -1,4 +1,4 @@
-"""A data set has every message of its anchor once, with what the other sensors said at that time, as the robot published it."""
+"""A dataset has every message of its anchor once, with the messages of the other sensors at that time, as published."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_causal_data_set_knows_nothing_later(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('frames', ['tar', 'zip'])
 def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: str) -> None:
-    """Each with its own time, its own neighbours, and a pose between those of the archives."""
+    """Each has its own time, its own neighbors, and a pose interpolated between those of the archives."""
     dataset = MissionDataset(drive(tmp_path, frames=frames), align=ALIGN)
     assert len(dataset) == SECONDS * FRAMES_HZ
     for number in (0, 5, 11, 20):
@@ -123,7 +123,7 @@ def test_an_archive_is_as_many_samples_as_it_has_frames(tmp_path: Path, frames: 
 
 
 def test_repeats_are_samples_of_their_own(tmp_path: Path) -> None:
-    """A frame that was stored once and seen thrice is three samples: as rows with a time of their own, and in an archive."""
+    """A frame that was stored once and seen thrice is three samples: as rows with different times, and in an archive."""
     settings = folder_store(tmp_path)
     still = Drive(settings, tmp_path)
     stamps = [NOON_NS + number * SECOND // 10 for number in range(3)]
@@ -170,7 +170,7 @@ def test_robots_differ_in_what_they_have(tmp_path: Path) -> None:
 
 
 def test_what_was_read_ahead_for_a_batch_does_not_stay(tmp_path: Path) -> None:
-    """Of the neighbours of a whole archive one frame needs few: the others would fill the memory, batch by batch."""
+    """One frame needs few of an archive's neighbors: the others would fill the memory, batch by batch."""
     dataset = MissionDataset(drive(tmp_path, frames='tar'), align={'imu': 1.0, 'odom': 1.0})
     for number in (0, 5, 9):
         dataset.__getitems__([number])
@@ -199,7 +199,7 @@ def test_the_poses_of_all_samples_are_those_of_each(tmp_path: Path) -> None:
 
 
 def test_incomplete_samples_can_be_left_out(tmp_path: Path) -> None:
-    """By the catalogue in what is counted, and message by message in a stream."""
+    """By the catalog in what is counted, and message by message in a stream."""
     settings = folder_store(tmp_path)
     partly = Drive(settings, tmp_path)
     partly.record(3, frames='tar')
@@ -279,7 +279,7 @@ def test_an_image_of_another_size(tmp_path: Path) -> None:
 
 
 def test_questions_are_those_of_the_catalogue(tmp_path: Path) -> None:
-    """The flags restrict the frames and not what is beside them; several robots keep to their own."""
+    """The flags restrict the frames but not the aligned sensors; several robots are not mixed."""
     settings = folder_store(tmp_path)
     Drive(settings, tmp_path).record(4)
     Drive(settings, tmp_path, 'tachi').record(4, without=['odom'])

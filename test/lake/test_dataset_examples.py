@@ -22,7 +22,7 @@ TIMEOUT_S = 200
 
 
 def run(example: str, *arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
-    """In a folder of its own where one is named by SHADOWHOUND_HOME: MLflow leaves artifacts where it stands."""
+    """In a separate folder if SHADOWHOUND_HOME names one: MLflow writes artifacts to the working directory."""
     return subprocess.run([sys.executable, str(ROOT / 'examples' / example), *arguments], env={**os.environ, **environ},
                           capture_output=True, text=True, check=False, timeout=TIMEOUT_S,
                           cwd=environ.get('SHADOWHOUND_HOME'))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Several processes share a data set without sharing anything: each sample comes once an epoch, whoever started them and how."""
+"""Several processes read a dataset without shared state: each sample once per epoch, however they were started."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Bucket:
 
 @pytest.fixture
 def in_worker(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """What torch tells a process of its DataLoader, and that torch is loaded."""
+    """The worker information that torch provides, and that torch is loaded."""
     told = types.SimpleNamespace(id=0, num_workers=1)
     module: Any = types.ModuleType('torch.utils.data')
     module.get_worker_info = lambda: told
@@ -99,7 +99,7 @@ def test_epochs_differ_and_can_be_had_again(source: Bucket) -> None:
 
 
 def test_a_shuffled_stream_mixes_archives_and_reads_each_once(source: Bucket) -> None:
-    """Neighbours in the stream are of several archives, and no object is fetched twice."""
+    """Neighbors in the stream come from several archives, and no object is fetched twice."""
     frames = MissionDataset(source)
     asked: list[str] = []
     read = frames._place.read
@@ -125,7 +125,7 @@ def test_a_shard_of_single_objects_is_bounded() -> None:
 
 
 def test_what_is_read_ahead_is_bounded(source: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the first sample no more is asked for than the bound and one object."""
+    """After the first sample, no more than the limit and one object is requested."""
     frames = MissionDataset(source)
     size = int(frames._selection.anchors[0].size[0])
     monkeypatch.setattr(dataset, 'PREFETCH_BYTES', 3 * size)
@@ -193,7 +193,7 @@ def test_with_the_real_data_loader(source: Bucket, style: str) -> None:
 
 
 def test_the_threads_of_a_process_open_one_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each opens none of its own when they all begin at once: a client of S3 takes half a second and megabytes."""
+    """Threads that start at the same time share one store: a client of S3 takes half a second and megabytes."""
     opened: list[object] = []
     begin = threading.Barrier(8)
 

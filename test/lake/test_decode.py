@@ -1,4 +1,4 @@
-"""Contents become the arrays that independent readers make of them; what is none is a LakeError."""
+"""Contents become the same arrays as with independent readers; invalid content is a LakeError."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def packed(image: Any, kind: str) -> bytes:
 
 
 def test_images_as_pillow_reads_them() -> None:
-    """Colour PNGs are RGB bytes; 16-bit depth and float images keep their values."""
+    """Color PNGs are RGB bytes; 16-bit depth and float images keep their values."""
     colours = np.random.default_rng(1).integers(0, 255, (6, 9, 3), np.uint8)
     assert np.array_equal(decode.image(packed(Image.fromarray(colours), 'PNG')), colours)
     grey = decode.image(packed(Image.fromarray(colours[:, :, 0]), 'PNG'))
@@ -100,7 +100,7 @@ def test_a_place_without_a_fix_is_nan() -> None:
 
 
 def test_records_become_numbers() -> None:
-    """Lists and nested messages are columns in order, null is NaN, texts are left out, times get their offset and an order."""
+    """Lists and nested messages are columns in order, null is NaN, texts are skipped, times get their offset and are sorted."""
     samples = [{'stamp_ns': 20, 'a': {'b': [1, 2]}, 'c': None, 'text': 'x', 'm': [{'q': 1}, {'q': 2}]},
                {'stamp_ns': 10, 'a': {'b': [3, 4]}, 'c': 5, 'text': 'y', 'm': [{'q': 3}, {'q': 4}]}]  # fmt: skip
     found = decode.records(orjson.dumps({'samples': samples}))

@@ -1,4 +1,4 @@
-"""Other engines open the tables of the lake: the lines of docs/lake.md, as they are, on a real S3 server."""
+"""Other engines open the tables of the lake: the unchanged lines of docs/lake.md, on a real S3 server."""
 
 from __future__ import annotations
 

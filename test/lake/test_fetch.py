@@ -1,4 +1,4 @@
-"""What is asked for lies in the folder, whole and verified; what lies there already is not moved again."""
+"""The requested objects are in the folder, complete and verified; existing ones are not downloaded again."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def fill(settings: StoreSettings, folder: Path) -> None:
 
 
 class Asked(DirectoryStore):
-    """Remembers whose content it was asked for."""
+    """Records the requested contents."""
 
     def __init__(self, settings: StoreSettings) -> None:
         super().__init__(settings.directory)
@@ -141,7 +141,7 @@ def test_what_another_program_fetched_is_read_and_not_moved(settings: StoreSetti
 
 
 def test_damage_on_the_way_is_tried_again_and_never_kept(settings: StoreSettings, tmp_path: Path) -> None:
-    """Once is repaired; for ever is a failure that names both checksums, and no file of that name."""
+    """Damage that occurs once is repaired; permanent damage is a failure that names both checksums, and leaves no file."""
     once, always, *_ = OBJECTS
     damaged = {once: 1, always: 99}
 
@@ -170,7 +170,7 @@ def test_the_word_of_the_catalogue_counts(settings: StoreSettings, tmp_path: Pat
 
 
 def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings, tmp_path: Path) -> None:
-    """Said so, and looked at again the next time."""
+    """It is reported, and checked again the next time."""
     key = next(iter(OBJECTS))
     (settings.directory / '.metadata' / BUCKET / f'{key}.json').unlink()
     source = Asked(settings)
@@ -182,7 +182,7 @@ def test_an_object_without_a_checksum_has_its_size_alone(settings: StoreSettings
 
 @pytest.mark.parametrize('key', ['../outside', '/etc/passwd', 'a//b', 'a/./b', 'a/../../b', '.fetch/files.db', ''])
 def test_no_key_leads_out_of_the_folder(settings: StoreSettings, tmp_path: Path, key: str) -> None:
-    """Anybody may have written to a bucket."""
+    """A bucket may contain hostile keys."""
     source = Asked(settings)
     found = run(source, tmp_path / 'data', requests=[FetchRequest(BUCKET, key, 3)])
     assert list(found.failed) == [f'{BUCKET}/{key}']
@@ -199,7 +199,7 @@ def test_no_row_leads_out_of_the_folder(tmp_path: Path, robot: str) -> None:
 
 
 def test_one_that_cannot_be_fetched_stops_no_other(settings: StoreSettings, tmp_path: Path) -> None:
-    """Gone meanwhile, a folder where the file should be, the same key in two buckets: each is told with its reason."""
+    """A deleted object, a folder in place of the file, the same key in two buckets: each is reported with its reason."""
     keys = list(OBJECTS)
     to = tmp_path / 'data'
     (to / keys[0]).mkdir(parents=True)
@@ -255,7 +255,7 @@ def test_what_was_not_synced_is_read_again_after_a_power_cut(settings: StoreSett
 
 
 def test_progress_adds_up(settings: StoreSettings, tmp_path: Path) -> None:
-    """Bytes and objects that are told, also of what was there already, are those that were asked for."""
+    """The reported bytes and objects, including existing ones, are those that were requested."""
     told = [0, 0]
 
     def tell(size: int, objects: int) -> None:

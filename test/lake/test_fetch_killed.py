@@ -45,7 +45,7 @@ SUMS = {key: hashlib.sha256(body(number)).hexdigest() for number, key in enumera
 
 
 class Counting(Front):
-    """Passes on so many objects and then answers nothing more; it knows which were asked for."""
+    """Passes on this many objects and then stops answering; it records the requested ones."""
 
     def __init__(self, url: str) -> None:
         super().__init__(url, lambda: Fault.HUNG if len(self.got) >= self.limit else Fault.NONE)

@@ -1,4 +1,4 @@
-"""The gap journal in the store: the newest statement counts, in whatever order it comes; and what is known of a time."""
+"""The gap journal in the store: the newest statement counts, in whatever order it arrives; and what is known about a time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def seconds(found: lake.Known) -> list[tuple[float, float, tuple[str, ...], str]
 
 
 def test_without_a_statement_nobody_knows(store: StoreSettings) -> None:
-    """No gap is known to be none where nothing was told: of a robot that never told, and of a topic."""
+    """Without statements, the absence of gaps means nothing: for a robot that never reported, and for a topic."""
     found = ask(store, 0, 10)
     assert seconds(found) == [(0, 10, (), '')]
     assert (found.is_whole, found.stretches[0].is_open, found.complete_ns) == (False, True, NOON_NS)
@@ -64,7 +64,7 @@ def test_by_received_a_gap_is_when_its_messages_would_have_arrived(store: StoreS
 
 
 def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: StoreSettings, tmp_path: Path) -> None:
-    """Whole, a gap, whole, and then what is not told yet."""
+    """Complete, a gap, complete, and then a time that is not reported yet."""
     tell(store, tmp_path, mark(60), lost('1', 20, 23))
     found = ask(store, 10, 90)
     assert seconds(found) == [
@@ -77,7 +77,7 @@ def test_below_the_watermark_no_row_is_no_gap_and_above_it_nobody_knows(store: S
 
 
 def test_a_gap_that_is_told_is_known_above_the_watermark_too(store: StoreSettings, tmp_path: Path) -> None:
-    """As one that nobody can place is: it is listed, and in no time."""
+    """Like a gap without times: it is listed, but belongs to no time."""
     untimed = statement('thor', GAP, 'j/9', 1, **IMU, kind='dropped', cause='queue_full', count=7)
     tell(store, tmp_path, mark(10), lost('1', 8, 14), untimed)
     found = ask(store, 5, 20)
@@ -91,7 +91,7 @@ def test_a_gap_that_is_told_is_known_above_the_watermark_too(store: StoreSetting
 
 
 def test_what_is_only_received_is_not_known(store: StoreSettings, tmp_path: Path) -> None:
-    """Without numbers or a rhythm a watermark tells what became of what came, and nothing of what did not."""
+    """Without sequence numbers or a regular rate, a watermark accounts for received messages, but not for lost ones."""
     tell(store, tmp_path, mark(60, grade='received-only'), mark(60, grade='estimated', topic='/odom'))
     assert seconds(ask(store, 0, 60)) == [(0, 60, (), '')]
     assert seconds(ask(store, 0, 60, '/odom')) == [(0, 60, (), 'estimated')]
@@ -105,7 +105,7 @@ def test_messages_of_another_type_are_nothing_of_the_topic(store: StoreSettings,
 
 
 def test_the_time_between_two_sessions_is_not_known_unless_told(store: StoreSettings, tmp_path: Path) -> None:
-    """A node that was off: numbers that went on tell what was lost, as soon as they come."""
+    """After a node was off, sequence numbers that continued show what was lost, as soon as they arrive."""
     tell(store, tmp_path, mark(60), mark(300, 2, 200, session=2))
     assert seconds(ask(store, 0, 300)) == [(0, 60, (), 'exact'), (60, 200, (), ''), (200, 300, (), 'exact')]
     tell(store, tmp_path, lost('2', 60, 200, 3, cause='restart', session=2), name='b')
@@ -122,7 +122,7 @@ def test_a_watermark_goes_back_when_an_object_waits_again(store: StoreSettings, 
 
 
 def test_a_gap_over_midnight_is_found_from_either_day(store: StoreSettings, tmp_path: Path) -> None:
-    """It lies under the date of its end, and is asked for by any time that it reaches into."""
+    """It is stored under the date of its end, and found by any time that it overlaps."""
     day_s = DAY_NS // SECOND
     tell(store, tmp_path, lost('1', 100, 2 * day_s), mark(2 * day_s + 50))
     for first_s in (100, day_s, 2 * day_s - 5):
@@ -191,7 +191,7 @@ def test_the_order_of_statements_does_not_matter(rows: list[Statement], random: 
        st.lists(st.tuples(st.integers(0, 50), st.integers(1, 30)), max_size=4))  # fmt: skip
 def test_every_instant_is_in_one_stretch_and_says_what_the_rows_say(gaps: list[tuple[int, int, str]],
                                                                      marks: list[tuple[int, int]]) -> None:  # fmt: skip
-    """Against asking each second by itself."""
+    """Compared with a query for each second."""
     rows = [lost(str(number), first, first + size, cause=cause) for number, (first, size, cause) in enumerate(gaps)]
     rows += [mark(first + size, first_s=first, session=number) for number, (first, size) in enumerate(marks)]
     found = of_rows('thor', 'objects', '/imu', NOON_NS, NOON_NS + 60 * SECOND, rows)
@@ -235,7 +235,7 @@ def test_sql_sees_gaps_and_watermarks(store: StoreSettings, tmp_path: Path) -> N
 
 
 def test_the_catalogue_does_not_see_the_journal(store: StoreSettings, tmp_path: Path) -> None:
-    """Its parts are not part of the catalogue, and no object that lacks a row."""
+    """Its files are not part of the catalog, and not objects without a row."""
     tell(store, tmp_path, mark(60))
     source = Bucket(store, BUCKET)
     assert len(lake.objects(source)) == 0

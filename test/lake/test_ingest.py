@@ -1,4 +1,4 @@
-"""Rows of robots get into the tables exactly once, whoever ingests, is killed or compacts."""
+"""Rows of robots are added to the tables exactly once, despite concurrent ingesters, kills and merges."""
 
 from __future__ import annotations
 
@@ -276,7 +276,7 @@ def test_upkeep_makes_one_ordered_file_of_a_day_that_has_ended(tmp_path: Path, t
 
 @pytest.mark.seaweedfs
 def test_on_a_server_row_files_expire_after_their_commit(tower: Tower, tmp_path: Path) -> None:
-    """Not before the grace period ends, and never one of which the tables lack rows or columns; they have the others then."""
+    """Not before the grace period ends, and never a file with rows or columns that the tables lack."""
     import boto3
 
     settings = tower.store_settings()

@@ -67,7 +67,7 @@ def test_a_removal_is_a_layer_and_a_label_may_come_back(lake: Bucket, tmp_path: 
 
 
 def test_labels_choose_objects(lake: Bucket) -> None:
-    """Of a time all that reaches into it, of an object that alone; with other flags beside it, and as a view of SQL."""
+    """A label of a time selects all that overlaps it, one of an object only that; with other flags, and as a view in SQL."""
     said(lake, STAIRS)
     boxes = [BOX, replace(BOX, key='thor/camera/none.jpg')]
     kept, absent = labels.with_times(lake, boxes, Findings())
@@ -88,7 +88,7 @@ def test_labels_choose_objects(lake: Bucket) -> None:
 
 
 def test_samples_have_labels(lake: Bucket) -> None:
-    """Those that stand when they are asked for, also in a data set that was pickled."""
+    """The labels at the time of the call, also in a dataset that was pickled."""
     said(lake, STAIRS)
     dataset = MissionDataset(lake, since='2026-10-28T11:59:50', until='2026-10-28T12:01')
     found = [(stamp - NOON_NS) // SECOND for stamp, names in zip(dataset.stamps_ns, dataset.labels(), strict=True) if names]

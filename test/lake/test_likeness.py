@@ -1,4 +1,4 @@
-"""What looks like this: vectors are made once, kept beside the catalogue, and searched exactly; what is none is left out."""
+"""Image similarity: vectors are computed once, stored next to the catalog, and searched exactly; invalid ones are skipped."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COLOURS = {'red': (250, 10, 20), 'green': (10, 240, 30), 'blue': (20, 10, 230), 
 
 
 class Lake:
-    """Pictures of one colour each, half of them a day later, in a store that is a folder."""
+    """Images of one color each, half of them a day later, in a folder store."""
 
     def __init__(self, home: Path, store: ObjectStore) -> None:
         self.home = home
@@ -137,7 +137,7 @@ def test_without_a_model_it_is_the_perceptual_hash(lake: Lake) -> None:
     rows = like(lake.source, model, wanted, limit=1).rows.to_pylist()
     assert rows[0]['key'] == lake.keys['ramp']
     assert rows[0]['likeness'] > 0.9
-    with pytest.raises(LakeError, match='needs a text model'):
+    with pytest.raises(LakeError, match='requires a text model'):
         model.embed_text('door')
 
 
@@ -213,7 +213,7 @@ def test_folders_that_are_no_model_are_refused(tmp_path: Path, pair: Path) -> No
         OnnxPair.open(silent).embed_text('red')
     strange = shutil.copytree(pair, tmp_path / 'strange')
     (strange / 'preprocessor_config.json').write_text('{"size": 999999}')
-    with pytest.raises(LakeError, match='does not say how a picture is prepared'):
+    with pytest.raises(LakeError, match='does not define how images are prepared'):
         OnnxPair.open(strange).embed_images([Image.new('RGB', (8, 8))])
 
 
@@ -245,7 +245,7 @@ def test_a_model_that_a_package_ships(tmp_path: Path) -> None:
 
 
 def test_a_long_picture_is_refused_before_it_is_large(pair: Path) -> None:
-    with pytest.raises(ValueError, match='too long'):
+    with pytest.raises(ValueError, match='too elongated'):
         OnnxPair.open(pair).embed_images([Image.new('RGB', (SIDE * 8192, 1))])
 
 

@@ -33,7 +33,7 @@ from shadowhound_data_logger.stores import open_store
 NOW_NS = NOON_NS + 10 * DAY_NS
 RULES = 'camera 5d, bags 5d, events forever'
 AGES = range(10)
-"""Days before now of which there are rows."""
+"""The days before now that have rows."""
 
 
 class Dead(Exception):
@@ -104,7 +104,7 @@ def _run(settings: StoreSettings, rules: str = RULES, store: Any = None, **how: 
 
 
 def _stored(settings: StoreSettings, *sensors: str) -> list[str]:
-    """What the store has, without the catalogue."""
+    """The keys in the store, without the catalog."""
     found = [entry.key for entry in _source(settings).list('thor/') if schema.is_row(schema.BUCKET, entry.key)]
     return sorted(key for key in found if not sensors or key.split('/')[1] in sensors)
 
@@ -114,7 +114,7 @@ def _answer(settings: StoreSettings) -> list[str]:
 
 
 def _check(settings: StoreSettings) -> None:
-    """The catalogue names what the store has, and of what it does not name there is a row that says when it went."""
+    """The catalog names what the store has, and for every deleted object there is a row with the time of its deletion."""
     source, left_out = _source(settings), Findings()
     assert _answer(settings) == _stored(settings)
     rows = verify.rows(source, left_out)
@@ -137,7 +137,7 @@ def settings(filled: Path, tmp_path: Path) -> StoreSettings:
 
 
 def test_what_a_rule_names_goes_and_nothing_else(settings: StoreSettings) -> None:
-    """By sensor and age. The catalogue names the rest, the rows of what went say when, and a second run finds nothing."""
+    """By sensor and age. The catalog names the rest, rows of deleted objects have the time, and a second run finds nothing."""
     before = _stored(settings)
     done = _run(settings)
     old = [key for key in before if '/camera/' in key and key.split('/')[2] < '20261102']
@@ -201,7 +201,7 @@ def test_what_something_refers_to_stays(settings: StoreSettings) -> None:
 
 
 def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path: Path) -> None:
-    """Nobody knows then what it refers to."""
+    """Then it is unknown what it refers to."""
     with closing(open_store(settings, UploadSettings())) as store:
         add(store, tmp_path / 'tmp', 'thor/_labels/date=2026-11-01/thor_x.jsonl.zst', b'no parquet')
     with pytest.raises(LakeError, match='labels'):
@@ -210,7 +210,7 @@ def test_a_label_that_cannot_be_read_stops_it(settings: StoreSettings, tmp_path:
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_bag_goes_as_a_whole_or_not_at_all(settings: StoreSettings, tmp_path: Path) -> None:
-    """When its last slice is old. An event's has a rule of its own, and of one without a manifest nobody knows whose it is."""
+    """When its last slice is old. An event's bag has a separate rule; without a manifest it is unknown which one applies."""
     tmp = tmp_path / 'tmp'
     old = _add_bag(settings, tmp, 'old', NOW_NS - 8 * DAY_NS)
     young = _add_bag(settings, tmp, 'young', NOW_NS - 5 * DAY_NS - MINUTE_NS)
@@ -283,7 +283,7 @@ def test_a_robot_cannot_have_a_young_object_deleted(settings: StoreSettings, tmp
 
 
 def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
-    """Of what a rule names with an age alone; what cannot be reached is told."""
+    """Only for rules with an age; a size that cannot be reached is reported."""
     per_day = sum(len(content(sensor, NOW_NS)) for sensor in ('camera', 'odom')) * 3
     camera = len(content('camera', NOW_NS)) * 3
     total = per_day * len(AGES)
@@ -299,7 +299,7 @@ def test_by_size_the_oldest_days_go(settings: StoreSettings) -> None:
 
 @pytest.mark.long('a death after each request')
 def test_it_may_die_anywhere(tmp_path: Path) -> None:
-    """After each single thing that it does, whatever the catalogue names is there; the next run ends it, once for each object."""
+    """After each step, whatever the catalog names exists; the next run finishes it, once for each object."""
     for life in range(100):
         settings = folder_store(tmp_path / str(life))
         with closing(open_store(settings, UploadSettings())) as store:
@@ -338,7 +338,7 @@ def test_two_at_once_delete_once(settings: StoreSettings) -> None:
         def run(made: prune.PrunePlan) -> None:
             try:
                 prune.apply(_source(settings), store, made, now_ns=NOW_NS, findings=Findings())
-            except BaseException as error:  # noqa: BLE001 - told by the test
+            except BaseException as error:  # noqa: BLE001 - reported by the test
                 failed.append(error)
 
         threads = [threading.Thread(target=run, args=(made,)) for made in plans]
@@ -374,7 +374,10 @@ def test_without_the_right_to_delete_it_says_whose_it_takes(settings: StoreSetti
         def delete(self, bucket: str, key: str) -> None:
             raise AccessDenied('no', bucket=bucket)
 
-    with closing(open_store(settings, UploadSettings())) as store, pytest.raises(LakeError, match='may not prune') as denied:
+    with (
+        closing(open_store(settings, UploadSettings())) as store,
+        pytest.raises(LakeError, match='do not permit pruning') as denied,
+    ):
         _run(settings, store=Denying(store, 1000))
     assert 'prune' in denied.value.remedy
     assert _run(settings).resumed == 12

@@ -1,4 +1,4 @@
-"""``lake prune`` against a real server: killed again and again, beside people who read, a compaction and another prune."""
+"""``lake prune`` against a real server: killed repeatedly, with concurrent readers, a compaction and another prune."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def command(tower: Tower, *arguments: str, url: str = '') -> subprocess.Popen[st
 
 
 def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
-    """What each said, once all have ended well."""
+    """The output of each, after all have succeeded."""
     said = [process.communicate(timeout=240) for process in processes]
     for process, (out, err) in zip(processes, said, strict=True):
         assert process.returncode == 0, f'{process.args}: {out}{err}'
@@ -71,7 +71,7 @@ def ended(processes: Sequence[subprocess.Popen[str]]) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.long('kills')
 def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tmp_path: Path) -> None:
-    """In the end exactly what the rule names is gone, with one row each; who reads the rest meanwhile gets all of it."""
+    """In the end exactly what the rule names is deleted, with one row each; concurrent readers can read all the rest."""
     now_ns, chance = time.time_ns(), random.Random(7)
     ages = range(10)
     rows: dict[str, schema.Row] = {}

@@ -78,7 +78,7 @@ class Field:
         self.passes()
 
     def passes(self) -> None:
-        """Ten seconds: the robot looks into its mailbox, tells what it has, and delivers."""
+        """Ten seconds: the robot polls its mailbox, reports what it has, and delivers."""
         self.now_s += 10
         self.clock.now_ns += 10 * SECOND
         self.server.step()
@@ -115,7 +115,7 @@ def run(*arguments: str, code: int = 0) -> Any:
 
 
 def test_a_pull_from_asking_to_arrival(field: Field) -> None:
-    """The rows arrive before the bytes; what is asked for comes, verified, and is not on the robot any more."""
+    """The rows arrive before the bytes; requested objects arrive verified, and are then no longer on the robot."""
     field.records(*range(6))
     assert field.kept() == [0, 1, 2, 3, 4, 5]
     assert run('query', '--sensor', 'camera') == []
@@ -182,7 +182,7 @@ def test_a_request_is_taken_back(field: Field) -> None:
     request = run('pull', '--sensor', 'camera')['id']
     done = CliRunner().invoke(cli, ['pull', '--cancel', request], standalone_mode=False)
     assert done.exception is None
-    field.server._poll_at_s = 1e9  # the robot is away while it is asked and told otherwise
+    field.server._poll_at_s = 1e9  # the robot is offline during the request and its cancellation
     field.passes()
     field.server._poll_at_s = 0.0
     field.passes()
@@ -193,7 +193,7 @@ def test_a_request_is_taken_back(field: Field) -> None:
 
 
 def test_times_labels_and_sql_choose_what_is_asked_for(field: Field, tmp_path: Path) -> None:
-    """And nothing else: the robot is asked by name, and where nothing is chosen it is asked for nothing."""
+    """And nothing else: the robot gets a request for these names, and none if nothing is selected."""
     field.records(*range(8))
     ranges = tmp_path / 'ranges.json'
     spans = [{'robot': 'thor', 'since_ns': NOON_NS + at * SECOND, 'until_ns': NOON_NS + at * SECOND + 1} for at in (1, 5)]
@@ -275,7 +275,7 @@ def test_the_pace_of_the_link_says_how_long_a_pull_takes(field: Field, tmp_path:
 
 
 def test_a_data_set_asks_for_what_is_kept(field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It waits until that has come and the catalogue knows of it; what nobody asked for stays. A folder has no robot to ask."""
+    """It waits until the objects and their rows have arrived; others are kept. A folder has no robot to request from."""
     field.records(*range(6))
     monkeypatch.setattr(lake.time, 'sleep', lambda _: field.passes())
     assert len(MissionDataset(field.source, since=NOON)) == 0
@@ -306,7 +306,7 @@ def test_a_pull_that_a_robot_does_not_finish_is_said(field: Field, monkeypatch: 
 
 
 def test_a_hostile_mailbox_and_hostile_answers_are_read(field: Field) -> None:
-    """By one who asks: what is none of ours is left out of the mailbox, and no number or text in an answer ends a verb."""
+    """For a requester: foreign entries of the mailbox are skipped, and no number or text in an answer crashes a command."""
     field.records(1, 2)
     prefix = '_requests/thor/inbox.json'
     lake.make(field.store, 'thor')

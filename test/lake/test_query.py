@@ -1,4 +1,4 @@
-"""A question is answered with exactly the rows that it means, and only what can hold them is asked for."""
+"""A query returns exactly the matching rows, and reads only what can contain them."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_sql_over_the_views(world: tuple[StoreSettings, list[schema.Row]]) -> No
     'told', ['{"distance_m": 1%s}' % (400 * '0'), '{"result": "\\ud800"}', 10_000 * '[', '{"mission_type": 5}'], ids=range(4)
 )
 def test_a_senseless_summary_costs_its_own_figures_alone(tmp_path: Path, told: str) -> None:
-    """Anybody may have written it: the mission has no end then, and the others are told."""
+    """A summary may be hostile: then the mission has no end, and the others are still listed."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(12,))
     untyped = {**row('camera', NOON_NS + 10**9), 'mission_id': 'odd', 'run_id': 'run-odd', 'mission_type': None}
@@ -200,7 +200,7 @@ def test_a_file_that_goes_while_a_folder_is_listed_is_no_error(tmp_path: Path) -
 
 
 def test_a_mission_without_a_summary_is_told_without_an_end(tmp_path: Path) -> None:
-    """It goes on, or its robot is away: neither failed nor succeeded."""
+    """It is still running, or its robot is unreachable: neither failed nor succeeded."""
     settings = folder_store(tmp_path)
     fill(settings, tmp_path / 'tmp', days=(0,), hours=(11,))
     source = Bucket(settings, schema.BUCKET)
@@ -283,7 +283,7 @@ def test_what_is_no_question_is_one_kind_of_error(
 
 
 def test_a_lake_that_is_not_there_is_empty(tmp_path: Path) -> None:
-    """No store yet, no catalogue yet: no rows, no error."""
+    """No store yet, no catalog yet: no rows, no error."""
     source = Bucket(folder_store(tmp_path), schema.BUCKET)
     assert found(source) == []
     assert lake.missions(source).to_pydict()['mission_id'] == []
@@ -350,7 +350,7 @@ def test_wrong_credentials_are_told_without_showing_them(seaweed: Tower) -> None
 def test_credentials_that_are_not_there_are_told(
     keys: dict[str, str], error: type[Exception], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """None of them, or half a pair: what is missing, before anything is asked for."""
+    """No model, or half a pair: the missing one is reported before any request."""
     for name in [name for name in os.environ if name.startswith('AWS_')]:
         monkeypatch.delenv(name)
     monkeypatch.setenv('HOME', str(tmp_path))

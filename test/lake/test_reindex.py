@@ -1,4 +1,4 @@
-"""A catalogue that is lost is made again from the objects, and what was never in it comes into it, each row once."""
+"""A lost catalog is rebuilt from the objects, and missing rows are added, each row once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LATER = datetime.now(timezone.utc) + timedelta(hours=2)
 
 @pytest.fixture
 def settings(tmp_path: Path) -> StoreSettings:
-    """Objects with what they say of themselves, and no catalogue."""
+    """Objects with metadata, without a catalog."""
     settings = folder_store(tmp_path)
     with closing(open_store(settings, UploadSettings())) as store:
         for sensor in SENSORS:
@@ -76,7 +76,7 @@ def test_only_what_is_missing_is_asked(settings: StoreSettings, tmp_path: Path) 
 
 
 def test_a_part_that_comes_after_it_adds_no_row_twice(settings: StoreSettings, tmp_path: Path) -> None:
-    """Robots deliver parts after the objects: before and after a merge a row that stands in two files is one row."""
+    """Robots deliver parts after the objects: before and after a merge a row in two files is one row."""
     run(settings)
     with closing(open_store(settings, UploadSettings())) as store:
         add_part(store, [row(sensor, stamp_ns) for sensor in SENSORS for stamp_ns in TIMES[:3]], 'late', tmp_path / 'tmp')

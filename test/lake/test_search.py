@@ -100,7 +100,7 @@ def test_the_flags_of_a_query(index: Path) -> None:
 
 
 def test_an_update_reads_what_is_new(lake: Bucket, index: Path, tmp_path: Path) -> None:
-    """A second one adds nothing, and the same comes of nothing; the index tells when it was last brought up to date."""
+    """A second update adds nothing, and a rebuild gives the same result; the index records its last update."""
     before = search.updated(index)
     again = search.update(index, lake, Findings(lambda _: None))
     after = search.updated(index)
@@ -141,9 +141,9 @@ def test_what_is_no_query_is_told(index: Path, text: str) -> None:
 
 
 def test_a_file_that_is_no_index(tmp_path: Path, lake: Bucket) -> None:
-    """Neither damage nor tables and triggers of somebody else are taken for ours."""
+    """Neither a damaged file nor one with foreign tables or triggers is accepted."""
     path = tmp_path / 'search.db'
-    with pytest.raises(LakeError, match='no index'):
+    with pytest.raises(LakeError, match='does not exist'):
         search.search(path, 'door', wanted(0))
     path.write_bytes(b'no database' * 99)
     with pytest.raises(LakeError, match='cannot be used'):
@@ -152,7 +152,7 @@ def test_a_file_that_is_no_index(tmp_path: Path, lake: Bucket) -> None:
     search.update(path, lake, Findings(lambda _: None))
     with closing(sqlite3.connect(path)) as db:
         db.executescript("CREATE VIEW more AS SELECT load_extension('x');")
-    with pytest.raises(LakeError, match='not an index'):
+    with pytest.raises(LakeError, match='not a search index'):
         search.search(path, 'door', wanted(0))
 
 
@@ -240,7 +240,7 @@ def test_a_file_of_another_program_is_left_alone(lake: Bucket, tmp_path: Path) -
     with closing(sqlite3.connect(path)) as db, db:
         db.execute('CREATE TABLE precious (x)')
     before = path.read_bytes()
-    with pytest.raises(LakeError, match='not an index') as raised:
+    with pytest.raises(LakeError, match='not a search index') as raised:
         search.update(path, lake)
     assert 'remove it' in raised.value.remedy
     assert path.read_bytes() == before

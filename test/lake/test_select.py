@@ -44,7 +44,7 @@ def test_without_an_end_it_goes_on_to_tomorrow() -> None:
 
 
 def test_nothing_is_between_an_end_and_a_later_beginning() -> None:
-    """No folder is asked for."""
+    """No folder is listed."""
     assert Wanted(since_ns=NOON_NS, until_ns=NOON_NS).dates(NOON_NS) == []
 
 

@@ -57,7 +57,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.fixture
 def url(cluster: Any) -> Iterator[str]:
-    """An empty server of its own."""
+    """A separate, empty server."""
     with cluster.clone() as clone:
         yield clone.url
 
@@ -116,7 +116,7 @@ def test_all_is_there_once(url: str, settings: StoreSettings, tmp_path: Path) ->
 
 
 def test_what_a_document_has(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """Times to the nanosecond, places in metres, and a mission, its event and its error found by their words."""
+    """Times to the nanosecond, positions in meters, and a mission, its event and its error found by their words."""
     send(url, settings, tmp_path)
     ask(url, 'robots-*/_refresh', 'POST')
     (mission,) = ask(url, 'robots-missions/_search?q=command:door')['hits']['hits']
@@ -160,7 +160,7 @@ def test_merged_files_of_tables_send_nothing_again(url: str, settings: StoreSett
 
 
 def test_an_index_that_was_deleted_is_filled_again(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """The position is of an index, by its UUID; the others are left as they are."""
+    """The position belongs to an index, by its UUID; the others are unchanged."""
     send(url, settings, tmp_path)
     whole = counts(url)
     for kind in ('objects', 'events'):
@@ -172,7 +172,7 @@ def test_an_index_that_was_deleted_is_filled_again(url: str, settings: StoreSett
 
 
 def test_what_was_pruned_says_so(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """Its document keeps all that it said, in whatever run it is told, and once."""
+    """Its document keeps all fields, whenever the deletion is sent, and exists once."""
     with closing(open_store(settings, UploadSettings())) as store:
         row = fill_row()
         told = {name: row[name] for name in schema.FORGOTTEN.columns if name in row}
@@ -289,7 +289,7 @@ def test_what_passes_is_tried_again(url: str, settings: StoreSettings, tmp_path:
 
 
 def test_a_server_that_stays_away(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """Is told, with what to do; what it took before is noted."""
+    """The error has a remedy, and what the server accepted before is recorded."""
     with between(url, lambda number, _: (429, b'{}') if number > 1 else None) as (proxy, _):
         with pytest.raises(SinkUnavailable, match='is overloaded or unavailable'):
             send(proxy, settings, tmp_path)
@@ -297,7 +297,7 @@ def test_a_server_that_stays_away(url: str, settings: StoreSettings, tmp_path: P
 
 
 def test_single_documents(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """One that has to wait is sent again alone; one that is refused is counted by reason and listed, and the others go on."""
+    """One that has to wait is sent again alone; one that is refused is counted by reason and listed, and the others continue."""
     sizes: list[int] = []
 
     def answer(number: int, body: bytes) -> tuple[int, bytes] | None:
@@ -369,7 +369,7 @@ def test_a_part_that_is_none_is_told_each_time(url: str, settings: StoreSettings
 
 
 def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:
-    """Is in a header alone, never in a URL or a repr; a redirect to somebody else is not followed."""
+    """The secret is only in a header, never in a URL or a repr; a redirect to another server is not followed."""
     with pytest.raises(SettingError, match='URL') as refused:
         sink.SearchServer('http://me:secret@127.0.0.1:9200')
     assert 'secret' not in str(refused.value)
@@ -391,7 +391,7 @@ def test_who_sends(url: str, settings: StoreSettings, tmp_path: Path) -> None:
 
 
 def test_two_at_a_time(url: str, tmp_path: Path) -> None:
-    """The second one is told to wait; a name that is no index is refused."""
+    """The second one gets an error; an invalid prefix is refused."""
     with closing(sink.SearchServer(url)) as server, sink.opened(server, 'robots', tmp_path):
         with pytest.raises(LakeError, match='another process'), sink.opened(server, 'robots', tmp_path):
             pass
@@ -421,7 +421,7 @@ def fields(value: Any) -> Iterator[str]:
 
 @pytest.mark.parametrize('kind', sink.INDEXES)
 def test_dashboards(kind: str) -> None:
-    """As far as parsing tells: each reference leads to an object of the file, each field is one that documents have."""
+    """As far as parsing shows: each reference leads to an object of the file, each field exists in documents."""
     objects = [json.loads(line) for line in (FOLDER / f'{kind}.ndjson').read_text().splitlines()]
     there = {(each['type'], each['id']) for each in objects}
     assert {(one['type'], one['id']) for each in objects for one in each['references']} <= there

@@ -1,4 +1,4 @@
-"""The lake of a Tower behind TLS with an authority of its own: asked, fetched, trained on, or not believed and told why."""
+"""The lake of a Tower behind TLS with a private authority: queried, fetched, trained on, or not trusted, with the reason."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def towards(filled: Tower, monkeypatch: pytest.MonkeyPatch, authorities: dict[st
 
 @contextmanager
 def secured(filled: Tower, authority: Authority, name: str, **how: Any) -> Iterator[Secured]:
-    """TLS before the store; whoever speaks to it otherwise fails the test."""
+    """TLS in front of the store; a connection without TLS fails the test."""
     with behind_tls(filled.endpoint_url, authority.sign(name, **how)) as front:
         yield front
     assert front.wire.heard_by_connection
@@ -128,7 +128,7 @@ def test_an_authority_is_no_server(
 def test_a_bundle_that_is_none_is_bad_usage(
     towards: Callable[[str], StoreSettings], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """It is named before anybody is asked."""
+    """It is reported before any request."""
     settings = towards('https://127.0.0.1:1')
     (tmp_path / 'ca.pem').write_text('no certificate')
     monkeypatch.setenv('AWS_CA_BUNDLE', str(tmp_path / 'ca.pem'))

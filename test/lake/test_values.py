@@ -54,7 +54,7 @@ def body(begin_ns: int, messages: list[dict[str, Any]]) -> bytes:
 
 
 def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], chosen: tuple[str, ...] = ()) -> Bucket:
-    """A lake with a batch every minute; ``told`` says of which there are statistics."""
+    """A lake with a batch every minute; ``told`` selects those with statistics."""
     store_settings = folder_store(root)
     with closing(open_store(store_settings, UploadSettings())) as store:
         rows, statistics = [], []
@@ -73,17 +73,17 @@ def filled(root: Path, batches: list[list[dict[str, Any]]], told: list[bool], ch
                 found.add(orjson.loads(content)['samples'])
                 statistics += statistic_rows(row, found.result())
         add(store, root, schema.OBJECTS.part_key('thor', '2026-10-28', '20261028T120000_a'), parts.encode(rows))
-        for name in 'ab' if statistics else '':  # told twice, as after a power cut
+        for name in 'ab' if statistics else '':  # delivered twice, as after a power cut
             key = STATISTICS.part_key('thor', '2026-10-28', f'20261028T12000{"ab".index(name)}_{name}')
             add(store, root, key, parts.encode(statistics, STATISTICS))
     return Bucket(store_settings, schema.BUCKET)
 
 
-# -- the oracle: a loop that knows nothing of statistics -----------------------------------------------------------------------
+# -- the oracle: a loop that does not use statistics ---------------------------------------------------------------------------
 
 
 def numbers(value: Any, path: list[str]) -> list[float]:
-    """What a path means in a message: all finite numbers below it; of long lists the elements have no numbers of their own."""
+    """What a path means in a message: all finite numbers below it; in long lists the elements have no separate numbers."""
     if isinstance(value, dict):
         below = [value[path[0]]] if path and path[0] in value else [] if path else list(value.values())
         return [number for each in below for number in numbers(each, path[1:])]
@@ -186,7 +186,7 @@ BATCHES = [[{'a': 1.0 * number + place} for place in range(5)] for number in ran
 
 
 def test_only_what_may_hold_it_is_opened(tmp_path: Path) -> None:
-    """A batch of which all or no message meets the condition is not opened, nor is any for a statistic."""
+    """A batch whose messages all, or none, meet the condition is not opened; for a statistic, none is."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     found = values.ranges('s.a > 11', source)
     assert (found.objects, found.opened, found.unknown) == (10, 2, 0)
@@ -230,7 +230,7 @@ def test_other_readers_read_the_statistics(tmp_path: Path) -> None:
 
 
 def test_fields_beyond_the_bound_are_unknown(tmp_path: Path) -> None:
-    """The first fields have statistics; of the others nobody says that they never were so."""
+    """The first fields have statistics; for the others, the condition may have been true."""
     wide = [[{f'f{place:03d}': 1.0 for place in range(MAX_FIELDS + 1)}]]
     source = filled(tmp_path, wide, [True])
     last = f's.f{MAX_FIELDS:03d} = 1'
@@ -251,7 +251,7 @@ def test_what_is_no_condition_is_told(text: str) -> None:
 
 
 def test_statistics_are_made_again_of_the_objects(tmp_path: Path) -> None:
-    """Those that are missing, once; a damaged object is told."""
+    """Missing statistics are added once; a damaged object is reported."""
     source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
     damaged = tmp_path / 'store/sensor-data/thor/s/20261028/000009_s.json'
     damaged.write_bytes(b'no JSON')
@@ -303,7 +303,7 @@ def test_absurd_counts_of_messages_hide_nothing(tmp_path: Path) -> None:
 
 
 def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
-    """A part that is none, and rows of another robot, are told; what they spoke of is unknown, not absent."""
+    """An invalid file, and rows of another robot, are reported; their objects are unknown, not absent."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     for number, path in enumerate(sorted(tmp_path.glob('store/sensor-data/thor/_stats/*/*.jsonl.zst'))):
         if number:
@@ -320,7 +320,7 @@ def test_hostile_statistics_are_left_out(tmp_path: Path) -> None:
 
 
 def test_only_questions_about_values_read_statistics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They lie in a folder of their own, which nobody else even lists."""
+    """They are in a separate folder, which other queries do not list."""
     source = filled(tmp_path, BATCHES, [True] * 10)
     asked: list[str] = []
     for name in ('list', 'get', 'ranges', 'folders'):

@@ -77,7 +77,7 @@ class Drive:
         self.has_arrivals = True
 
     def record(self, seconds: int, *, frames: str = 'jpeg', without: Sequence[str] = (), first: int = 0) -> None:
-        """``frames``: jpeg, one a second; tar or zip, ``FRAMES_HZ`` of them in an archive a second."""
+        """``frames``: jpeg, one per second; tar or zip, ``FRAMES_HZ`` frames in one archive per second."""
         made: list[DataObject] = []
         for second in range(first, first + seconds):
             begin = NOON_NS + second * SECOND
@@ -104,7 +104,7 @@ class Drive:
         self.rows += rows
 
     def catalogue(self, told: Sequence[tuple[DataObject, Mapping[str, str]]]) -> None:
-        """Rows without objects of their own, such as those of repeats."""
+        """Rows without separate objects, such as those of repeats."""
         rows = []
         for one, metadata in told:
             assert isinstance(one.body, bytes)
@@ -161,6 +161,6 @@ class Drive:
 
 
 def in_a_child(frames: MissionDataset, numbers: Sequence[int], out: Any) -> None:
-    """The times of these samples, read in another process, which a spawned one has to be able to import."""
+    """The times of these samples, read in another process; a function that a spawned process can import."""
     out.put([int(sample['stamp_ns']) for sample in frames.__getitems__(numbers)])
     frames.close()

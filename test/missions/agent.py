@@ -1,4 +1,4 @@
-"""A mission agent that is killed: it logs until it is, and says what each call has returned for."""
+"""A mission agent that logs until it is killed, and prints each record whose call has returned."""
 
 from __future__ import annotations
 

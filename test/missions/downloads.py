@@ -1,6 +1,6 @@
 """The artifacts of a run as MLflow's client lists and downloads them: ``python -m missions.downloads URI RUN NAME ...``.
 
-A process of its own, because MLflow's client leaves threads behind. Those with a NAME are downloaded
+A separate process, because MLflow's client leaves threads behind. Those with a NAME are downloaded
 singly as well.
 """
 

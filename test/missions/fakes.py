@@ -1,4 +1,4 @@
-"""A tracking server and a spooler in memory that fail when they are told to."""
+"""A tracking server and a spooler in memory that fail on request."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shadowhound_data_logger.missions.state import Point
 
 @dataclass
 class FakeTracking:
-    """One server. ``fail`` is asked before each request, by its name; ``refuses`` judges each point."""
+    """A server. ``fail`` decides by name whether a request fails, ``refuses`` whether a point is refused."""
 
     fail: Callable[[str], bool] = lambda _: False
     refuses: Callable[[Point], bool] = lambda _: False
@@ -67,7 +67,7 @@ class FakeTracking:
 
 @dataclass
 class FakeSpooler:
-    """What was spooled, each content once, as the spool's index sees to it."""
+    """The spooled objects, each content once, as the spool's index ensures."""
 
     objects: list[DataObject] = field(default_factory=list)
     has_unsent: bool = False

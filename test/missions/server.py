@@ -1,4 +1,4 @@
-"""What a real MLflow server and a real S3 server hold of a mission."""
+"""The content of a real MLflow server and a real S3 server for a mission."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FOREIGN: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_')
 
 
 def until(found: Callable[[], Any], what: str, seconds: float = 120.0) -> Any:
-    """What it finds; fails after a while."""
+    """The first true result; fails after a deadline."""
     end = time.monotonic() + seconds
     while not (answer := found()):
         assert time.monotonic() < end, f'not within {seconds:g} s: {what}'
@@ -33,7 +33,7 @@ def until(found: Callable[[], Any], what: str, seconds: float = 120.0) -> Any:
 
 
 def complete(home: Path, count: int = 1) -> bool:
-    """Whether so many missions are there and all of them are sent."""
+    """Whether there are this many missions and all are sent."""
     found = [folder.sent().complete for folder in missions(home)]
     return len(found) >= count and all(found)
 
@@ -61,7 +61,7 @@ class Server:
         return MlflowClient(self.tower.tracking_uri)
 
     def runs(self, command: str) -> list[Any]:
-        """By its command, which each test has of its own."""
+        """The runs with this command, which is unique to each test."""
         experiment = self.client.get_experiment_by_name('thor_missions')
         if experiment is None:
             return []
@@ -82,7 +82,7 @@ class Server:
         return found
 
     def keys(self, prefix: str, bucket: str = 'sensor-data') -> Counter[str]:
-        """What the store holds below a prefix."""
+        """The keys in the store below a prefix."""
         store = S3Store(self.tower.store_settings(), UploadSettings())
         store.open()
         try:

@@ -1,4 +1,4 @@
-"""Which mission is active, as its folder tells."""
+"""The active mission, found by its folder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_newest_of_several_is_active(tmp_path: Path) -> None:
 
 
 def test_a_mission_that_is_being_made_is_not_over(tmp_path: Path) -> None:
-    """Between the folder, the journal, the lock and the first record it is looked at again."""
+    """Until the folder has a locked journal with a first record, it is checked again."""
     finder = MissionFinder(tmp_path, 'thor')
     folder = new_folder(tmp_path, 'patrol', 1)
     assert finder.active() is None

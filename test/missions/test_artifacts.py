@@ -1,4 +1,4 @@
-"""Each artifact is in the run as its own, whatever it is called; one that the server does not take delays no other."""
+"""Each artifact arrives in the run separately, whatever its name; one that the server refuses delays no other."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ LONG = ('x' * 251 + '.txt', 'x' * 250 + 'y.txt', '巡' * 85, '探' * 85, '#' * 2
 
 
 def original(name: str) -> str:
-    """What a name that was changed was before."""
+    """The original of a changed name."""
     found = re.sub(rb'=([0-9A-F]{2})', lambda match: bytes.fromhex(match[1].decode()), name.encode())
     return found.decode('utf-8', 'surrogateescape')
 
@@ -75,7 +75,7 @@ def test_two_names_never_become_one(one: str, other: str) -> None:
 
 
 def test_long_names_stay_apart() -> None:
-    """What is longer than a file's name may be once it is changed has a hash, and keeps its extension."""
+    """A name that becomes too long for a file when it is changed gets a hash, and keeps its extension."""
     names = [f'{"#" * length}{end}.png' for length in (84, 85, 200, 250) for end in ('a', 'b')]
     found = [artifact_name(name) for name in names]
     assert len(set(found)) == len(names)
@@ -145,7 +145,7 @@ def test_every_name_reaches_the_run_through_the_server(server: Server, warm_home
 def test_every_name_reaches_a_store_without_a_server(
     store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
-    """Artifacts that lie in a folder, or in S3 directly."""
+    """Artifacts in a folder, or directly in S3."""
     monkeypatch.setenv('MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR', 'false')
     uri = f'sqlite:///{tmp_path}/mlflow.db'
     tracking = MlflowTracking(uri, 'names', None if store == 's3' else tmp_path / 'artifacts')
@@ -181,7 +181,7 @@ def deliver(folder: MissionFolder, tracking: Any, rounds: int = 1000) -> Deliver
 
 
 class Picky(FakeTracking):
-    """A server that does not take some artifacts."""
+    """A server that refuses some artifacts."""
 
     def __init__(self, takes: Callable[[str], bool], error: Callable[[], Exception]) -> None:
         super().__init__()
@@ -209,7 +209,7 @@ OTHERS = {'b', 'c', 'd', 'e', 'events.jsonl', 'summary.json'}
 
 
 def test_what_the_server_refuses_is_counted_with_its_reason(folder: MissionFolder) -> None:
-    """It is skipped once the server took others; the mission is complete, and its report says what is missing and why."""
+    """It is skipped once the server accepts others; the mission is complete, and its report contains what is missing and why."""
     tracking = Picky(lambda name: name != 'bad', lambda: TrackingUnavailable('404 for bad', remedy='', of_object=True))
     assert deliver(folder, tracking).sent.complete
     assert set(tracking.artifacts) == OTHERS
@@ -239,7 +239,7 @@ def test_what_fails_for_another_reason_delays_no_other(folder: MissionFolder, er
 
 
 def test_a_server_that_takes_nothing_is_not_believed(folder: MissionFolder) -> None:
-    """A proxy that answers 404 to everything says nothing of an artifact: all of them wait for the server."""
+    """A proxy that answers 404 to everything does not refuse an artifact: all of them wait for the server."""
     away = True
     tracking = Picky(lambda _: not away, lambda: TrackingUnavailable('404', remedy='', of_object=True))
     assert not deliver(folder, tracking, 50).sent.complete
@@ -250,7 +250,7 @@ def test_a_server_that_takes_nothing_is_not_believed(folder: MissionFolder) -> N
 
 
 def test_a_restart_in_between_loses_none(folder: MissionFolder) -> None:
-    """What waits behind others is not taken for sent."""
+    """Artifacts that wait behind others do not count as sent."""
     tracking = Picky(lambda name: name != 'bad', lambda: TrackingUnavailable('500', remedy=''))
     deliver(folder, tracking, 20)
     assert folder.sent().artifacts < folder.sent().metrics
@@ -310,7 +310,7 @@ def test_an_s3_server_s_answer_is_recognized(monkeypatch: pytest.MonkeyPatch, tm
 
 @pytest.mark.parametrize('where', ['..', '../x', '/x', '.', 'a//b', 'a/', './a', 'a/../b', 'x' * 251, 'a\0b', 3])
 def test_a_folder_that_leads_elsewhere_is_refused_at_the_call(tmp_path: Path, where: Any) -> None:
-    """And counted, as MLflow would refuse it."""
+    """It is refused and counted, because MLflow would refuse it."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_artifact(__file__, where)

@@ -1,4 +1,4 @@
-"""A spool whose index somebody else holds for seconds: what an agent logs is not delayed by it, only its delivery is."""
+"""A spool whose index another process locks for seconds: this delays only the delivery, not the calls of an agent."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def log(logger: MissionDataLogger, first: int) -> list[float]:
 
 @pytest.mark.long('a second of CPU or more')
 def test_a_busy_index_delays_the_delivery_and_no_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All calls return while it is held, in the time that they take anyway; the sender waits, and goes on once it is free."""
+    """All calls return as fast as usual while it is locked; the sender waits, and continues when it is free."""
     settings = Settings.load({'spool.min_free_bytes': 0}, {'SHADOWHOUND_HOME': str(tmp_path)})
     clock = SystemClock.of_this_machine()
     with closing(Spool(settings.spool_path, settings.spool, clock, 'thor')) as spool:

@@ -1,4 +1,4 @@
-"""What an agent delivers without a node is in the catalogue, and a node's frames say where the robot was."""
+"""Objects that an agent delivers without a node are in the catalog, and a node's frames have the pose of the robot."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_an_agent_alone_writes_the_catalogue(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('is_hastened', [True, False])
 def test_the_sender_stays_until_the_last_row_is_written(tmp_path: Path, is_hastened: bool) -> None:
-    """For a period of the catalog at most, or some seconds after a mission's end: nobody else would write it."""
+    """For a period of the catalog at most, or some seconds after a mission's end: no other process would write it."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_camera_frame(b'\xff\xd8one', 1)

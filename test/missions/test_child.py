@@ -33,7 +33,7 @@ def home(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def host(tmp_path: Path) -> Path:
-    """A program that embeds Python, and writes down when it is started."""
+    """A program that embeds Python, and records each time it is started."""
     return program(tmp_path / 'bin/my_robot_app', tmp_path / 'started')
 
 
@@ -105,7 +105,7 @@ def test_without_an_interpreter_missions_are_journaled(
 def test_an_interpreter_that_cannot_import_us_is_not_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is said once, with the log that has the reason."""
+    """It is logged once, with the path of the log that has the reason."""
     monkeypatch.setattr(child, 'PACKAGE', str(tmp_path))
     monkeypatch.setattr(child, 'interpreter', lambda: REAL)
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
@@ -158,7 +158,7 @@ def test_the_sender_loads_nothing_until_it_is_woken(home: Path, tmp_path: Path, 
     {'frame_artifact_every_s': None}, {'frame_artifact_every_s': float('nan')},
 ])  # fmt: skip
 def test_the_constructor_raises_setting_errors_only(arguments: dict[str, Any]) -> None:
-    """For any argument that it cannot work with."""
+    """For any invalid argument."""
     with pytest.raises(SettingError, match=next(iter(arguments)) if arguments != {'home': '~nobody-here/x'} else 'HOME'):
         MissionDataLogger(**arguments)
 
@@ -179,7 +179,7 @@ def test_an_endpoint_that_no_client_can_use_is_an_invalid_setting(
 
 
 def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An absolute home works all the same, a relative one is a setting that cannot be used."""
+    """An absolute home still works; a relative one is an invalid setting."""
     gone = tmp_path / 'gone'
     gone.mkdir()
     monkeypatch.chdir(gone)
@@ -196,7 +196,7 @@ def test_the_working_directory_was_deleted(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_no_thread_can_be_started(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mission is logged all the same, and synced when the logger is closed."""
+    """The mission is still logged, and synced when the logger is closed."""
 
     def refuse(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
@@ -228,7 +228,7 @@ print(run_id)
     ('sqlite:///mlflow.db', 'mlflow.db'), ('file:mlruns', 'mlruns'), ('./mlruns', 'mlruns'), ('mlruns', 'mlruns'),
 ])  # fmt: skip
 def test_relative_paths_are_of_the_agent_s_folder(tmp_path: Path, home: Path, uri: str, made: str) -> None:
-    """A store for MLflow, a home, and PYTHONPATH; modules that lie there do not replace Python's own."""
+    """A store for MLflow, a home, and PYTHONPATH; modules in the agent's folder do not replace Python's own."""
     work = tmp_path / 'work'
     (work / 'agent').mkdir(parents=True)
     (work / 'agent/go.py').write_text(AGENT)

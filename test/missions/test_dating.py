@@ -1,4 +1,4 @@
-"""Missions of a robot that starts in 1970 and learns the time later, or never: all that they log has one date, the right one."""
+"""Missions of a robot that starts in 1970 and learns the time later, or never: all their records have the same, correct date."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fly(home: Path, clocks: Clocks, *, is_set_meanwhile: bool = False) -> Missio
 
 @pytest.mark.parametrize('step_s', [-3600, 3600])
 def test_a_mission_takes_as_long_as_it_does(tmp_path: Path, clocks: Clocks, step_s: int) -> None:
-    """A clock that is set back or forward in the middle of it changes when it ended, and not how long it took."""
+    """A clock that is set back or forward during a mission changes its end time, but not its duration."""
     clocks.set(NOON_NS)
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
@@ -70,7 +70,7 @@ def sender(home: Path, clocks: Clocks, tracking: FakeTracking, spooler: FakeSpoo
 
 
 def check(tracking: FakeTracking, spooler: FakeSpooler, folder: MissionFolder) -> None:
-    """All of it has the date that it should have."""
+    """Everything has the expected date."""
     noon_ms = NOON_NS // MS
     assert tracking.names[folder.mission_id] == f'{NAME} {noon_ms - 10_000}'
     assert tracking.params['timestamp'] == '2025-10-18T11:59:50+00:00'
@@ -82,7 +82,7 @@ def check(tracking: FakeTracking, spooler: FakeSpooler, folder: MissionFolder) -
 
 
 def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
-    """Nothing of it is sent while the clock is in 1970, which the report says; then run, points and keys have the right time."""
+    """Nothing is sent while the clock is in 1970, and the report states this; then run, points and keys have the correct time."""
     folder, tracking, spooler = fly(tmp_path, clocks), FakeTracking(), FakeSpooler()
     replay = sender(tmp_path, clocks, tracking, spooler)
     assert not replay.step()
@@ -99,7 +99,7 @@ def test_a_mission_waits_for_its_date(tmp_path: Path, clocks: Clocks) -> None:
 
 
 def test_the_clock_is_set_in_the_middle(tmp_path: Path, clocks: Clocks) -> None:
-    """What was logged before is dated like what was logged after, and the duration is what it was."""
+    """Records from before and after the setting have consistent times, and the duration is correct."""
     folder, tracking, spooler = fly(tmp_path, clocks, is_set_meanwhile=True), FakeTracking(), FakeSpooler()
     replay = sender(tmp_path, clocks, tracking, spooler)
     while replay.step():
@@ -122,7 +122,7 @@ def test_a_date_is_given_once(tmp_path: Path, clocks: Clocks) -> None:
 
 
 def test_a_boot_that_is_over(tmp_path: Path, clocks: Clocks) -> None:
-    """Where the node noted the clock of that boot, that dates it; else nobody will ever know, and it goes as it is."""
+    """If the node recorded the clock of that boot, it dates the mission; otherwise the mission is sent undated."""
     folder = fly(tmp_path, clocks)
     later = Clocks(boot_id='later')
     later.set(NOON_NS + 3600 * SECOND)
@@ -141,7 +141,7 @@ def test_a_boot_that_is_over(tmp_path: Path, clocks: Clocks) -> None:
 
 
 def test_a_clock_that_is_never_set(tmp_path: Path, clocks: Clocks) -> None:
-    """After ``clock.hold_s`` the mission goes with the times that it has."""
+    """After ``clock.hold_s`` the mission is sent with the times that it has."""
     fly(tmp_path, clocks)
     tracking = FakeTracking()
     replay = sender(tmp_path, clocks, tracking, FakeSpooler())

@@ -1,4 +1,4 @@
-"""The delivery of a mission to a server that fails at any moment: in order, once to effect, nothing left out."""
+"""The delivery of a mission to a server that fails at any moment: in order, effectively exactly once, and complete."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fly(home: Path, points: int = 3, frames: int = 2, *, command: str = 'go roun
 
 
 def work(delivery: Delivery) -> bool:
-    """One round; whether all of it is done."""
+    """One round; returns whether everything is sent."""
     worked = [delivery.track(), delivery.attach(), delivery.spool()]
     return delivery.complete() or not any(worked)
 
@@ -107,7 +107,7 @@ def test_the_summary_tells_the_mission(tmp_path: Path) -> None:
     assert summary['start'] < summary['end']
 
 
-def test_a_long_command_is_whole_as_an_artifact(tmp_path: Path) -> None:
+def test_a_long_command_is_complete_as_an_artifact(tmp_path: Path) -> None:
     """The param is cut where MLflow would cut it."""
     tracking = FakeTracking()
     deliver(fly(tmp_path, command='x' * 7000), tracking, FakeSpooler())
@@ -116,7 +116,7 @@ def test_a_long_command_is_whole_as_an_artifact(tmp_path: Path) -> None:
 
 
 def test_batches_are_large_and_never_too_large(tmp_path: Path) -> None:
-    """A backlog goes in batches of nearly a thousand points, none above."""
+    """A backlog is sent in batches of nearly a thousand points, but not more."""
     tracking = FakeTracking()
     deliver(fly(tmp_path, points=3000), tracking, FakeSpooler())
     assert max(tracking.batches) <= 1000
@@ -131,7 +131,7 @@ MORE = (pytest.param(seed, marks=pytest.mark.long('more of the same')) for seed 
 @pytest.mark.long('a second of CPU or more')
 @pytest.mark.parametrize('seed', [*range(SOME), *MORE])
 def test_any_failure_changes_nothing(tmp_path: Path, seed: int) -> None:
-    """Requests and answers get lost, the replayer dies in between: afterwards all is there, each thing once to effect."""
+    """Requests and answers get lost, the replayer dies in between: afterwards all has arrived, effectively exactly once."""
     rng = random.Random(seed)
     folder = fly(tmp_path, points=1200, frames=9)
     tracking = FakeTracking(fail=lambda _: rng.random() < 0.3)
@@ -169,7 +169,7 @@ def test_the_run_is_looked_up_after_a_lost_answer(tmp_path: Path) -> None:
     assert list(tracking.runs) == [folder.mission_id]
 
 
-def test_what_the_server_refuses_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_the_server_refuses_is_skipped_and_counted(tmp_path: Path) -> None:
     """One bad point does not keep the others of its batch."""
     folder = fly(tmp_path, points=50)
     tracking = FakeTracking(refuses=lambda point: point.key == 'battery_pct' and point.step == 33)
@@ -180,7 +180,7 @@ def test_what_the_server_refuses_is_left_out_and_counted(tmp_path: Path) -> None
 
 
 def test_a_deleted_run_is_not_made_again(tmp_path: Path) -> None:
-    """Whoever deletes a run does not want it: the mission stops, and says so."""
+    """The user who deletes a run does not want it: the mission stops, and reports why."""
     tracking = FakeTracking(gone=True)
     delivery = Delivery(fly(tmp_path), tracking, FakeSpooler())  # type: ignore[arg-type]
     with pytest.raises(TrackingRefused):
@@ -231,8 +231,8 @@ def test_a_mission_of_a_dead_agent_ends_as_killed(tmp_path: Path) -> None:
     assert b'torn' not in folder.journal.read_bytes()
 
 
-def test_a_mission_of_a_living_agent_goes_on(tmp_path: Path) -> None:
-    """What is there is sent; the end is the agent's own business."""
+def test_a_mission_of_a_running_agent_continues(tmp_path: Path) -> None:
+    """The existing records are sent; only the agent writes the end."""
     folder = abandon(tmp_path)
     content = folder.journal.read_bytes().rpartition(b'\n')[0] + b'\n'
     folder.journal.unlink()
@@ -251,7 +251,7 @@ def test_a_mission_of_a_living_agent_goes_on(tmp_path: Path) -> None:
     assert tracking.finished == [('run0', 'FINISHED', 10**12)]
 
 
-def test_a_measured_distance_stands_where_zero_is_stated(tmp_path: Path) -> None:
+def test_a_measured_distance_replaces_a_stated_zero(tmp_path: Path) -> None:
     """The agent's failure path states zeros; its positive numbers win."""
     for stated, expected in ((0.0, 7.5), (9.0, 9.0)):
         home = tmp_path / str(stated)
@@ -288,7 +288,7 @@ def test_a_frame_that_is_gone_is_counted(tmp_path: Path) -> None:
 
 
 def test_frames_do_not_wait_for_a_run(tmp_path: Path) -> None:
-    """While Tower is away they are held in the spool, out of the mission's folder; with the run they get their names."""
+    """While Tower is unreachable, the spool holds them outside the mission's folder; with the run they get their keys."""
     folder = fly(tmp_path)
     tracking, spooler = FakeTracking(fail=lambda name: name == 'run_of'), FakeSpooler()
     delivery = Delivery(folder, tracking, spooler)  # type: ignore[arg-type]

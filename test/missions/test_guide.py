@@ -1,4 +1,4 @@
-"""The code of the integration guide, as it stands there, against this package and a real MLflow server."""
+"""The verbatim code of the integration guide, against this package and a real MLflow server."""
 
 from __future__ import annotations
 
@@ -311,7 +311,7 @@ logger.log_trajectory('trajectory.csv')
 logger.end_mission(True, 12.5, 60.0)
 print(run_id)
 """
-"""What calls the guide's own sketch, in a process of its own: MLflow's fluent client leaves threads behind."""
+"""What calls the guide's own sketch, in a separate process: MLflow's fluent client leaves threads behind."""
 RUN_TRAINING: Final = """
 import sys, types
 torch = types.ModuleType('torch')
@@ -320,7 +320,7 @@ sys.modules['torch'] = torch
 model = types.SimpleNamespace(state_dict=lambda: 'weights')
 exec(sys.argv[1], {'train_model': lambda: model})
 """
-"""The training itself is left out: torch stands for its one call."""
+"""The training is replaced: torch stands for its one call."""
 
 
 def in_a_process(program: str, *arguments: str, folder: Path, **environ: str) -> subprocess.CompletedProcess[str]:

@@ -1,4 +1,4 @@
-"""The journal: what is written stays readable, whatever happens to the rest."""
+"""The journal: written records stay readable, whatever happens to others."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def records(path: Path, offset: int = 0) -> list[object]:
 
 
 def test_it_is_read_as_it_was_written(journal: Journal) -> None:
-    """Records come back in order, floats to the last bit, and reading goes on at any line's end."""
+    """Records come back in order, floats to the last bit, and reading continues at the end of any line."""
     said = [{'k': 'metrics', 'm': {'a': 0.1 + 0.2}, 't': 1 << 60}, {'k': 'event', 'name': 'Küche\n\0'}, {'k': 'end'}]
     for record in said:
         journal.append(record)
@@ -42,7 +42,7 @@ def test_it_is_read_as_it_was_written(journal: Journal) -> None:
 
 
 def test_a_torn_line_costs_itself(journal: Journal) -> None:
-    """A line that ends in the middle is left out until it is whole; one that never becomes whole is damaged."""
+    """An incomplete line is skipped until it is complete; one that never becomes complete is damaged."""
     journal.append({'a': 1})
     with journal.path.open('ab') as file:
         file.write(line_of({'b': 2})[:-4])
@@ -53,8 +53,8 @@ def test_a_torn_line_costs_itself(journal: Journal) -> None:
     assert records(journal.path) == [{'a': 1}, None, {'c': 3}]
 
 
-def test_a_record_after_a_full_disk_is_whole(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a full disk cut off in the middle of a record does not swallow the next one."""
+def test_a_record_after_a_full_disk_is_complete(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A record that a full disk cut off does not damage the next one."""
     journal.append({'a': 1})
     write = os.write
     monkeypatch.setattr(os, 'write', lambda descriptor, data: write(descriptor, data[:7]))
@@ -96,7 +96,7 @@ def test_threads_share_it(journal: Journal) -> None:
 
 
 def test_a_living_writer_is_known(journal: Journal) -> None:
-    """As long as the writer has it open nobody may finish it; afterwards anybody may."""
+    """No process can finish the journal while its writer has it open; afterwards any process can."""
     with abandoned(journal.path) as descriptor:
         assert descriptor is None
     journal.close()
@@ -149,7 +149,7 @@ def test_the_last_record_replaces_what_is_torn(journal: Journal) -> None:
 
 
 def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the disk is busy with a sync, records go on."""
+    """Records are appended while the disk is busy with a sync."""
     entered, leave = threading.Event(), threading.Event()
     monkeypatch.setattr(os, 'fsync', lambda _: (entered.set(), leave.wait(60)))
     thread = threading.Thread(target=journal.sync)
@@ -164,7 +164,7 @@ def test_syncing_does_not_hold_up_writers(journal: Journal, monkeypatch: pytest.
 
 
 def test_nobody_else_reads_it(journal: Journal) -> None:
-    """What a robot did is its owner's business."""
+    """Only the owner can read what a robot did."""
     assert journal.path.stat().st_mode & 0o077 == 0
 
 

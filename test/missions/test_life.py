@@ -1,4 +1,4 @@
-"""A logger's life: its thread and its disk, forks, and how it ends."""
+"""The lifecycle of a logger: its thread and files, forks, and closing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _in_a_fork(logger: MissionDataLogger) -> None:
 
 @pytest.mark.filterwarnings('ignore:This process .* is multi-threaded')
 def test_a_fork_has_no_mission(tmp_path: Path) -> None:
-    """A forked child's calls do nothing, and the parent's mission goes on."""
+    """A forked child's calls do nothing, and the parent's mission continues."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         child = multiprocessing.get_context('fork').Process(target=_in_a_fork, args=(logger,))
@@ -60,7 +60,7 @@ def test_a_fork_touches_no_file_of_the_mission(tmp_path: Path) -> None:
 
 
 def test_what_comes_after_the_end_leaves_no_file(tmp_path: Path) -> None:
-    """Nobody would ever send it."""
+    """It would never be sent."""
     with journalling(tmp_path) as logger:
         with logger.mission('patrol', '') as mission:
             pass
@@ -81,7 +81,7 @@ def test_closing_ends_the_mission_as_killed(tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_a_robot_s_name_is_checked_at_once(tmp_path: Path) -> None:
-    """A name that cannot lead a key is the one thing that is refused, and before any mission."""
+    """The constructor refuses a name that cannot be the first part of a key, before any mission."""
     with pytest.raises(SettingError, match='robot'):
         MissionDataLogger(robot='../thor', home=tmp_path, replay=False)
 
@@ -117,7 +117,7 @@ def test_what_was_logged_reaches_the_disk_within_a_quarter_of_a_second(tmp_path:
 
 
 def test_frames_have_files_that_were_made_ahead(tmp_path: Path) -> None:
-    """What is not needed of them goes at the end, and a frame that comes too soon gets a file all the same."""
+    """What is not needed of them goes at the end, and a frame that arrives too early still gets a file."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         (folder,) = missions(tmp_path)
@@ -132,7 +132,7 @@ def test_frames_have_files_that_were_made_ahead(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_full_at_the_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mission goes on unlogged, and the journal that took no record is closed."""
+    """The mission continues unlogged, and the journal without a record is closed."""
 
     def full(*_: object) -> int:
         raise OSError(28, 'No space left on device')

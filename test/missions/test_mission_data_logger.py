@@ -71,7 +71,7 @@ def fail(mission: Mission) -> None:
     raise ZeroDivisionError('oh')
 
 
-def test_an_exception_ends_the_mission_and_goes_on(tmp_path: Path) -> None:
+def test_an_exception_ends_the_mission_and_propagates(tmp_path: Path) -> None:
     """What is raised inside ``with`` is recorded, ends the mission as FAILED, and reaches the agent unchanged."""
     with journalling(tmp_path) as logger:
         with pytest.raises(ZeroDivisionError, match='oh'), logger.mission('explore', 'up') as mission:
@@ -83,7 +83,7 @@ def test_an_exception_ends_the_mission_and_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_with_that_ends_well_is_a_success(tmp_path: Path) -> None:
-    """Leaving ``with`` ends the mission as FINISHED, unless it said its end itself."""
+    """Leaving ``with`` ends the mission as FINISHED, unless the agent has ended it."""
     with journalling(tmp_path) as logger:
         with logger.mission('a', ''):
             pass
@@ -123,7 +123,7 @@ class Mute(Exception):
     'value', [math.nan, math.inf, None, 'twelve', '12', [1, 2], object(), 10**400, pytest.param(10**5000, id='huge'), Mute()]
 )
 def test_what_is_no_number_is_counted(tmp_path: Path, value: Any) -> None:
-    """It is left out and counted, and the rest of the call stands."""
+    """The invalid value is skipped and counted, and the rest of the call is logged."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
         logger.log_robot_state(value, 40.0, 1)
@@ -165,7 +165,7 @@ def test_what_is_no_file_is_counted(tmp_path: Path, path: Any) -> None:
      (None, 'None'), ('a..b', 'a_b')],
 )  # fmt: skip
 def test_a_hostile_type_is_made_safe(tmp_path: Path, given: Any, named: str) -> None:
-    """The mission goes on: its name is the nearest that can be one, its type stands as it was given."""
+    """The mission continues: its name is the nearest valid one, and its type is unchanged."""
     with journalling(tmp_path) as logger:
         mission_id = logger.start_mission(given, 'x')
     assert re.fullmatch(re.escape(named) + r'_\d{8}_\d{6}_[0-9a-f]{8}', mission_id)
@@ -194,7 +194,7 @@ def test_events_hold_anything_but_files(tmp_path: Path) -> None:
 
 
 def test_what_has_no_text_is_named_by_its_class(tmp_path: Path) -> None:
-    """In an event, as a name, a command, or as the exception that ends a mission, which goes on as it was raised."""
+    """In an event, as a name, a command, or as the exception that ends a mission, which propagates unchanged."""
 
     def fly(logger: MissionDataLogger, mute: Any) -> None:
         with logger.mission('patrol', mute) as mission:
@@ -212,7 +212,7 @@ def test_what_has_no_text_is_named_by_its_class(tmp_path: Path) -> None:
 def test_a_full_disk_does_not_reach_the_mission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What cannot be written is warned of once; when there is room again the journal goes on."""
+    """One warning is logged, and the journal continues when there is free space again."""
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')
 
@@ -241,7 +241,7 @@ def test_little_room_is_kept_for_the_journal(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_home_that_cannot_be_written_costs_the_log_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The agent gets an id and goes on; the log says that nothing is logged."""
+    """The agent gets an id and continues; the log contains that the mission is not logged."""
     (tmp_path / 'file').write_text('')
     with journalling(tmp_path / 'file') as logger:
         assert logger.start_mission('patrol', '').endswith('_unlogged')

@@ -45,7 +45,7 @@ def environ(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
 
 @pytest.fixture
 def flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[MissionFolder]:
-    """A mission of each type, all of one second, each with a trajectory of its own."""
+    """A mission of each type, all in the same second, each with a different trajectory."""
     for module in (mission, recorder):
         monkeypatch.setattr(module, 'now_ns', lambda _: NOON_NS)
     for given in TYPES:
@@ -64,7 +64,7 @@ def first(folder: MissionFolder) -> dict[str, object]:
 def test_every_object_and_row_has_the_agent_s_spelling(
     environ: dict[str, str], tmp_path: Path, flown: list[MissionFolder]
 ) -> None:
-    """Types with one key-safe form have keys of their own, each with its own content; catalogue and store have the spelling."""
+    """Types with the same safe form get different keys, each with its own content; catalog and store have the spelling."""
     settings = Settings.load({'spool.min_free_bytes': 0, 'robot': ROBOT}, environ)
     with closing(Spooler(settings, SystemClock('boot'))) as spooler:
         for number, folder in enumerate(flown):

@@ -75,7 +75,7 @@ def test_a_mission_is_in_mlflow_and_in_the_store(server: Server, warm_home: Path
 
 @pytest.mark.long('seconds of a heartbeat')
 def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> None:
-    """What was logged is in the run before the mission ends, and a mission of another logger has a run of its own."""
+    """What was logged is in the run before the mission ends, and a mission of another logger has a separate run."""
     one, two = (MissionDataLogger(home=warm_home, start_timeout_s=60.0) for _ in range(2))
     try:
         first, second = one.start_mission('patrol', 'live 1'), two.start_mission('patrol', 'live 2')
@@ -94,7 +94,7 @@ def test_a_run_lives_while_its_mission_does(server: Server, warm_home: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.long('a kill')
-def test_tower_away_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
+def test_tower_unreachable_for_the_whole_mission(server: Server, home: Path, tmp_path: Path) -> None:
     """No call waits for it; when it is back, after the robot's next start, the run is whole with the original times."""
     server.wire.set(HANG)
     logger = MissionDataLogger(home=home, start_timeout_s=0.3)
@@ -154,7 +154,7 @@ def test_a_killed_agent_s_mission(server: Server, home: Path, tmp_path: Path) ->
 
 @pytest.mark.long('an outage of some seconds')
 def test_a_wrong_password_costs_no_mission(server: Server, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mission waits and it is said why; once the right one is in ~/.mlflow/credentials it is sent, without a restart."""
+    """The mission waits, and reports the reason; once the right one is in ~/.mlflow/credentials it is sent, without a restart."""
     user, password = (os.environ[name] for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'))
     for name in ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD'):
         monkeypatch.delenv(name)
@@ -192,15 +192,15 @@ def test_a_second_run_is_closed_where_it_may_not_be_deleted(server: Server) -> N
 
 
 def test_an_experiment_that_a_robot_may_not_make(server: Server) -> None:
-    """It is waited for, and said who makes it."""
+    """The mission waits for it, and the remedy names who creates it."""
     with pytest.raises(TrackingUnavailable, match=r'^there is no experiment of_another') as caught:
         MlflowTracking(server.wire.url, 'of_another').run_of('patrol_1', 'patrol', 1, {})
     assert 'make tower-secrets' in caught.value.remedy
 
 
 def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where artifacts lie in S3 the error names the missing variable, and with it they arrive."""
-    uri = f'file://{tmp_path}/mlruns'  # a Tower's own server lets nobody choose
+    """If artifacts are in S3, the error names the missing variable, and with it they arrive."""
+    uri = f'file://{tmp_path}/mlruns'  # a Tower's own server does not allow this
     MlflowTracking(uri, '').open()
     type(server.client)(uri).create_experiment('in s3', artifact_location='s3://sensor-data/mlflow')
     tracking = MlflowTracking(uri, 'in s3')
@@ -223,7 +223,7 @@ def test_artifacts_in_s3(server: Server, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_file_that_a_proxy_never_takes_is_refused(server: Server, tmp_path: Path) -> None:
-    """Tried again for ever it would hold up all that follows it."""
+    """If it were retried indefinitely, it would block everything after it."""
     tracking = MlflowTracking(server.wire.url, 'thor_missions')
     run = tracking.run_of('patrol_1', 'patrol', 1, {})
     path = tmp_path / 'map.png'

@@ -131,7 +131,7 @@ def test_an_experiment_is_created_once(server: Server, home: Path, tmp_path: Pat
 @pytest.mark.seaweedfs
 @pytest.mark.parametrize('mode', [REFUSE, (200, 'Portal'), (503, 'Broken')])
 def test_without_a_server_the_mission_starts_at_once(server: Server, home: Path, mode: str | tuple[int, str]) -> None:
-    """With its own id, and as soon as it is known that there is none."""
+    """It has its own id, and starts as soon as the server is known to be unreachable."""
     server.wire.set(mode)
     logger = MissionDataLogger(home=home, start_timeout_s=1.0)
     began = time.monotonic()
@@ -143,7 +143,7 @@ def test_without_a_server_the_mission_starts_at_once(server: Server, home: Path,
 
 @pytest.mark.seaweedfs
 @pytest.mark.long('a request that is given up')
-def test_a_server_that_hangs_holds_up_no_mission(server: Server, home: Path) -> None:
+def test_a_server_that_hangs_blocks_no_mission(server: Server, home: Path) -> None:
     """The call takes as long as it says; the run is made once, when the server is back."""
     server.wire.set(HANG)
     logger = MissionDataLogger(home=home, start_timeout_s=0.3)
@@ -157,7 +157,7 @@ def test_a_server_that_hangs_holds_up_no_mission(server: Server, home: Path) -> 
 
 
 @pytest.mark.seaweedfs
-def test_a_run_that_was_not_noted_is_found(server: Server, warm_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_was_not_saved_is_found(server: Server, warm_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As after a kill between the server's answer and the disk: the sender finds it by the mission's id."""
     monkeypatch.setattr(MissionFolder, 'set_run', lambda *_: None)
     logger = MissionDataLogger(home=warm_home, start_timeout_s=PATIENCE_S)
@@ -208,7 +208,7 @@ class Clock:
 
 
 def test_the_sender_waits_for_the_agent_s_request(folder: MissionFolder) -> None:
-    """It sends nothing and creates nothing meanwhile, then uses the agent's run."""
+    """Until then it sends and creates nothing, and then uses the agent's run."""
     new, tracking = NewRun(folder), FakeTracking()
     delivery = Delivery(folder, tracking, FakeSpooler())  # type: ignore[arg-type]
     for _ in range(3):
@@ -239,7 +239,7 @@ def test_the_sender_creates_it_where_the_agent_could_not(folder: MissionFolder, 
 
 
 def test_the_sender_stays_for_the_agent_s_request(tmp_path: Path, folder: MissionFolder) -> None:
-    """The agent may have closed its logger meanwhile: what its request leaves is still to be sent."""
+    """Even if the agent has closed its logger before its request ends, the mission is still sent."""
     new, tracking = NewRun(folder), FakeTracking()
     replay = Replay(tmp_path, tracking, FakeSpooler(), FakePictures())  # type: ignore[arg-type]
     replay.step()

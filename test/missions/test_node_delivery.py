@@ -50,7 +50,7 @@ def deliver(folder: MissionFolder, tracking: FakeTracking, spooler: FakeSpooler,
 
 
 def newest(tracking: FakeTracking) -> dict[str, float]:
-    """As MLflow shows them: the value of the greatest step."""
+    """The values that MLflow shows: those with the highest step."""
     return {point.key: point.value for point in sorted(tracking.points, key=lambda point: (point.step, point.time_ms))}
 
 
@@ -65,7 +65,7 @@ def flown(home: Path, distance_m: float = 0.0) -> ActiveMission:
     return node_log.mission
 
 
-def test_an_agent_that_only_starts_and_ends_has_a_whole_run(tmp_path: Path) -> None:
+def test_an_agent_that_only_starts_and_ends_has_a_complete_run(tmp_path: Path) -> None:
     """Battery, distance, pose, trajectory and frames are there, in the run and in the store."""
     mission, tracking, spooler = flown(tmp_path), FakeTracking(), FakeSpooler()
     assert deliver(mission.folder, tracking, spooler)
@@ -128,7 +128,7 @@ def test_a_node_that_hangs_does_not_hold_the_end(tmp_path: Path) -> None:
 
 
 def test_the_agents_own_values_win(tmp_path: Path) -> None:
-    """Of a metric that both log the agent's is the newest; frames of both are kept, under numbers of their own."""
+    """Of a metric that both log the agent's is the newest; frames of both are kept, with separate numbers."""
     tracking, spooler = FakeTracking(), FakeSpooler()
     with journalling(tmp_path) as logger:
         logger.start_mission('patrol', '')

@@ -1,4 +1,4 @@
-"""What the node logs beside the agent: in order, of the mission's time, and going on after a restart."""
+"""The node's journal of a mission: in order, within the mission's time, and continued after a restart."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def records(mission: ActiveMission) -> list[dict[str, Any]]:
 
 
 def walk(mission: ActiveMission, seconds: range) -> list[Pose]:
-    """One metre a second."""
+    """One meter per second."""
     return [Pose(mission.start_ns + second * SECOND, float(second), 0.0, 0.5) for second in seconds]
 
 
@@ -63,7 +63,7 @@ def test_poses_of_several_threads_come_into_order(mission: ActiveMission) -> Non
     assert written == [[pose.stamp_ns, pose.x, pose.y, pose.yaw, pose.z] for pose in poses]
 
 
-def test_what_is_of_another_time_is_left_out(mission: ActiveMission) -> None:
+def test_facts_of_another_time_are_skipped(mission: ActiveMission) -> None:
     """Before the start, and at the end after the end."""
     node_log = opened(mission)
     for second in (-1, 1, 9):
@@ -72,7 +72,7 @@ def test_what_is_of_another_time_is_left_out(mission: ActiveMission) -> None:
     assert [(record['m'], record['s']) for record in records(mission)] == [({'battery_pct': 1.0}, 1)]
 
 
-def test_a_second_node_goes_on_where_the_first_was_killed(mission: ActiveMission) -> None:
+def test_a_second_node_continues_where_the_first_was_killed(mission: ActiveMission) -> None:
     """Distance and frames are counted on, and a torn record costs itself alone."""
     first = opened(mission)
     for fact in (*walk(mission, range(5)), Frame(mission.start_ns, JPEG)):
@@ -126,7 +126,7 @@ def test_the_floor_stays_small() -> None:
 def test_a_full_disk_costs_a_warning(
     mission: ActiveMission, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is said once, and nothing is raised."""
+    """It is logged once, and nothing is raised."""
 
     def full(*_: object) -> None:
         raise OSError('no space')
@@ -141,7 +141,7 @@ def test_a_full_disk_costs_a_warning(
 
 
 def test_little_room_costs_frames_alone(mission: ActiveMission, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What comes after one in the same second is journalled all the same."""
+    """Records after a lost frame in the same second are still journaled."""
     node_log = opened(mission)
     monkeypatch.setattr(copies, 'MIN_FREE_BYTES', 1 << 60)
     node_log.add(Frame(mission.start_ns + SECOND, JPEG))

@@ -103,7 +103,7 @@ def test_without_a_node_it_is_delivered(tmp_path: Path, spooler: Spooler, folder
 
 
 def test_beside_a_node_it_is_the_node_s(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """Whoever drains already delivers it."""
+    """The process that drains the spool delivers it."""
     spooler.add(objects(folder, RUN))
     with flock(tmp_path / 'spool' / 'drain.lock', wait=False):
         spooler.drain()
@@ -112,7 +112,7 @@ def test_beside_a_node_it_is_the_node_s(tmp_path: Path, spooler: Spooler, folder
 
 
 def test_what_an_earlier_process_left_is_delivered(tmp_path: Path, spooler: Spooler, folder: MissionFolder) -> None:
-    """A new replayer without a mission of its own empties the spool."""
+    """A new replayer without a mission empties the spool."""
     spooler.add(objects(folder, RUN))
     spooler.close()
     later = Spooler(Settings.load({}, {'SHADOWHOUND_HOME': str(tmp_path)}), SystemClock('boot'))

@@ -1,4 +1,4 @@
-"""How far a robot went, whatever its odometry does."""
+"""The traveled distance, despite errors of odometry."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_drone_is_fast() -> None:
 
 
 def test_a_jump_is_no_way() -> None:
-    """A step faster than the robot is left out, and the way goes on from where it led."""
+    """A step faster than the robot is not counted, and the path continues after it."""
     odometer = walked((0, 0, 0), (1, 1, 0), (2, 100, 0), (3, 101, 0))
     assert (odometer.distance_m, odometer.jumps) == (pytest.approx(2), 1)
 
@@ -69,7 +69,7 @@ def test_slow_walking_at_a_high_rate_is_all_counted() -> None:
 
 
 @pytest.mark.parametrize('x', [math.nan, math.inf])
-def test_what_is_no_pose_is_left_out(x: float) -> None:
+def test_an_invalid_pose_is_skipped(x: float) -> None:
     """Neither NaN nor an earlier time moves it."""
     odometer = walked((0, 0, 0), (1, 1, 0))
     assert not odometer.add(Pose(2 * SECOND, x, 0.0, 0.0, frame_id='odom'))

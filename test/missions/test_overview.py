@@ -1,4 +1,4 @@
-"""What the report of a mission that is not complete says: what it waits for, and what can be done about it."""
+"""The report of an incomplete mission: what it waits for, and the remedy."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_nothing_is_sent_yet(folder: MissionFolder) -> None:
 
 @pytest.mark.usefixtures('sender')
 def test_its_pictures_are_being_made(folder: MissionFolder) -> None:
-    """With every record in the run and no error, which said nothing before."""
+    """Even if every record is in the run and there is no error."""
     delivery = new(folder, make_pictures=lambda *_: None)
     for _ in range(10):
         delivery.track()

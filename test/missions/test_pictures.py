@@ -1,4 +1,4 @@
-"""The pictures of a mission: made of what was logged, each by itself, in a process that the sender does not wait for."""
+"""The pictures of a mission: created independently from the journals, in a process that does not block the sender."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_mission_has_three_pictures(tmp_path: Path) -> None:
 
 
 def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None:
-    """What is wrong is said, and the others are there."""
+    """The note contains the reason, and the other pictures exist."""
     folder = fly(tmp_path, frames=2, broken=1, rows='timestamp,x,y\n1,nan,2\nx,1,2\n')
     folder.floor.write_bytes(b'no array')
     notes = make(folder, 'patrol_1')
@@ -73,7 +73,7 @@ def test_a_picture_that_cannot_be_made_costs_only_itself(tmp_path: Path) -> None
 
 
 def test_a_mission_without_anything_has_no_pictures(tmp_path: Path) -> None:
-    """Nothing is drawn of nothing, and the reasons are told."""
+    """Nothing is drawn without data, and the notes contain the reasons."""
     folder = fly(tmp_path, frames=0, states=1)
     assert make(folder, 'patrol_1') == {
         'camera_summary.jpg': 'not made: no camera frame was sampled', 'trajectory.png': 'not made: no trajectory was logged',
@@ -81,7 +81,7 @@ def test_a_mission_without_anything_has_no_pictures(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_the_node_s_data_stand_in(tmp_path: Path) -> None:
+def test_the_node_s_data_replace_missing_ones(tmp_path: Path) -> None:
     """What the agent did not log is taken from the node, and only that."""
     folder = fly(tmp_path, frames=0, states=3)
     folder.node.files.mkdir(parents=True)
@@ -109,7 +109,7 @@ def test_the_node_s_data_stand_in(tmp_path: Path) -> None:
     ],
 )
 def test_a_trajectory_is_read(tmp_path: Path, text: str, expected: list[tuple[float, float, float]]) -> None:
-    """Seconds, nanoseconds and ISO times; columns in any order; lines without numbers are left out."""
+    """Seconds, nanoseconds and ISO times; columns in any order; lines without numbers are skipped."""
     (tmp_path / 't.csv').write_text(text)
     assert read_path(tmp_path / 't.csv') == expected
 
@@ -126,7 +126,7 @@ def test_a_speed_is_no_noise() -> None:
 
 @pytest.mark.long('a process that imports much')
 def test_a_process_draws(tmp_path: Path) -> None:
-    """Nobody waits for it; its notes stay, and a later sender does not draw again."""
+    """It blocks no process; its notes are kept, and a later sender does not draw again."""
     folder = fly(tmp_path, rows=path())
     here = PictureProcess()
     assert here.make(folder, 'patrol_1') is None
@@ -138,8 +138,8 @@ def test_a_process_draws(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('program', ['no_such_module', 'hang'])
-def test_a_process_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str) -> None:
-    """Whether it dies or hangs: the mission goes on without pictures, and the next one is drawn."""
+def test_a_process_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    """If it exits or hangs, the mission continues without pictures, and the next mission is drawn."""
     hanging = tmp_path / 'hang.py'
     hanging.write_text('import time\ntime.sleep(600)\n')
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))

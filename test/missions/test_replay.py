@@ -36,7 +36,7 @@ from shadowhound_data_logger.missions.replay import (
 
 
 class Now:
-    """Time that passes when told to."""
+    """A clock that the test advances."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -123,8 +123,8 @@ def test_the_newest_mission_comes_first(tmp_path: Path) -> None:
     assert next(iter(tracking.runs)) == newest
 
 
-def test_a_rotten_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """One whose first record is damaged is told of and left, the others are sent."""
+def test_a_corrupt_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A mission whose first record is damaged is reported and skipped; the others are sent."""
     rotten = fly(tmp_path)
     path = tmp_path / MISSIONS / rotten / 'journal'
     path.write_bytes(b'X' + path.read_bytes()[1:])
@@ -137,7 +137,7 @@ def test_a_rotten_mission_does_not_stop_the_others(tmp_path: Path, caplog: pytes
     assert rotten in caplog.text
 
 
-def test_a_mission_that_arrived_long_ago_goes(tmp_path: Path) -> None:
+def test_a_mission_that_arrived_long_ago_is_deleted(tmp_path: Path) -> None:
     """After a month, at the next start; one that is younger or has not arrived stays."""
     old, young = fly(tmp_path), fly(tmp_path)
     replay = new_replay(tmp_path, FakeTracking())
@@ -152,7 +152,7 @@ def test_a_mission_that_arrived_long_ago_goes(tmp_path: Path) -> None:
 
 
 def test_the_default_store_is_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody but its owner reads the database and the artifacts of a home, whatever the umask."""
+    """Only the owner can read the database and the artifacts of a home, whatever the umask."""
     monkeypatch.delenv('MLFLOW_TRACKING_URI', raising=False)
     monkeypatch.setattr('shadowhound_data_logger.missions.replay.MlflowTracking.open', lambda _: None)
     before = os.umask(0)
@@ -164,7 +164,7 @@ def test_the_default_store_is_private(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [oct((tmp_path / name).stat().st_mode & 0o777) for name in ('mlflow.db', 'mlartifacts')] == ['0o600', '0o700']
 
 
-def test_a_deleted_run_is_told(tmp_path: Path) -> None:
+def test_a_deleted_run_is_reported(tmp_path: Path) -> None:
     """Its mission is left alone, with the reason in its report."""
     mission_id = fly(tmp_path)
     replay = new_replay(tmp_path, FakeTracking(gone=True))
@@ -240,8 +240,8 @@ def test_a_second_one_waits_and_ends_with_its_agent(tmp_path: Path) -> None:
         assert waiting.wait(60.0) == 0
 
 
-def test_one_whose_agent_is_gone_makes_way_for_another(tmp_path: Path) -> None:
-    """As soon as somebody waits; while its own agent lives it does not, and a request that hangs ends with its process."""
+def test_one_whose_agent_has_exited_yields_to_another(tmp_path: Path) -> None:
+    """It yields as soon as another sender waits, but not while its own agent runs; a hanging request ends with its process."""
     waiting, ends = tmp_path / 'replay.waiting', threading.Event()
     reader, writer = os.pipe()
     parent = AgentProcess(reader)
@@ -283,7 +283,7 @@ def test_a_corrected_address_is_used_though_an_earlier_sender_is_stuck(tmp_path:
 
 
 def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sender that dies is replaced after a pause, it is not a zombie meanwhile, and none is left after its logger."""
+    """A sender that dies is restarted after a pause, is never a zombie, and does not remain after its logger."""
     monkeypatch.setattr('shadowhound_data_logger.missions.child.RESTART_PAUSE_S', 0.1)
     monkeypatch.setattr('shadowhound_data_logger.missions.child.interpreter', lambda: '/bin/false')
     logger = MissionDataLogger(home=tmp_path, start_timeout_s=0.0)
@@ -297,7 +297,7 @@ def test_the_logger_starts_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize('what', ['journal', 'artifact'])
-def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> None:
+def test_one_that_always_fails_blocks_no_other(tmp_path: Path, what: str) -> None:
     """A journal that the disk does not give back, an artifact that the server never gets: the older missions arrive."""
     for number in range(3):
         older = tmp_path / MISSIONS / fly(tmp_path)
@@ -323,8 +323,8 @@ def test_one_that_always_fails_holds_up_no_other(tmp_path: Path, what: str) -> N
     assert [folder.sent().complete for folder in missions(tmp_path) if folder.path != stuck] == [True] * 3
 
 
-def test_a_mission_that_is_beyond_help_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`missions list` tells the cause, not the log alone."""
+def test_a_mission_that_cannot_be_sent_reports_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`missions list` shows the cause, not only the log."""
     broken = MissionFolder(tmp_path / MISSIONS / fly(tmp_path))
     monkeypatch.setattr(Delivery, 'track', lambda _: 1 / 0)
     replay = new_replay(tmp_path, FakeTracking(), Now())
@@ -333,7 +333,7 @@ def test_a_mission_that_is_beyond_help_says_why(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it says of itself cannot be written: it goes on, for what it sends makes room."""
+    """It continues although it cannot write its state, because sending frees space."""
     fly(tmp_path)
     replay = new_replay(tmp_path, FakeTracking())
 
@@ -350,7 +350,7 @@ def test_a_full_disk_does_not_end_the_sender(tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_mission_that_cannot_be_looked_at_stops_no_other(tmp_path: Path) -> None:
-    """Its folder's disk, or whoever removes it in that instant: the others are sent."""
+    """If its disk fails or another process deletes it at that moment, the others are still sent."""
     rotten, whole = fly(tmp_path), fly(tmp_path)
 
     def settle(folder: MissionFolder) -> bool:

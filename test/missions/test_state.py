@@ -61,7 +61,7 @@ def test_what_is_stated_is_what_a_local_store_shows(tmp_path: Path, store: str, 
 
 @pytest.mark.seaweedfs
 def test_what_is_stated_is_what_a_server_shows(server: Server, warm_home: Path) -> None:
-    """In its list of runs as well, by which they are sorted."""
+    """Also in its list of runs, which can be sorted by it."""
     logger = MissionDataLogger(home=warm_home, start_timeout_s=60.0)
     logger.start_mission('patrol', 'stated')
     log(logger, 7)
@@ -92,7 +92,7 @@ def test_the_clock_was_set_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('stated', 'logged', 'expected'), [(None, 7.5, 7.5), (0.0, 7.5, 7.5), (9.0, 7.5, 9.0), (0.0, None, 0.0)])
-def test_what_the_agent_logged_stands_where_it_states_nothing(
+def test_logged_values_are_used_if_none_are_stated(
     tmp_path: Path, stated: float | None, logged: float | None, expected: float
 ) -> None:
     """In MLflow and in ``summary.json`` alike."""

@@ -16,7 +16,7 @@ POINTS = [Point('battery_pct', 90.0 - number, 1_760_788_800_000 + number, number
 
 @pytest.fixture(scope='module')
 def database(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A SQLite file, whose tables take a second to make; each test has an experiment of its own in it."""
+    """A SQLite file, whose tables take a second to make; each test has a separate experiment in it."""
     return f'sqlite:///{tmp_path_factory.mktemp("local")}/mlflow.db'
 
 
@@ -56,7 +56,7 @@ def test_a_mission_sent_twice_is_there_once(tracking: MlflowTracking, tmp_path: 
 
 @pytest.mark.parametrize('uri', ['nosuch://tower', 'tower:5001'])
 def test_an_address_that_this_mlflow_cannot_do_with_is_waited_for(uri: str) -> None:
-    """As sqlite: is for mlflow-skinny. It is not a refusal of a mission: the sender lives, and says what is to be set."""
+    """As sqlite: is for mlflow-skinny. It is not a refusal of a mission: the sender keeps running, and reports the setting."""
     with pytest.raises(TrackingUnavailable, match='set MLFLOW_TRACKING_URI to a server'):
         MlflowTracking(uri, 'thor_missions').open()
 

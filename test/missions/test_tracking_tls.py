@@ -65,7 +65,7 @@ def serve() -> Iterator[Callable[[str], tuple[str, type[Elsewhere]]]]:
 
 @pytest.fixture
 def authorities(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Authority]:
-    """One that MLflow's client is told to trust, and one that nobody knows."""
+    """One that MLflow's client is configured to trust, and an unknown one."""
     found = {name: Authority(tmp_path, name) for name in ('authority', 'stranger')}
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)

@@ -52,7 +52,7 @@ def test_pixels_are_red_green_and_blue(tmp_path: Path, value: Any) -> None:
 
 @pytest.mark.parametrize('value', [MAGIC, MAGIC[..., None]])
 def test_gray_pixels_that_begin_as_a_jpeg_does_are_pixels(tmp_path: Path, value: Any) -> None:
-    """An image that begins with the two bytes of a JPEG is encoded all the same."""
+    """An image that starts with the two bytes of a JPEG is still encoded."""
     pixels = simplejpeg.decode_jpeg(frame_of(tmp_path, value), 'GRAY')
     assert pixels.shape == (48, 64, 1)
     assert abs(float(pixels.mean()) - 200) < 2

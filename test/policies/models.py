@@ -58,7 +58,7 @@ def linear(gain: float = 0.5, operator: str = 'MatMul', extra: int = 0) -> onnx.
 
 
 def trained(folder: Path, model: onnx.ModelProto | None = None) -> Path:
-    """What a training wrote, and a sample beside it."""
+    """The output of a training, and a sample."""
     folder.mkdir(parents=True)
     (folder / 'model.onnx').write_bytes((model or linear()).SerializeToString())
     features: dict[str, Any] = {

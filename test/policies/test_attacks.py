@@ -72,7 +72,7 @@ class Battle:
         self.store.put(SpooledObject(1, BUCKET, key, path, len(body), sha256, 'application/json', {}, 5, 0))
 
     def saved(self) -> dict[str, bytes]:
-        """All metadata as they are now."""
+        """All current metadata."""
         found = [info.key for info in self.store.list(BUCKET, f'{METADATA}/')]
         return {key.rpartition('/')[2]: self.store.get(BUCKET, key) for key in found}
 
@@ -84,7 +84,7 @@ class Battle:
     # -- what is signed ----------------------------------------------------------------------------------------------
 
     def upload(self, version: int, spark: Spark | None = None) -> bytes:
-        """The files of a version, whoever made it, to where a registry may say that it is; its manifest."""
+        """Upload the files of a version, by any author, to a location that a registry may name; returns its manifest."""
         packed, _ = (spark or self.spark).packed(version, linear(0.01 * version))
         for path in packed.rglob('*'):
             if path.is_file():
@@ -163,7 +163,7 @@ class Thief:
         return f'{timestamp.snapshot_meta.version}.snapshot.json'
 
     def evil(self) -> bytes:
-        """The manifest of a version that nobody of the team made; all its files are in the store, and the registry names it."""
+        """The manifest of a version that no team member created; all its files are in the store, and the registry names it."""
         content = self.battle.upload(EVIL, Spark(self.battle.path / 'evil'))
         self.battle.registry.say('champion', EVIL)
         return content
@@ -191,7 +191,7 @@ def battle(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_arbitrary_software(battle: Battle) -> None:
-    """A version that nobody signed does not run, though its files are in the store and the registry names it."""
+    """An unsigned version does not run, although its files are in the store and the registry names it."""
     thief = Thief(battle, battle.path / 'none')
     evil = thief.evil()
     assert battle.refused() == 'unlisted'
@@ -223,7 +223,7 @@ def test_rollback(battle: Battle) -> None:
 
 
 def test_indefinite_freeze(battle: Battle) -> None:
-    """When what was signed has expired the robot keeps what it has, takes nothing new, and says so; and goes on by itself."""
+    """With expired metadata the robot keeps its policy, accepts nothing new, and reports it; later it recovers."""
     first, second = battle.folder.current(), battle.publish(2)
     battle.spark.signing(battle.store, days=0.0).refresh()
     assert battle.refused() == 'expired'
@@ -239,7 +239,7 @@ def test_indefinite_freeze(battle: Battle) -> None:
 
 
 def test_mix_and_match(battle: Battle) -> None:
-    """Files of two moments, each of which was signed, do not go together."""
+    """Signed files from two different times are not accepted together."""
     battle.publish(2)
     for role in ('targets', 'snapshot'):
         latest = battle.newest(role)
@@ -438,7 +438,7 @@ def test_a_stolen_targets_key_whose_list_a_refresh_took_in(battle: Battle) -> No
 
 
 def test_a_stolen_delegated_key(battle: Battle) -> None:
-    """It lists versions of its own policies alone, and none after its right ended; the right of another key stays."""
+    """It can list only versions of its policies, and none after its delegation ended; that of another key is unchanged."""
     battle.stolen()
     signing, people = battle.spark.signing(battle.store), battle.path / 'people'
     people.mkdir()

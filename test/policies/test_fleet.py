@@ -73,7 +73,7 @@ def speaker() -> Iterator[tuple[int, Callable[[str], object]]]:
 
 
 def test_a_service_ends_at_once_also_while_it_downloads(tower: Tower, tmp_path: Path) -> None:
-    """Of a download of minutes nothing is waited for, and what had come is there when it goes on."""
+    """A download of minutes blocks nothing, and continues with the bytes that have arrived."""
     bucket_of(tower)
     spark = Spark(tmp_path / 'spark', f'patrol_{uuid4().hex[:8]}')
     thor = Robot('thor', tmp_path / 'thor', spark, tower.environment('thor') | tower.tracking('thor'))

@@ -105,7 +105,7 @@ def test_one_that_changes_without_end_is_bounded(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_delays_what_is_noted(tmp_path: Path, logger: MissionDataLogger, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is noted as soon as there is room, and is none of what was lost."""
+    """It is recorded as soon as there is free space, and does not count as lost."""
     activate(tmp_path, NEW)
     logger.start_mission('patrol', 'go round')
     mission = logger._mission

@@ -133,7 +133,7 @@ def test_one_for_other_robots(second: Scene) -> None:
 
 
 def test_one_too_large_for_the_disk(second: Scene) -> None:
-    """For the quota, and for the space that is to be left."""
+    """For the quota, and for the space that must stay free."""
     for given in ({'max_bytes': 100}, {'min_free_bytes': 1 << 60}):
         robot = second.new_robot('tachi', **given)
         with pytest.raises(PolicyRefused) as raised:
@@ -159,7 +159,7 @@ def test_another_version_than_the_registry_says(second: Scene) -> None:
 
 
 def test_a_link_in_a_version(second: Scene, tmp_path: Path) -> None:
-    """Neither on the robot, whoever put it there, nor on the way into a package."""
+    """Neither on the robot nor when it is packed."""
     place = second.folder.versions.path / str(second.folder.current())
     place.chmod(0o700)
     (place / 'config.json').unlink()
@@ -332,7 +332,7 @@ def test_a_policy_that_misbehaves_is_out_when_its_report_returns(second: Scene) 
 
 
 def test_no_mission_is_disturbed_and_no_version_in_use_removed(second: Scene) -> None:
-    """A version waits for the end of a mission; one that somebody uses stays on the disk."""
+    """A version waits for the end of a mission; a version in use stays on disk."""
     first = str(second.folder.current())
     second.robot.may_activate = lambda: False
     assert second.robot.run().done == 'waiting'
@@ -476,7 +476,7 @@ def test_a_home_that_anybody_may_rename_things_in(second: Scene) -> None:
 
 @pytest.mark.parametrize('name', ['stray', 'link', '{id}', '{id}/link.json', '{id}/stray', '{id}/smoke', '{id}/model.onnx.part/'])
 def test_what_lies_among_downloads_hinders_none(second: Scene, name: str) -> None:
-    """Files, links and folders that are none of ours go, and the download goes on."""
+    """Foreign files, links and folders are deleted, and the download continues."""
     manifest = parse_manifest((second.place(2) / MANIFEST).read_bytes())
     place = second.folder.versions.incoming / name.format(id=manifest.id)
     place.parent.mkdir(exist_ok=True)
@@ -491,7 +491,7 @@ def test_what_lies_among_downloads_hinders_none(second: Scene, name: str) -> Non
 
 
 def test_a_rollback_that_is_cut_off_is_ended_by_the_next(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By whoever rolls back again, or looks for policies: to the last good version, not to one before it."""
+    """The next rollback or sync finishes it: to the last good version, not to one before it."""
     first, bad = str(second.folder.current()), str(second.robot.run().active)
     for end in (second.folder.roll_back, second.robot.run):
         with monkeypatch.context() as patch:
@@ -518,7 +518,7 @@ def test_one_that_is_too_large_for_the_quota_costs_no_other(second: Scene) -> No
 
 
 def test_a_policy_goes_out_though_the_disk_is_full(second: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is told, and as nobody could remember it, the policy may come again when there is room."""
+    """It is reported; because it could not be recorded, the policy may be activated again when there is free space."""
     first, bad = second.folder.current(), second.robot.run().active
 
     def full(*_: object) -> None:
@@ -619,7 +619,7 @@ print(said)
 
 
 def test_the_smoke_run_starts_nothing_and_writes_nothing() -> None:
-    """No process of its own, and no byte in any file."""
+    """It can start no process, and write no byte to any file."""
     environ = {'PYTHONPATH': os.pathsep.join(path for path in sys.path if path), 'PYTHONDONTWRITEBYTECODE': '1'}
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o777)
@@ -631,7 +631,7 @@ def test_the_smoke_run_starts_nothing_and_writes_nothing() -> None:
 @pytest.mark.long('a process of its own')
 @pytest.mark.skipif(os.getuid() != 0, reason='the other tests of smoke runs are those of an ordinary user')
 def test_the_smoke_run_of_an_ordinary_user(tmp_path: Path) -> None:
-    """The runtime needs no process and no thread, of which a user other than root may have none there."""
+    """The runtime needs no additional process or thread: a user other than root can have none there."""
     packed, _ = Spark(tmp_path).packed(1)
     rights = '=-all,+dac_override,+dac_read_search'  # to read Python's own files, wherever they are
     program = 'from shadowhound_data_logger.policies import smoke; smoke.main()'
@@ -683,7 +683,7 @@ def gone(pid: int) -> bool:
 
 @pytest.mark.long('a process of its own')
 def test_the_smoke_run_takes_no_package_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever may write there would be run."""
+    """Otherwise users who can write there could run code."""
     packed, manifest = Spark(tmp_path).packed(1)
     (tmp_path / 'here').mkdir()
     (tmp_path / 'here' / 'onnxruntime.py').write_text("raise RuntimeError('from here')")

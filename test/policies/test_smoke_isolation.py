@@ -117,7 +117,7 @@ def home() -> Iterator[Path]:
 
 
 def attacked(home: Path, isolation: str) -> dict[str, Any]:
-    """What the attacks came to, of an ordinary user: nobody where this is root."""
+    """The results of the attacks, as an unprivileged user if the tests run as root."""
     python, become = sys.executable, []
     if os.getuid() == 0:
         become = ['setpriv', '--reuid=65534', '--regid=65534', '--clear-groups',
@@ -149,13 +149,13 @@ def test_the_sandbox_stops_each_attack(home: Path) -> None:
 
 
 def test_the_limits_alone_stop_next_to_nothing(home: Path) -> None:
-    """Each attack works without the sandbox, but for a byte in a file of its own making: that is what ``limits`` allows."""
+    """Without the sandbox each attack succeeds, except for writing to a new file: this is what ``limits`` permits."""
     found = attacked(home, LIMITS)
     assert found['done'] == found['tried']
 
 
 def test_without_a_sandbox_nothing_is_run_unless_that_is_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the machine has no bubblewrap, or lets nobody use it, the error says why and what to do; nothing is run."""
+    """If bubblewrap is missing or not permitted, the error contains the reason and the remedy; nothing is run."""
     packed, manifest = Spark(tmp_path).packed(1)
     broken = tmp_path / 'bin' / 'bwrap'
     broken.parent.mkdir()
@@ -177,7 +177,7 @@ def test_without_a_sandbox_nothing_is_run_unless_that_is_allowed(tmp_path: Path,
 @needs_bwrap
 @pytest.mark.long('a process that runs a model')
 def test_the_isolation_that_was_in_force_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A model runs in the sandbox, and there too where less would do; without one, the limits are what is said."""
+    """A model runs in the sandbox, even if less is required; without one, ``limits`` is reported."""
     packed, manifest = Spark(tmp_path).packed(1)
     assert [run_smoke(packed, manifest, isolation=each).isolation for each in (SANDBOX, LIMITS)] == [SANDBOX, SANDBOX]
     monkeypatch.setattr(smoke.shutil, 'which', lambda _: None)
@@ -245,5 +245,5 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     (SANDBOX, [SANDBOX, LIMITS]), (LIMITS, [LIMITS]), (None, []), ('', []), ('magic', []),
 ])  # fmt: skip
 def test_what_is_enough(isolation: str | None, enough_for: list[str]) -> None:
-    """More isolation than required is enough, less is not, and a word that is unknown, or none, is none."""
+    """More isolation than required is enough, less is not; an unknown or missing value counts as no isolation."""
     assert [required for required in smoke.ISOLATIONS if is_enough(isolation, required)] == enough_for

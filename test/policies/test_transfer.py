@@ -195,7 +195,7 @@ def test_a_cap_is_kept_and_made_use_of(
 
 
 class Liar(DirectoryStore):
-    """Sends something else whenever it is asked for a model, and breaks off more often than one download goes on."""
+    """Sends wrong content for every request of a model, and disconnects more often than a download retries."""
 
     asked = sent = 0
     breaks = True

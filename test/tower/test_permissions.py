@@ -184,7 +184,7 @@ def test_old_data_is_deleted_by_one_user_alone(server: Tower, as_user: Connect, 
             if user == 'prune':
                 assert prune.apply(Bucket(server.store_settings(user), 'sensor-data'), store, made, **how).objects == 3
             else:
-                with pytest.raises(LakeError, match='may not prune'):
+                with pytest.raises(LakeError, match='do not permit pruning'):
                     prune.apply(source, store, made, **how)
                 assert len(source.list('thor/camera/20260921/')) == 3
                 assert source.list('_forgotten/') == []
