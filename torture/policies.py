@@ -100,7 +100,7 @@ class Robot:
         after = chance.choice(sorted(others))
         if is_new:
             self._registry.set_alias(NAME, CHAMPION, self.manifests[after].version)
-        with self.folder.changing() as state:
+        with self.folder.state.changing() as state:
             state.pin, state.history = None, [] if is_new else [after]
             state.bad.clear()
         return Round(act, before, after)
@@ -125,10 +125,10 @@ class Robot:
         if now is None or now not in allowed:
             return f'{now} is active, and none of {allowed}'
         try:
-            self.folder.check(now, self.folder.state())
+            self.folder.check(now, self.folder.state.read())
         except (DataLoggerError, OSError) as error:
             return f'{now}: {error}'
-        return '' if now in self.folder.state().verified else f'{now} was never verified'
+        return '' if now in self.folder.state.read().verified else f'{now} was never verified'
 
     def start(self, one: Round, at: int | None = None, then: Callable[[], object] = lambda: None) -> int:
         """Do it in a process of its own, in which ``then`` happens at the step of this number."""

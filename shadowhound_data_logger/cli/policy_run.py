@@ -116,7 +116,7 @@ def run(*, interval: float, as_json: bool, **given: Any) -> ExitCode:
 def list_(*, as_json: bool) -> ExitCode:
     """List the versions on this robot."""
     folder = _policies()
-    state, now = folder.state(), folder.current()
+    state, now = folder.state.read(), folder.current()
     why_not = {**state.bad, **dict.fromkeys(state.withdrawn, 'no signer lists it any longer')}
     rows = [{'policy': name, 'active': name == now, 'pinned': name == state.pin, 'why_not': why_not.get(name, ''),
              'isolation': state.verified.get(name)}
@@ -145,11 +145,11 @@ def show(*, name: str | None, as_json: bool) -> ExitCode:
     if found is None:
         raise PolicyError('no policy is active')
     try:
-        manifest, why = folder.check(found, folder.state()), ''
+        manifest, why = folder.check(found, folder.state.read()), ''
     except PolicyRefused as error:
         manifest, why = None, f'{error.reason}: {error.what}'
     told = {'policy': found, 'active': found == folder.current(), 'path': str(folder.versions.path / found), 'refused': why,
-            'isolation': folder.state().verified.get(found), 'stale': why_stale(folder.path, time.time_ns())}  # fmt: skip
+            'isolation': folder.state.read().verified.get(found), 'stale': why_stale(folder.path, time.time_ns())}  # fmt: skip
     if manifest is not None:
         told |= {'robot_types': list(manifest.robot_types), 'fps': manifest.fps,
                  'inputs': [spec.name for spec in manifest.inputs], 'outputs': [spec.name for spec in manifest.outputs],
@@ -173,7 +173,7 @@ def use(*, name: str, now: bool, isolation: str, as_json: bool) -> ExitCode:
     """Activate a version that is on this robot, and pin it."""
     folder = _policies()
     found = folder.versions.find(name)
-    tried = folder.state().verified.get(found, 'no isolation that is known')
+    tried = folder.state.read().verified.get(found, 'no isolation that is known')
     if not is_enough(tried, isolation):
         raise PolicyError(f'the smoke run of {found} was in {tried}, required is {isolation}',
                           remedy='policy sync tries it again; or allow less: --isolation limits')  # fmt: skip
@@ -227,7 +227,7 @@ def report(*, failures: int, p99_ms: float, as_json: bool) -> ExitCode:
     name = folder.current()
     if name is None:
         raise PolicyError('no policy is active')
-    is_good = running.judge(folder, name, folder.check(name, folder.state(), hashes=False), failures, p99_ms)
+    is_good = running.judge(folder, name, folder.check(name, folder.state.read(), hashes=False), failures, p99_ms)
     active = folder.current()
     if as_json:
         print_json({'policy': name, 'rolled_back': not is_good, 'active': active})

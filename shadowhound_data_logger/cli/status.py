@@ -131,7 +131,7 @@ def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     active, isolation = folder.current(), None
     if active:
         try:
-            isolation = folder.state().verified.get(active)
+            isolation = folder.state.read().verified.get(active)
         except PolicyError as error:
             findings.append(str(error))
     return Page(replace(chosen, findings=tuple(findings)), others, active, isolation)

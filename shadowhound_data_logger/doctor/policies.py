@@ -28,7 +28,7 @@ def check(context: Context) -> Iterator[Result]:
         )
     else:
         yield ok(NAME, f'the signed lists are fresh; active is {folder.current() or "no policy"}')
-    if (active := folder.current()) and (tried := folder.state().verified.get(active)) != SANDBOX:
+    if (active := folder.current()) and (tried := folder.state.read().verified.get(active)) != SANDBOX:
         yield warning(
             'policies.isolation',
             f'{active} was tried in {tried or "an unknown isolation"}, not in a sandbox',

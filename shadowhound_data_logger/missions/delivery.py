@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.durable_files import replacing
@@ -26,7 +26,7 @@ from shadowhound_data_logger.missions.folder import MissionFolder, MissionSent, 
 from shadowhound_data_logger.missions.journal_delivery import JournalDelivery
 from shadowhound_data_logger.missions.objects import Spooler
 from shadowhound_data_logger.missions.pictures import MakePictures, no_pictures
-from shadowhound_data_logger.missions.state import FRAMES, KILLED, MissionState, Point, run_request, summary_of
+from shadowhound_data_logger.missions.state import FRAMES, KILLED, Point, run_request, summary_of
 from shadowhound_data_logger.missions.tracking import Tracking, send
 from shadowhound_data_logger.missions.values import MAX_TAG
 
@@ -88,7 +88,8 @@ class Delivery:
             self.run = run
         run = self.run
         params = self._state.params() if batch.last == 'start' else self._state.final_params() if is_last else {}
-        self._send(run, batch.points, params, _error_tag(self._state) if is_last else {})
+        error = self._state.end.get('error') if is_last else None
+        self._send(run, batch.points, params, {'shadowhound.error': str(error)[:MAX_TAG]} if error else {})
         if is_last:
             end = self._state.end
             self._tracking.finish(run.run_id, self.folder.mission_id, end['status'], int(end['t']) // 1_000_000)
@@ -269,8 +270,3 @@ class Delivery:
             content = summary_of(self._state, self.folder.mission_id, self.run, self.sent, made)
             write_json(self.folder.summary, content, durable=True)
         return True
-
-
-def _error_tag(state: MissionState) -> dict[str, str]:
-    error: Any = state.end.get('error')
-    return {'shadowhound.error': str(error)[:MAX_TAG]} if error else {}

@@ -98,7 +98,7 @@ def active(home: str | os.PathLike[str] | None = None, environ: Mapping[str, str
             durable_files.lock(descriptor, shared=True)
             if os.fstat(descriptor).st_nlink and (folder.versions.path / name).exists():
                 folder.check_owner()
-                manifest = folder.check(name, folder.state())
+                manifest = folder.check(name, folder.state.read())
                 yield ActivePolicy(name, folder.versions.path / name, manifest, folder)
                 return
         finally:

@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.options import GIBI
 from shadowhound_data_logger.core.retry import steadily
 from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.content import files_of
-from shadowhound_data_logger.policies.folder import PolicyFolder, newest_of
+from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import (
     BUCKET,
     MANIFEST,
@@ -34,6 +34,7 @@ from shadowhound_data_logger.policies.manifest import (
 )
 from shadowhound_data_logger.policies.registry import PolicyRegistry, RegisteredVersion, choose, folder_of
 from shadowhound_data_logger.policies.smoke import SANDBOX, is_enough, run_smoke
+from shadowhound_data_logger.policies.state import newest_of
 from shadowhound_data_logger.stores.bandwidth import BYTES_PER_MEGABIT
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.download import UNFINISHED, download
@@ -116,7 +117,7 @@ class PolicySync:
         with durable_files.flock(self.folder.path / 'sync.lock', wait=False) as is_ours:
             if not is_ours:
                 raise PolicyError('another process is syncing the policies of this robot', remedy='wait until it has finished')
-            state, active = self.folder.state(), self.folder.current()
+            state, active = self.folder.state.read(), self.folder.current()
             if active is not None and active in state.bad:  # a rollback was interrupted
                 self.folder.roll_back(state.bad[active], of=active)
             traffic = _Traffic(self.settings.max_mbps, self.pause, self.monotonic)
@@ -131,7 +132,7 @@ class PolicySync:
             return self._finished(result if isinstance(listing, trust.Trust) else replace(result, stale=f'{listing}'))
 
     def _finished(self, result: SyncResult) -> SyncResult:
-        return replace(result, isolation=self.folder.state().verified.get(result.active) if result.active else None)
+        return replace(result, isolation=self.folder.state.read().verified.get(result.active) if result.active else None)
 
     def _listing(self, traffic: _Traffic) -> trust.Trust | DataLoggerError:
         """The verified lists, or why they cannot be verified: then no new version is accepted."""
@@ -145,7 +146,7 @@ class PolicySync:
 
     def _withdrawn(self, listing: trust.Trust) -> list[str]:
         """The versions that were verified here and are no longer listed. If that is unknown for a version, nothing changes."""
-        state = self.folder.state()
+        state = self.folder.state.read()
         return [name for name in sorted({*state.verified, *self.folder.versions.ids()})
                 if not self._is_listed(listing, name, unknown=name not in state.withdrawn)]  # fmt: skip
 
@@ -160,7 +161,7 @@ class PolicySync:
 
     def _follow(self, listing: trust.Trust | DataLoggerError, traffic: _Traffic, *, again: bool) -> SyncResult:
         """Activate the pinned version, otherwise the one that the registry selects."""
-        state = self.folder.state()
+        state = self.folder.state.read()
         if state.pin is not None:
             if state.pin != self.folder.current():
                 if not self.may_activate():
@@ -175,7 +176,7 @@ class PolicySync:
         prefix = folder_of(chosen, self.settings.name)
         now = self.folder.current()
         if now is not None and now.partition('#')[0] == wanted:
-            self.folder.check(now, self.folder.state(), hashes=False)
+            self.folder.check(now, self.folder.state.read(), hashes=False)
             return SyncResult(now, now, 'unchanged')
         since, refusal = self._refused.get(wanted, (float('-inf'), None))
         if refusal is not None and not again and self.monotonic() - since < REFUSAL_S:
@@ -218,7 +219,7 @@ class PolicySync:
 
     def _fetch(self, chosen: RegisteredVersion, prefix: str, listing: trust.Trust, traffic: _Traffic) -> PolicyManifest:
         """Download a version to ``incoming`` and verify it, except for the smoke run."""
-        state, wanted = self.folder.state(), f'{chosen.name}@{chosen.version}'
+        state, wanted = self.folder.state.read(), f'{chosen.name}@{chosen.version}'
         target = listing.listed(trust.target_of(self.settings.robot_type, chosen.name, chosen.version))
         if target is None:
             raise PolicyRefused('unlisted', f'no authorized signer lists {wanted} for a {self.settings.robot_type}',
@@ -295,7 +296,7 @@ class PolicySync:
 
     def _ensure_tested(self, name: str) -> None:
         """Repeat the smoke run of an installed version if it had less isolation than is required now."""
-        state = self.folder.state()
+        state = self.folder.state.read()
         if not is_enough(state.verified.get(name), self.settings.isolation):
             manifest = self.folder.check(name, state)
             run = run_smoke(self.folder.versions.path / name, manifest, self.settings.isolation)

@@ -83,7 +83,7 @@ class PolicyTopics:
         if not name or name != self._folder.current():
             return 'other'
         try:
-            manifest = self._folder.check(name, self._folder.state(), hashes=False)
+            manifest = self._folder.check(name, self._folder.state.read(), hashes=False)
             if not judge(self._folder, name, manifest, failures, p99_ms):
                 log.warning('%s is rolled back: %d failures, p99 %g ms; active: %s', name, failures, p99_ms,
                             self._folder.current() or 'none')  # fmt: skip

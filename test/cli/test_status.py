@@ -160,7 +160,7 @@ def test_the_isolation_of_the_active_policy_is_reported(tmp_path: Path, isolatio
     folder.make()
     (folder.versions.path / name).mkdir()
     (folder.path / 'current').symlink_to(Path('versions') / name)
-    with folder.changing() as state:
+    with folder.state.changing() as state:
         state.verified |= {name: isolation} if isolation else {}
     home = {'SHADOWHOUND_HOME': str(tmp_path)}
     assert json.loads(run(tmp_path, '--json', **home).stdout)['policy'] == {'active': name, 'isolation': isolation}

@@ -18,7 +18,7 @@ def activate(scene: Scene, isolation: str) -> None:
     folder.make()
     (folder.versions.path / NAME).mkdir()
     (folder.path / 'current').symlink_to(Path('versions') / NAME)
-    with folder.changing() as state:
+    with folder.state.changing() as state:
         state.verified[NAME] = isolation
 
 

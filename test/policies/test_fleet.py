@@ -141,8 +141,8 @@ def test_a_canary_goes_first_and_goes_back_alone(  # noqa: PLR0915 - one story
         service.said(f'{ids[2]} was rolled back here: 4 steps failed')  # the registry says the same, and is not followed
         assert tachi.folder.current() == ids[1]
         assert {robot.synced() for robot in others} == {('unchanged', ids[1])}
-        assert [robot.folder.state().bad for robot in others] == [{}, {}]
-        assert [*tachi.folder.state().bad] == [ids[2]]
+        assert [robot.folder.state.read().bad for robot in others] == [{}, {}]
+        assert [*tachi.folder.state.read().bad] == [ids[2]]
 
         publish(3, 'canary', '--canary', 'tachi')
         until(lambda: tachi.folder.current() == ids[3], lambda: f'the next one: {service.log}')

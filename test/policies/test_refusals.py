@@ -30,6 +30,7 @@ from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.folder import PolicyFolder
 from shadowhound_data_logger.policies.manifest import MANIFEST, parse_manifest
 from shadowhound_data_logger.policies.smoke import LIMITS, SANDBOX, SmokeRun, run_smoke
+from shadowhound_data_logger.policies.state import StateFile
 from shadowhound_data_logger.stores.directory import DirectoryStore
 
 
@@ -402,7 +403,7 @@ def test_a_full_disk_while_activating_changes_nothing(second: Scene, monkeypatch
 def test_a_pinned_version_waits_for_the_end_of_a_mission_too(second: Scene) -> None:
     """Where its activation was cut off before."""
     first, later = second.folder.versions.find('go2_patrol@1'), str(second.robot.run().active)
-    with second.folder.changing() as state:
+    with second.folder.state.changing() as state:
         state.pin = first
     second.robot.may_activate = lambda: False
     assert second.robot.run() == sync.SyncResult(first, later, 'waiting', isolation='sandbox')
@@ -454,7 +455,7 @@ def test_no_rollback_waits_for_gigabytes(second: Scene, monkeypatch: pytest.Monk
         return acts
 
     monkeypatch.setattr('shadowhound_data_logger.policies.versions.check_files', asks(check_files))
-    monkeypatch.setattr('shadowhound_data_logger.policies.folder.shutil.rmtree', asks(shutil.rmtree))
+    monkeypatch.setattr('shadowhound_data_logger.policies.versions.shutil.rmtree', asks(shutil.rmtree))
     second.robot.settings = replace(second.robot.settings, keep=2)
     assert second.robot.run().done == 'activated'
     second.folder.use(second.folder.versions.find('go2_patrol@3'))
@@ -525,7 +526,7 @@ def test_a_policy_goes_out_though_the_disk_is_full(second: Scene, monkeypatch: p
         raise OSError(28, 'No space left on device')
 
     with active(second.path / 'thor') as policy, monkeypatch.context() as patch:
-        patch.setattr(PolicyFolder, '_write', full)
+        patch.setattr(StateFile, 'write', full)
         with pytest.raises(OSError, match='No space'):
             all(policy.report(100.0) for _ in range(30))
         assert second.folder.current() == first

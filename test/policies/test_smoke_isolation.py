@@ -209,7 +209,7 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     def tried(folder: Path, manifest: PolicyManifest, isolation: str) -> SmokeRun:
         runs.append(folder.parent.name)
         if not is_enough(possible, isolation):
-            raise PolicyError(f'{manifest.id} is not run')
+            raise PolicyError(f'{manifest.id} was not run')
         return SmokeRun(1.0, possible)
 
     monkeypatch.setattr(sync, 'run_smoke', tried)
@@ -223,11 +223,11 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     second = scene.publish(2)
     result = scene.robot.run()
     assert (result.active, result.isolation) == (second, LIMITS)
-    assert scene.folder.state().verified == {first: LIMITS, second: LIMITS}
+    assert scene.folder.state.read().verified == {first: LIMITS, second: LIMITS}
 
     scene.robot.settings = replace(scene.robot.settings, isolation=SANDBOX)
     if by == 'a pin':
-        with scene.folder.changing() as state:
+        with scene.folder.state.changing() as state:
             state.pin = first
     else:
         scene.registry.say('champion', 1)
@@ -237,7 +237,7 @@ def test_a_version_that_was_tried_in_less_is_tried_again_before_it_is_activated(
     possible = SANDBOX
     result = scene.robot.run()
     assert (result.active, result.isolation) == (first, SANDBOX)
-    assert scene.folder.state().verified == {second: LIMITS, first: SANDBOX}
+    assert scene.folder.state.read().verified == {second: LIMITS, first: SANDBOX}
     assert runs == ['incoming', 'incoming', 'incoming', 'versions', 'versions']
 
 

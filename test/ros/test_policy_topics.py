@@ -92,7 +92,7 @@ def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) 
         assert scene.folder.current() == second, 'within its limits'
         listener.say({'policy': second, 'failures': 4, 'p99_ms': 1.0})
         listener.until(lambda: listener.heard[-1] == first, 'the last good one is active')
-        assert scene.folder.state().bad[second].startswith('4 steps failed')
+        assert scene.folder.state.read().bad[second].startswith('4 steps failed')
         scene.folder.roll_back()
         listener.until(lambda: listener.heard[-1] == '', 'none is active')
 
