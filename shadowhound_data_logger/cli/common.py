@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
-from shadowhound_data_logger.core.config import DEFAULT_ROBOT, UploadSettings, home, store_settings
+from shadowhound_data_logger.core.config import UploadSettings, default_robot, home, store_settings
 from shadowhound_data_logger.core.errors import NameRefused, SettingError, StoreError
 from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.options import StoreSettings
@@ -173,7 +173,7 @@ def the_robot(named: str | None, spool: Path | None = None, *, in_store: bool = 
         found = the_store_robots()
     if len(found) > 1 or (must_exist and not found):
         raise BadUsage(f'which robot? There are {", ".join(found) or "none"}', '--robot NAME, or set SHADOWHOUND_ROBOT')
-    return found[0] if found else DEFAULT_ROBOT
+    return found[0] if found else default_robot(os.environ)
 
 
 def the_store_robots() -> list[str]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
-import socket
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +17,7 @@ import click
 from shadowhound_data_logger.cli.common import BadUsage, ExitCode, as_json, examples, exit_code
 from shadowhound_data_logger.cli.output import print_json
 from shadowhound_data_logger.core.clock import iso
-from shadowhound_data_logger.core.config import DEFAULT_SENSORS, SensorSettings, Settings
+from shadowhound_data_logger.core.config import DEFAULT_SENSORS, SensorSettings, Settings, default_robot
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.keys import is_name, printable
 from shadowhound_data_logger.core.model import Batch, Sample
@@ -87,8 +85,7 @@ def init(to: Path | None, duration: float, namespace: str, robot: str | None, *,
     if to is not None and to.exists() and not overwrite:
         raise BadUsage(f'{to} exists', 'name another file, or add --overwrite')
     namespace = '/' + namespace.strip('/')
-    of_machine = re.sub(r'[^A-Za-z0-9_-]', '_', namespace.strip('/') or socket.gethostname()).strip('_-') or 'robot'
-    name = robot or os.environ.get('SHADOWHOUND_ROBOT') or of_machine
+    name = robot or os.environ.get('SHADOWHOUND_ROBOT') or default_robot(os.environ, namespace)
     if not is_name(name):
         raise BadUsage(f'{name!r} is not a name of a robot', '--robot NAME, of letters, digits, - and _')
     if find_spec('rclpy') is None:

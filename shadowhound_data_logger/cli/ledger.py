@@ -26,7 +26,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import SECOND, SystemClock
-from shadowhound_data_logger.core.config import DEFAULT_ROBOT
+from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.dataclass_json import parse
 from shadowhound_data_logger.core.stamps import SAME_NS, StampReport, describe
 from shadowhound_data_logger.core.times import moment
@@ -117,7 +117,7 @@ def ledger(*, as_json: bool, spool: Path | None, ask: bool, deep: bool, again: b
 
 
 def _robot(folder: Path) -> str:
-    return next(iter(local_robots(os.environ, folder)), DEFAULT_ROBOT)
+    return next(iter(local_robots(os.environ, folder)), default_robot(os.environ))
 
 
 def _is_asked_for(gap: Gap, topic: str, begin_ns: int | None, end_ns: int | None, cause: str) -> bool:

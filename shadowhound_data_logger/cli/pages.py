@@ -359,7 +359,8 @@ def _described() -> dict[str, str]:
             '',
             'a name',
             '',
-            "The first part of every key. If empty: `SHADOWHOUND_ROBOT`, otherwise the node's namespace, otherwise `thor`.",
+            "The first part of every key. If empty: `SHADOWHOUND_ROBOT`, otherwise the node's namespace, otherwise `thor` if the "
+            'messages of a Go2 are installed, otherwise the host name.',
         ),
         'sensors': _row(
             '`sensors`',

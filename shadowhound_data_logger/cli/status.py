@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -39,7 +40,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
 )
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, SystemClock
-from shadowhound_data_logger.core.config import DEFAULT_ROBOT
+from shadowhound_data_logger.core.config import default_robot
 from shadowhound_data_logger.core.errors import PolicyError
 from shadowhound_data_logger.core.status import BagStatus, EventStatus, NodeStatus, SpoolStatus, TopicStatus
 from shadowhound_data_logger.core.times import iso_ns
@@ -120,7 +121,7 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
 
 def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     """The requested robot, or the first that runs, or the first that has a status."""
-    names = [robot] if robot else robots(spool) or [DEFAULT_ROBOT]
+    names = [robot] if robot else robots(spool) or [default_robot(os.environ)]
     found = [read_status(spool, name, clock) for name in names]
     chosen = next((each for each in found if each.running), found[0])
     others = tuple(each.robot for each in found if each.running and each is not chosen)

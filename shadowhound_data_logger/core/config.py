@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
@@ -58,6 +59,7 @@ __all__ = [
     'StoreSettings',
     'UploadSettings',
     'default_parameters',
+    'default_robot',
     'endpoint_url',
     'home',
     'store_settings',
@@ -65,6 +67,8 @@ __all__ = [
 
 DEFAULT_ROBOT: Final = 'thor'
 """The Go2 of the integration guide."""
+GO2_PACKAGES: Final = ('go2_interfaces', 'unitree_go')
+"""Message packages of a Go2's driver, and of the robot itself."""
 MIN_RATE_HZ: Final = 1e-4
 """A message every three hours."""
 MAX_INT: Final = (1 << 63) - 1
@@ -196,12 +200,22 @@ def _listed(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
+def default_robot(environ: Mapping[str, str], namespace: str = '/') -> str:
+    """For a robot that no setting names: the namespace, ``thor`` if the messages of a Go2 are installed, or the host name."""
+    if name := namespace.strip('/').replace('/', '_'):
+        return name
+    shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
+    if any((share / package).is_dir() for share in shares for package in GO2_PACKAGES):
+        return DEFAULT_ROBOT
+    return re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-') or 'robot'
+
+
 def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
-    """The parameter, else SHADOWHOUND_ROBOT, else the node's namespace, else ``thor``."""
+    """The parameter, otherwise SHADOWHOUND_ROBOT, otherwise ``default_robot``."""
     if not isinstance(given, str):
         raise SettingError('robot', given, 'a string')
     of_shell = environ.get('SHADOWHOUND_ROBOT')
-    name = given or of_shell or namespace.strip('/').replace('/', '_') or DEFAULT_ROBOT
+    name = given or of_shell or default_robot(environ, namespace)
     try:
         return check_name(name, 'the robot name')
     except NameRefused as error:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+import socket
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +26,9 @@ def refused(**parameters: Any) -> SettingError:
 
 
 def test_nothing_has_to_be_set() -> None:
-    """With nothing set the robot is thor, the store a folder, and all sensors of the Go2 are logged."""
+    """With nothing set the robot has the name of its host, the store is a folder, and all sensors of the Go2 are logged."""
     settings = load()
-    assert settings.robot == 'thor'
+    assert settings.robot == re.sub(r'[^A-Za-z0-9_-]', '_', socket.gethostname()).strip('_-')
     assert settings.home == Path('~/.shadowhound').expanduser()
     assert settings.spool_path == settings.home / 'spool'
     assert (settings.store.endpoint_url, settings.store.directory) == (None, settings.home / 'store')
@@ -49,11 +51,25 @@ def test_the_defaults_can_be_spelled_out() -> None:
 
 @pytest.mark.parametrize(('given', 'environ', 'namespace', 'robot'), [
     ('odin', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'odin'), ('', {'SHADOWHOUND_ROBOT': 'loki'}, '/tachi', 'loki'),
-    ('', {}, '/tachi', 'tachi'), ('', {'SHADOWHOUND_ROBOT': ''}, '/lab/robot0', 'lab_robot0'), ('', {}, '/', 'thor'),
+    ('', {}, '/tachi', 'tachi'), ('', {'SHADOWHOUND_ROBOT': ''}, '/lab/robot0', 'lab_robot0'),
 ])  # fmt: skip
 def test_the_robot_name(given: str, environ: dict[str, str], namespace: str, robot: str) -> None:
-    """The parameter comes before the variable, that before the namespace, and thor is last."""
+    """The parameter comes before the variable, and that before the namespace."""
     assert load(environ, namespace, robot=given).robot == robot
+
+
+@pytest.mark.parametrize(('host', 'package', 'robot'), [
+    ('turtle.local', None, 'turtle_local'), ('turtle', 'turtlebot4_msgs', 'turtle'), ('jetson', 'go2_interfaces', 'thor'),
+    ('jetson', 'unitree_go', 'thor'), ('---', None, 'robot'),
+])  # fmt: skip
+def test_a_robot_without_a_name(
+    host: str, package: str | None, robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is called thor where the messages of a Go2 are installed, and as its host otherwise."""
+    monkeypatch.setattr(socket, 'gethostname', lambda: host)
+    if package is not None:
+        (tmp_path / 'share' / package).mkdir(parents=True)
+    assert load({'AMENT_PREFIX_PATH': f'/nowhere:{tmp_path}'}).robot == robot
 
 
 @pytest.mark.parametrize('value', ['../thor', 'a b', 'x' * 65, 7])
