@@ -247,7 +247,10 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
         check_name(name, 'the sensor name')
     except NameRefused as error:
         raise SettingError('sensors', name, f'a name: {error.remedy}') from error
+    names_types = f'{name}.types' in given
     sensor: SensorSettings = _fill(SensorSettings, name, given, {'name': name, **DEFAULT_SENSORS.get(name, {})})
+    if not names_types:  # those of the default topics, of which the settings may name fewer
+        sensor = replace(sensor, types=sensor.types[: len(sensor.topics)])
     if not sensor.topics or not all(sensor.topics):
         raise SettingError(f'{name}.topics', list(sensor.topics), 'at least one topic')
     if len(sensor.types) > len(sensor.topics):

@@ -122,7 +122,8 @@ def _middleware(environ: Mapping[str, str]) -> Iterator[Result]:
         )
     elif given or there:
         yield ok('ros.middleware', f'the middleware is {given or "the default"}')
-    if given == ZENOH and not (environ.get('ZENOH_SESSION_CONFIG_URI') or environ.get('ZENOH_CONFIG_OVERRIDE')):
+    is_configured = environ.get('ZENOH_SESSION_CONFIG_URI') or environ.get('ZENOH_CONFIG_OVERRIDE')
+    if given == ZENOH and (given in there or not there) and not is_configured:
         try:
             socket.create_connection(ROUTER, timeout=ROUTER_S).close()
         except OSError as failure:

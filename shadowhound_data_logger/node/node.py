@@ -161,7 +161,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
         size = sum(each.bytes for each in freed)
         log.info('freed %.0f MB of shared memory (%d segments) that killed processes had left', size / 1e6, len(freed))
     if avoided:
-        log.debug('%d shared-memory ports of killed processes are not reused: publishers may still write to them', len(avoided))
+        log.info('%d ports in shared memory that killed processes left are not reused', len(avoided))
     node.get_logger().info(f'listening by {middleware.describe()}')
     if '--params-file' in arguments and not Parameters(node).given():  # which is not an error to rcl
         node.get_logger().warning(UNHEARD.format(name=name))

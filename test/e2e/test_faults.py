@@ -84,7 +84,7 @@ def test_a_store_that_fails_and_recovers(
     wired.publish()
     wired.node.settled(TOPIC, wired.count)
     assert words not in wired.node.log
-    recovered = wired.node.log.count('delivery goes on')
+    recovered = wired.node.log.count('delivery continues')
     wire.set(mode)
     try:
         wired.publish()
@@ -95,7 +95,7 @@ def test_a_store_that_fails_and_recovers(
     finally:
         wire.set(PASS)
     wired.delivered(lambda: stored(shared.robot))
-    until(lambda: wired.node.log.count('delivery goes on') == recovered + 1, 'the node says that it is over')
+    until(lambda: wired.node.log.count('delivery continues') == recovered + 1, 'the node says that it is over')
     assert wired.node.ledger()['objects']['quarantined'] == 0
 
 

@@ -53,9 +53,9 @@ def test_samples_that_are_too_deep_are_no_samples(depth: int) -> None:
     """Of a robot's batch, of its single documents, and beside the messages of an archive; the error is the one of bad content."""
     sample = b'{"stamp_ns":1,"a":%b}' % objects(depth)
     for body in (sample, b'{"type":"x/msg/Y","samples":[%b]}' % sample):
-        with pytest.raises(LakeError, match='not JSON of a sensor'):
+        with pytest.raises(LakeError, match="not a sensor's JSON"):
             records(body)
-    with pytest.raises(LakeError, match='no tar that can be read'):
+    with pytest.raises(LakeError, match='the tar cannot be read'):
         members(tar_of(a_json=sample, a_bin=b'1'), 'tar')
 
 

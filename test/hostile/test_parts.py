@@ -103,7 +103,7 @@ def test_a_bad_part_costs_nobody_else_an_answer(home: Path, kinds: Collection[st
     assert sorted(line.removeprefix('sensor-data/') for line in found.stdout.splitlines()) == before
     assert found.return_value == 1
     assert [key for key in keys if f'{key} is skipped: ' not in found.stderr] == []
-    assert f'{len(keys)} of the catalog are left out' in found.stderr
+    assert f'{len(keys)} files of the catalog are skipped' in found.stderr
     assert run(query, home, '--robot', 'tachi').return_value == 0
 
 

@@ -151,7 +151,7 @@ def test_an_index_that_is_lost_meanwhile(tmp_path: Path, spooler: Spooler, folde
     other = new_spool(tmp_path / 'spool')
     other.open()
     other.close()
-    with pytest.raises(SpoolError, match='was lost'):
+    with pytest.raises(SpoolError, match='was deleted or replaced'):
         spooler.add(others)
     spooler.add(others)
     prefix = 'thor/missions/abc/camera/'

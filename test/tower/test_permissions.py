@@ -368,7 +368,7 @@ def test_an_object_that_was_hidden_is_found_by_verify(server: Tower, as_user: Co
     assert found.counts == {'unreadable': 1}, found
     (finding,) = found.first['unreadable']
     assert finding.key == 'thor/camera/sse-b.txt'
-    delivered.note.assert_called_once_with([0, 2])
+    delivered.set_verified.assert_called_once_with([0, 2])
 
 
 def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch,

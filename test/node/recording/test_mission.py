@@ -55,7 +55,7 @@ class Intake:
 
 def given(parameters: Mapping[str, object], home: Path) -> Settings:
     named = {f'mission.{name}': value for name, value in parameters.items()}
-    return Settings.load(named, {'SHADOWHOUND_HOME': str(home)})
+    return Settings.load(named, {'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': 'thor'})
 
 
 class Setting:
