@@ -26,7 +26,7 @@ def test_a_way_is_the_sum_of_its_steps() -> None:
 
 
 def test_a_drone_is_fast() -> None:
-    """At 15 m/s its way counts, but for the first step; a jump on the way does not, nor an estimate that jumps to and fro."""
+    """At 15 m/s its way counts, but for the first step; a jump on the way does not, nor an estimate that jumps back and forth."""
     odometer = Odometer()
     for number in range(101):
         odometer.add(Pose(number * SECOND // 10, 1.5 * number + (200 if number >= 50 else 0), 0.0, 0.0))
