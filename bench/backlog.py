@@ -4,7 +4,7 @@ Run it as ``python bench/backlog.py [--long] [--folder F] [--json]``; ``--long``
 minute.
 
 Claims: the real spool and schedule, no network. A claim is all steps up to the one that names an object: out of what was
-looked up before (``drain``), or with a look at the spool each time, as when new objects arrive all the time (``look``), also
+looked up before (``drain``), or with a poll at the spool each time, as when new objects arrive all the time (``poll``), also
 while a bucket that holds all but a few of the objects takes nothing (``blocked``). Shares: eight hours of the default profile
 wait, the profile goes on, and a store takes ten objects a second; the clock is simulated.
 """
@@ -108,14 +108,14 @@ def make(number: int, sensor: str, priority: int, bucket: str = 'sensor-data') -
     )  # fmt: skip
 
 
-def claims(spool: Spool, *, look: bool) -> list[float]:
+def claims(spool: Spool, *, poll: bool) -> list[float]:
     """CPU milliseconds of each of some hundred claims; the settling between them is not counted."""
     now = itertools.count()
     drain = Drain(spool.pending, lambda: next(now) * 1e-6)
     spent: list[float] = []
     done: list[SpooledObject] = []
     for _ in range(CLAIMS):
-        if look:
+        if poll:
             drain.schedule.wake()
         began = thread_time()
         item = drain.claim()
@@ -163,8 +163,8 @@ def measured(rows: int, folder: str | None) -> dict[str, float]:
     with tempfile.TemporaryDirectory(dir=folder) as place:
         spool = filled(Path(place, 'spool'), rows, 'sensor-data')
         for name, spent in (
-            ('look', claims(spool, look=True)),
-            ('drain', claims(spool, look=False)),
+            ('look', claims(spool, poll=True)),
+            ('drain', claims(spool, poll=False)),
             ('blocked', blocked(spool)),
         ):
             figures[f'{name}_p50_ms'], figures[f'{name}_p99_ms'] = median(spent), quantiles(spent, n=100)[98]

@@ -45,7 +45,7 @@ LAST: Final = 0.75
 """Of the time, before the video is asked for."""
 THIRDS: Final = 3
 """Of the time before the video is asked for, in which whatever grows or becomes late would show."""
-MOST_RATIO, MOST_LATE_S, MOST_BEGIN_S = 1.3, 15.0, 20.0
+MAX_RATIO, MAX_LATE_S, MAX_BEGIN_S = 1.3, 15.0, 20.0
 
 
 class Arrivals:
@@ -57,7 +57,7 @@ class Arrivals:
         """Folder -> key -> when it came, and how late; None of what was there before."""
         self._find(lambda _key, _at: None)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         self._find(lambda key, at: (at, at - self._first_ns(key) / SECOND))
 
     def _find(self, late: Any) -> None:
@@ -126,13 +126,13 @@ def _bars(figures: dict[str, Any], late: dict[str, list[float]], rounds: Sequenc
     words = {'_previews': 'preview', KEPT.folder: 'catalog row'}
     shaped = f'link of {MBPS:g} Mbit/s, {figures["seconds"]:g} s'
     return (
-        Bar('CPU of the node that keeps all at full rate, against one beside it that uploads 1 Hz', f'at most {MOST_RATIO}',
-            figures['ratio'], 'of it', figures['ratio'] <= MOST_RATIO, tuple(rounds)),
+        Bar('CPU of the node that keeps all at full rate, against one beside it that uploads 1 Hz', f'at most {MAX_RATIO}',
+            figures['ratio'], 'of it', figures['ratio'] <= MAX_RATIO, tuple(rounds)),
         *(Bar(f'{words[folder]} of what is kept in the store after the message, {shaped}: worst of {len(each)}',
-              f'at most {MOST_LATE_S:g}', max(each), 's', max(each) <= MOST_LATE_S)
+              f'at most {MAX_LATE_S:g}', max(each), 's', max(each) <= MAX_LATE_S)
           for folder, each in late.items()),
         Bar(f'from asking for {ASKED_S} s of 30 Hz video to its first second in the store, the same link',
-            f'at most {MOST_BEGIN_S:g}', figures['begin_s'], 's', figures['begin_s'] <= MOST_BEGIN_S),
+            f'at most {MAX_BEGIN_S:g}', figures['begin_s'], 's', figures['begin_s'] <= MAX_BEGIN_S),
     )  # fmt: skip
 
 
@@ -143,7 +143,7 @@ def _watch(nodes: dict[str, Program], arrivals: Arrivals,
     for _ in range(ROUNDS):
         before, end_s = {name: node.cpu_s() for name, node in nodes.items()}, time.monotonic() + seconds / ROUNDS
         while (left := end_s - time.monotonic()) > 0:
-            arrivals.look()
+            arrivals.poll()
             for name, node in nodes.items():
                 memory[name].append(_proc.memory(node.pid).anon)
             time.sleep(min(2.0, max(left, 0.0)))
@@ -163,7 +163,7 @@ def _pull(source: Bucket, arrivals: Arrivals, seconds: float) -> tuple[float, fl
     until(lambda: source.list(f'{ROBOT}/camera/'), 'the first second of the video', seconds=300.0)
     begin_s, arrived_s = time.monotonic() - began_s, None
     while time.monotonic() - began_s < seconds and arrived_s is None:
-        arrivals.look()
+        arrivals.poll()
         answer = pull.newest_answer(source, ROBOT, request.id)
         if answer is not None and answer.state in pull.FINAL:
             arrived_s = time.monotonic() - began_s

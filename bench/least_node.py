@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import rclpy
 from rclpy.node import Node
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SensorSettings, Settings
 from shadowhound_data_logger.core.model import Batch, DataObject, Sample, SpooledObject
@@ -110,7 +110,7 @@ class LeastNode:
             with path.open('wb', buffering=0) as file:
                 file.write(item.body)
                 os.fsync(file)
-            metadata = {**item.metadata, words.SHA256: sha256}
+            metadata = {**item.metadata, meta.SHA256: sha256}
             found.append(SpooledObject(self._number, item.bucket, item.key, path, len(item.body), sha256, item.content_type,
                                        metadata, item.priority, 0))  # fmt: skip
         rows = [(one.id, one.bucket, one.key, 'pending', one.size, one.sha256, json.dumps(one.metadata)) for one in found]

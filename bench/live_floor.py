@@ -26,7 +26,7 @@ DISCOVERY_S = 2.0
 
 def main() -> None:
     do, topics = sys.argv[1], set(sys.argv[2:])
-    heap.keep()
+    heap.keep_free_blocks()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with without_our_profile(os.environ):
         node = Node('live_floor', start_parameter_services=False, enable_rosout=False)

@@ -63,11 +63,11 @@ def run(url: str, folder: Path) -> tuple[float, list[float], dict[str, Any]]:
         memory: list[float] = []
         done = threading.Event()
 
-        def look() -> None:
+        def poll() -> None:
             while not done.wait(LOOK_S):
                 memory.append(process_memory(child.pid).anon)
 
-        watcher = threading.Thread(target=look, name='memory')
+        watcher = threading.Thread(target=poll, name='memory')
         watcher.start()
         assert child.stdout is not None
         said = child.stdout.read()

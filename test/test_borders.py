@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from shadowhound_data_logger.core import metadata_words
+from shadowhound_data_logger.core import metadata_keys
 
 PACKAGE = 'shadowhound_data_logger'
 ROOT = Path(__file__).parents[1] / PACKAGE
@@ -170,7 +170,7 @@ print([name for name in ('deltalake', 'obstore', 'pyarrow') if name in sys.modul
 
 def test_the_words_of_metadata_are_told() -> None:
     """Each word is defined once, and the page on formats says what it means."""
-    words = {name: word for name, word in vars(metadata_words).items() if name.isupper()}
+    words = {name: word for name, word in vars(metadata_keys).items() if name.isupper()}
     page = (ROOT.parent / 'docs' / 'formats.md').read_text(encoding='utf-8')
     assert len(set(words.values())) == len(words)
     assert [word for word in words.values() if f'`{word}`' not in page] == []

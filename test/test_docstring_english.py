@@ -16,6 +16,8 @@ PACKAGE = ROOT / 'shadowhound_data_logger'
 DONE = (
     'bags/*.py',
     'cli/*.py',
+    'core/*.py',
+    'doctor/*.py',
     'formats/**/*.py',
     'lake/*.py',
     'missions/*.py',

@@ -26,7 +26,7 @@ from e2e.reading import TYPES, assert_same, decode
 from e2e.witness import recorded
 from pypcd4.pypcd4 import PointCloud
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.stores.base import ObjectStore
 from torture._command import Bar, some
@@ -137,7 +137,7 @@ def _objects(found: Audit, heard: Heard, index: Path, store: ObjectStore, robot:
         info = store.head(BUCKET, key)
         said = {} if info is None else info.metadata
         rows[key] = (
-            row['state'], row['sha256'], said.get(words.TOPIC), int(said.get(words.T_START_NS, 0)), int(said.get(words.COUNT, 0)),
+            row['state'], row['sha256'], said.get(meta.TOPIC), int(said.get(meta.T_START_NS, 0)), int(said.get(meta.COUNT, 0)),
         )  # fmt: skip
     keys = {info.key for info in store.list(BUCKET, f'{robot}/')}
     found.wrong['foreign'] += sorted(keys - set(rows))

@@ -121,7 +121,7 @@ class Soak:
 
     def early_and_late(self, what: str) -> tuple[float, float]:
         """Medians of the second and of the last quarter of the time in which the robot published."""
-        values = [float(getattr(look, what)) for look in self.looks]
+        values = [float(getattr(poll, what)) for poll in self.looks]
         quarter = max(1, len(values) // 4)
         return statistics.median(values[quarter : 2 * quarter] or values), statistics.median(values[-quarter:])
 
@@ -131,7 +131,7 @@ class Soak:
             'minutes': round(last.s / 60, 1), 'faults': dict(Counter(fault.what for fault in self.faults)),
             'messages': sum(self.published.values()), 'missed': sum(row['missed'] or 0 for row in self.ledger['topics'].values()),
             'objects': self.ledger['objects']['delivered'],
-            'most_pending': max(look.pending for look in self.looks), 'index_mb': last.index_mb,
+            'most_pending': max(poll.pending for poll in self.looks), 'index_mb': last.index_mb,
             **{what: [round(value, 1) for value in self.early_and_late(what)]
                for what in ('own_mb', 'descriptors', 'threads', 'shm_mb')},
         }  # fmt: skip
@@ -234,7 +234,7 @@ def _kill(tower: Tower) -> None:
 
 def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]], target: Path) -> None:
     """What the node had over the minutes, and when what was wrong."""
-    minutes = [look['s'] / 60 for look in looks]
+    minutes = [poll['s'] / 60 for poll in looks]
     lines = {'own_mb': 'memory [MB]', 'descriptors': 'descriptors', 'threads': 'threads', 'shm_mb': 'shared [MB]',
              'index_mb': 'index [MB]', 'pending': 'objects that wait'}  # fmt: skip
     with mpl.rc_context(STYLE):
@@ -242,7 +242,7 @@ def draw(looks: Sequence[Mapping[str, Any]], faults: Sequence[Mapping[str, Any]]
         for axes, (what, label) in zip(figure.subplots(len(lines), 1, sharex=True), lines.items(), strict=True):
             for fault in faults:
                 axes.axvspan(fault['begin_s'] / 60, fault['end_s'] / 60, color=COLORS[fault['what']], alpha=0.25, lw=0)
-            axes.plot(minutes, [look[what] for look in looks], color=BLUE if what != 'pending' else INK, lw=1.2)
+            axes.plot(minutes, [poll[what] for poll in looks], color=BLUE if what != 'pending' else INK, lw=1.2)
             axes.set(ylabel=label, ylim=(0, None))
             axes.yaxis.label.set_size(8)
         axes.set(xlabel='minutes (yellow: the store is away, red: Tower is killed, green: the clock is wrong)', xlim=(0, None))

@@ -28,7 +28,7 @@ from spool.making import FakeClock, assert_whole, make, receive
 
 from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings
 from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, KeptFilter, PullRequest, encode_inbox, inbox_key
@@ -79,7 +79,7 @@ RULE: Final = 'wifi.ssid == "lab" and lowstate:bms_state.soc > 30'
 EVENTS_RULE: Final = 'not wifi.ssid == "guest"'
 RATE: Final = 40
 """Objects that the link takes in a minute."""
-SHIP: Final = {words.ROBOT: ROBOT, words.SHIP: words.ON_REQUEST}
+SHIP: Final = {meta.ROBOT: ROBOT, meta.SHIP: meta.ON_REQUEST}
 CAMERA = Channel('/front', COMPRESSED_IMAGE, '', '', '', '')
 IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
 
@@ -182,7 +182,7 @@ class Weeks:
             self._restart()
         if self.world.ssid and self.chance.random() < 1 / 240:
             self._ask()
-        judged = {name: rule.judge(self.world, minute * 60.0) for name, rule in self.rules.items() if rule is not None}
+        judged = {name: rule.evaluate(self.world, minute * 60.0) for name, rule in self.rules.items() if rule is not None}
         self.closed = {name: found.why for name, found in judged.items() if not found.holds}
         for _ in range(6):
             self.server.step()
@@ -225,14 +225,14 @@ class Weeks:
             bucket=BAGS, key=f'{ROBOT}/rosbags/patrol_{_day(begin_ns)}/patrol_{minute}.mcap',
             body=FileBody(info.path, info.bytes, info.sha256), content_type='application/octet-stream', sensor='bag',
             topic=None, type='', samples=info.messages, t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, priority=5,
-            protected=False, metadata={**SHIP, words.MESSAGES: str(info.messages)}, counts=counts,
+            protected=False, metadata={**SHIP, meta.MESSAGES: str(info.messages)}, counts=counts,
         )  # fmt: skip
 
     def _event(self) -> DataObject:
         now_ns = self.clock.now_ns
         self.figures['events'] += 1
         return make(f'{ROBOT}/camera/{_day(now_ns)}/event_{now_ns}.jpg', self.chance.randbytes(2000), t_start_ns=now_ns + 1,
-                    t_end_ns=now_ns + 1, protected=True, metadata={words.ROBOT: ROBOT, words.EVENT: 'bump'})  # fmt: skip
+                    t_end_ns=now_ns + 1, protected=True, metadata={meta.ROBOT: ROBOT, meta.EVENT: 'bump'})  # fmt: skip
 
     def _ask(self) -> None:
         """Somebody wants up to an hour of the camera, of the last three days."""
@@ -263,7 +263,7 @@ class Weeks:
                 self.faults.append(f'{iso(self.clock.now_ns)}: {item.key} was sent, though {self.closed[rule]}')
             self.store.put(item)
             if item.key in self.recorded:
-                self.sent[item.key] = int(item.metadata[words.COUNT])
+                self.sent[item.key] = int(item.metadata[meta.COUNT])
         self.spool.commit(outcomes=[Outcome(item, State.DELIVERED) for item in items])
         self.figures['objects sent'] += len(items)
 
@@ -362,7 +362,7 @@ class Weeks:
         kept = {
             row['key']: (row['bytes'], row['count']) for row in pull.kept(self.source, ROBOT, KeptFilter(), findings).to_pylist()
         }
-        own = {row['key']: (row['bytes'], json.loads(row['metadata']).get(words.COUNT)) for row in self._rows("state = 'kept'")}
+        own = {row['key']: (row['bytes'], json.loads(row['metadata']).get(meta.COUNT)) for row in self._rows("state = 'kept'")}
         for key in kept.keys() ^ own.keys():
             self.faults.append(
                 f'{now}: {key} is {"kept, and the catalog does not say so" if key in own else "in the catalog alone"}'
@@ -447,7 +447,7 @@ def _day(time_ns: int) -> str:
 
 
 def _sensor(item: SpooledObject) -> str:
-    return item.metadata.get(words.SENSOR, '')
+    return item.metadata.get(meta.SENSOR, '')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

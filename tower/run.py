@@ -78,7 +78,7 @@ class Runner:
             self._start_ingest(running)
             self._running = running.pop_all()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Hand on to MLflow who its users are by now, where it cannot look itself."""
         if self._is_root:
             self._give(self._folder / 'mlflow' / 'users.json')
@@ -167,7 +167,7 @@ class Runner:
         for server, standard, method in (seaweedfs.S3, *seaweedfs.OTHERS):
             port = standard + self._offset  # ours alone: another Tower may run beside this one
             for host in {LOOPBACK, LOOPBACK if self._bind in EVERY_ADDRESS else self._bind}:
-                if seaweedfs.answers_anybody(host, port, method):
+                if seaweedfs.answers_without_keys(host, port, method):
                     raise ServerFailed(
                         f'the {server} of SeaweedFS serves everybody at {host}:{port}',
                         remedy='it asks for no certificate (secrets/seaweedfs.*): install the version of docs/tower.md',
@@ -359,7 +359,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f'credentials     {options.folder / "secrets"}/NAME.env   (thor, spark, ...)', flush=True)
             while True:
                 time.sleep(LOOK_S)
-                tower.look()
+                tower.poll()
         finally:
             tower.stop()
     except KeyboardInterrupt:

@@ -21,7 +21,7 @@ from shadowhound_data_logger.bags.description import Description, describe_files
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import MANIFEST, MCAP, METADATA, PACKED, SLICES, SQLITE, natural_key
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
-from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, decompress
 from shadowhound_data_logger.core.zstd import ZstdError, ZstdFile
 from shadowhound_data_logger.formats.definitions import describe
 from shadowhound_data_logger.formats.mcap.format import CDR, ROS2
@@ -332,7 +332,7 @@ class BagReader:
         if not (is_packed or self._is_packed):
             return message
         try:
-            return message._replace(cdr=unpacked('zstd', message.cdr))
+            return message._replace(cdr=decompress('zstd', message.cdr))
         except ValueError as error:
             raise BagDamaged(f'a message in {name} cannot be unpacked: {error}', path=name) from error
 

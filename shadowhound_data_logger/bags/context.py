@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.manifest import ClockOf
 from shadowhound_data_logger.bags.naming import BUCKET, UNSYNCED, bag_name, key_of, slice_file, unsynced_name
 from shadowhound_data_logger.bags.queue import MessageBatch
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, Clock
 from shadowhound_data_logger.core.dating import Dating
 from shadowhound_data_logger.spool.writer import SpoolWriter
@@ -53,7 +53,7 @@ class BagContext:
         wall_ns, boot_ns = self.clock.wall_ns(), self.clock.boot_ns()
         if wall_ns >= EARLIEST_SANE_NS:
             return None
-        return ClockOf(words.UNSET, self.clock.boot_id, max(0, boot_ns - age_ns), max(0, wall_ns - age_ns), None)
+        return ClockOf(meta.UNSET, self.clock.boot_id, max(0, boot_ns - age_ns), max(0, wall_ns - age_ns), None)
 
     def name(self, what: str, unset_clock: ClockOf | None, age_ns: int = 0) -> str:
         """A unique name for a bag that starts."""
@@ -79,7 +79,7 @@ class BagContext:
             return False
         if offset_ns:
             began_ns = clock.boot_ns + offset_ns
-            clock = replace(clock, known=words.SET_LATER, offset_ns=began_ns - clock.wall_ns)
+            clock = replace(clock, known=meta.SET_LATER, offset_ns=began_ns - clock.wall_ns)
             name = bag_name(state.bag.rpartition(UNSYNCED)[0], began_ns, lambda name: self._is_taken(name, state))
         else:
             name = state.bag

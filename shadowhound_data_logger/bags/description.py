@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.naming import SQLITE, natural_key
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.untrusted import check_size, from_yaml
@@ -67,7 +67,7 @@ class Description:
     t_end_ns: int | None
     """As in ``BagPart``."""
     clock: Mapping[str, str] = field(default_factory=dict)
-    """If the clock was not set: how its times are known, with the keys of ``metadata_words.py``. Otherwise empty."""
+    """If the clock was not set: how its times are known, with the keys of ``metadata_keys.py``. Otherwise empty."""
     absent: tuple[str, ...] = ()
     """Files that the metadata names but that do not exist."""
     damaged: Mapping[str, str] = field(default_factory=dict)
@@ -232,15 +232,15 @@ def clock_state(custom: object) -> dict[str, str]:
     """``Description.clock`` from a bag's custom data or a slice's metadata; ignores data that we did not write."""
     if not isinstance(custom, Mapping):
         return {}
-    known, boot_id, offset_ns = (custom.get(word) for word in (words.CLOCK, words.BOOT_ID, words.CLOCK_OFFSET_NS))
-    if known not in {words.SET_LATER, words.UNSET} or not isinstance(boot_id, str) or len(boot_id) > MAX_BOOT_ID:
+    known, boot_id, offset_ns = (custom.get(word) for word in (meta.CLOCK, meta.BOOT_ID, meta.CLOCK_OFFSET_NS))
+    if known not in {meta.SET_LATER, meta.UNSET} or not isinstance(boot_id, str) or len(boot_id) > MAX_BOOT_ID:
         return {}
-    found = {words.CLOCK: str(known), words.BOOT_ID: boot_id}
-    if known == words.UNSET:
+    found = {meta.CLOCK: str(known), meta.BOOT_ID: boot_id}
+    if known == meta.UNSET:
         return found
     if not isinstance(offset_ns, str) or not re.fullmatch('[0-9]{1,20}', offset_ns) or int(offset_ns) >= _LATEST_NS:
         return {}
-    return {**found, words.CLOCK_OFFSET_NS: offset_ns}
+    return {**found, meta.CLOCK_OFFSET_NS: offset_ns}
 
 
 def _topics(found: Iterable[Mapping[str, Any]]) -> Iterable[DescribedTopic]:

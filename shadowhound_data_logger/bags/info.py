@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.remote import (
     missing_of,
     state_of,
 )
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Meter, Ranged, StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -101,7 +101,7 @@ def _info(robot: str, name: str, where: Mapping[str, tuple[int, str]], manifest:
 def _tags(store: ObjectStore, bag: RemoteBag, waiting: Mapping[str, UnsentFile]) -> Mapping[str, str]:
     """The object metadata of one slice, which identifies the writer of the bag and the clock of its times."""
     for file in waiting.values():
-        return file.metadata or {words.BAG: bag.name}
+        return file.metadata or {meta.BAG: bag.name}
     is_described = bag.file(MANIFEST) and bag.file(METADATA)
     held = store.head(BUCKET, bag.slices[0].key) if bag.slices and not is_described else None
     return held.metadata if held else {}

@@ -15,7 +15,7 @@ from typing import Final
 from shadowhound_data_logger.bags.manifest import COMPLETE, Manifest, MissionOf, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, natural_key, slice_file
 from shadowhound_data_logger.bags.objects import SENSOR, ros_distro
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES
 from shadowhound_data_logger.core.model import DataObject, FileBody
@@ -97,17 +97,17 @@ class KeptCut:
 
     def _objects(self, info: SliceInfo) -> list[DataObject]:
         source = self.slices[0].metadata
-        copied = (words.ROBOT, words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE)
-        marks = {name: source[name] for name in copied if name in source} | {words.BAG: self.bag, words.CUT_OF: self._of}
-        mission = MissionOf(source.get(words.MISSION_TYPE, ''), source.get(words.MISSION_ID), source.get(words.RUN_ID))
+        copied = (meta.ROBOT, meta.MISSION_ID, meta.RUN_ID, meta.MISSION_TYPE)
+        marks = {name: source[name] for name in copied if name in source} | {meta.BAG: self.bag, meta.CUT_OF: self._of}
+        mission = MissionOf(source.get(meta.MISSION_TYPE, ''), source.get(meta.MISSION_ID), source.get(meta.RUN_ID))
         manifest = Manifest(
             bag=self.bag, robot=self.robot, mission=mission if mission.mission_id or mission.run_id else None, state=COMPLETE,
             missing=(), topics=topics_of([info]), slices=(SliceEntry.of(info, self.places[0][1]),),
         )  # fmt: skip
-        times = {words.T_START_NS: str(info.t_start_ns), words.T_END_NS: str(info.t_end_ns)}
+        times = {meta.T_START_NS: str(info.t_start_ns), meta.T_END_NS: str(info.t_end_ns)}
         bodies: tuple[tuple[FileBody | bytes, str, dict[str, str]], ...] = (
             (FileBody(info.path, info.bytes, info.sha256), 'application/octet-stream',
-             {words.SLICE: '0', words.MESSAGES: str(info.messages), **times}),
+             {meta.SLICE: '0', meta.MESSAGES: str(info.messages), **times}),
             (metadata_yaml([info], ros_distro=ros_distro()), 'application/yaml', {}),
             (manifest.to_json(), 'application/json', {}),
         )  # fmt: skip

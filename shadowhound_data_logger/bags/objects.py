@@ -11,7 +11,7 @@ from typing import Final
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, RECOVERED, Manifest, Missing, SliceEntry, topics_of
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, key_of, prefix_of, slice_number
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import metadata_yaml
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
@@ -39,10 +39,10 @@ def slice_object(state: BagState, info: SliceInfo, priority: int, *, is_kept: bo
     is_event = state.event is not None
     file, (start_ns, end_ns) = state.final(info.path.name), _times(state, info.t_start_ns, info.t_end_ns)
     metadata = {
-        **_marks(state), words.SLICE: str(slice_number(state.bag, file)), words.MESSAGES: str(info.messages),
-        **({words.T_START_NS: str(start_ns), words.T_END_NS: str(end_ns)} if _is_dated(state) else {}),
+        **_marks(state), meta.SLICE: str(slice_number(state.bag, file)), meta.MESSAGES: str(info.messages),
+        **({meta.T_START_NS: str(start_ns), meta.T_END_NS: str(end_ns)} if _is_dated(state) else {}),
         **_clock_marks(state, info.t_start_ns, info.t_end_ns),
-        **({words.SHIP: words.ON_REQUEST} if is_kept and not is_event else {}),
+        **({meta.SHIP: meta.ON_REQUEST} if is_kept and not is_event else {}),
     }  # fmt: skip
     return DataObject(
         bucket=BUCKET, key=key_of(state.robot, state.bag, file), body=FileBody(info.path, info.bytes, info.sha256),
@@ -114,12 +114,12 @@ def _document(state: BagState, file: str, body: bytes, content_type: str, span: 
 
 
 def _marks(state: BagState) -> dict[str, str]:
-    marks = {words.ROBOT: state.robot, words.BAG: state.bag}
+    marks = {meta.ROBOT: state.robot, meta.BAG: state.bag}
     if state.event is not None:
-        marks[words.EVENT] = state.event.name
+        marks[meta.EVENT] = state.event.name
     if state.mission is not None:
-        mission = {words.MISSION_ID: state.mission.mission_id, words.RUN_ID: state.mission.run_id,
-                   words.MISSION_TYPE: state.mission.type}  # fmt: skip
+        mission = {meta.MISSION_ID: state.mission.mission_id, meta.RUN_ID: state.mission.run_id,
+                   meta.MISSION_TYPE: state.mission.type}  # fmt: skip
         marks |= {word: value for word, value in mission.items() if value}
     return marks
 
@@ -146,8 +146,8 @@ def _clock_marks(state: BagState, *times_ns: int) -> dict[str, str]:
     clock = state.clock
     if clock is None:
         return {}
-    marks = {words.CLOCK: clock.known, words.BOOT_ID: clock.boot_id}
+    marks = {meta.CLOCK: clock.known, meta.BOOT_ID: clock.boot_id}
     if clock.offset_ns is not None:
-        marks[words.CLOCK_OFFSET_NS] = str(clock.offset_ns)
+        marks[meta.CLOCK_OFFSET_NS] = str(clock.offset_ns)
     boot = (str(max(0, time_ns - clock.wall_ns + clock.boot_ns)) for time_ns in times_ns)
-    return {**marks, **dict(zip((words.BOOT_START_NS, words.BOOT_END_NS), boot, strict=False))}
+    return {**marks, **dict(zip((meta.BOOT_START_NS, meta.BOOT_END_NS), boot, strict=False))}

@@ -25,7 +25,7 @@ from shadowhound_data_logger.bags.remote import (
     read_manifest,
     state_of,
 )
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.formats.mcap.ranges import StoredFile
@@ -133,7 +133,7 @@ def _tags(store: ObjectStore, bag: RemoteBag, local: Iterable[UnsentFile]) -> di
     found: dict[str, Mapping[str, str]] = {file.name: file.metadata for file in local if file.metadata}
     for file in bag.slices:
         held = store.head(BUCKET, file.key)
-        if held is None or words.BAG not in held.metadata:
+        if held is None or meta.BAG not in held.metadata:
             break
         found[file.name] = held.metadata
     return found
@@ -156,7 +156,7 @@ def _facts(store: ObjectStore, bag: RemoteBag, manifest: Manifest | None, tags: 
             return _Facts(found.messages, len({topic.name for topic in found.topics}), found.t_start_ns, found.t_end_ns,
                           '; '.join(wrong), '; '.join(each for each in found.remarks if each != NOT_READ))  # fmt: skip
     try:
-        numbers = [tuple(int(tag[word]) for word in (words.MESSAGES, words.T_START_NS, words.T_END_NS)) for tag in tags]
+        numbers = [tuple(int(tag[word]) for word in (meta.MESSAGES, meta.T_START_NS, meta.T_END_NS)) for tag in tags]
     except (KeyError, ValueError):
         return _Facts()
     if not all(0 <= value < 1 << 64 for each in numbers for value in each):

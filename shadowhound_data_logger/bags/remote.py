@@ -14,7 +14,7 @@ from typing import Final
 from shadowhound_data_logger.bags.description import clock_state
 from shadowhound_data_logger.bags.manifest import Manifest
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, METADATA, SLICES, natural_key, prefix_of
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import UnknownBag
 from shadowhound_data_logger.formats.mcap.ranges import StoredFile, read_whole
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -119,7 +119,7 @@ def state_of(bag: RemoteBag, manifest: Manifest | None, slice_metadata: Mapping[
     """The state; ``slice_metadata`` is the object metadata of any slice, needed only without a manifest."""
     if manifest is not None:
         return GROWING if missing_of(bag, manifest) else manifest.state
-    return GROWING if words.BAG in slice_metadata and not bag.file(METADATA) else FOREIGN
+    return GROWING if meta.BAG in slice_metadata and not bag.file(METADATA) else FOREIGN
 
 
 def _ordered(files: Iterable[RemoteFile]) -> tuple[RemoteFile, ...]:

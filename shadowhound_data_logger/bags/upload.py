@@ -17,14 +17,14 @@ from typing import Final
 from shadowhound_data_logger.bags.fetch import disk_errors
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST
 from shadowhound_data_logger.bags.upload_plan import PlannedFile, UploadPlan, archive_of, plan_of, read_finished
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import BagError, ForeignObject
 from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State
 from shadowhound_data_logger.core.progress import ProgressListener
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.shipping.uploader import Uploader, delivering
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import MAX_OBJECTS, Spool
@@ -86,9 +86,9 @@ def upload_now(store: ObjectStore, plan: UploadPlan, *, deadline_s: float, progr
     def put(place: int) -> None:
         file = plan.files[place]
         item = SpooledObject(place, BUCKET, file.key, file.path, file.size, file.sha256, file.content_type,
-                             {**file.metadata, words.SHA256: file.sha256}, PRIORITY, 0)  # fmt: skip
+                             {**file.metadata, meta.SHA256: file.sha256}, PRIORITY, 0)  # fmt: skip
         try:
-            steadily(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
+            with_retries(lambda: store.put(item), tries=float('inf'), until_s=end_s, cap_s=CAP_S)
         except ForeignObject as error:
             raise _name_taken(plan.bag, str(error.data.get('key'))) from error
         progress.have(file.size)
@@ -189,7 +189,7 @@ def _check_names(spool: Spool, plan: UploadPlan) -> None:
 
 
 def _object(file: PlannedFile, path: Path) -> DataObject:
-    is_slice = file.name != MANIFEST and words.MESSAGES in file.metadata
+    is_slice = file.name != MANIFEST and meta.MESSAGES in file.metadata
     return DataObject(
         bucket=BUCKET, key=file.key, body=FileBody(path, file.size, file.sha256), content_type=file.content_type,
         sensor='rosbags', topic=None, type='', samples=0, t_start_ns=file.t_start_ns, t_end_ns=file.t_end_ns,

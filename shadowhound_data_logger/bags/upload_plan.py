@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.description import Description
 from shadowhound_data_logger.bags.manifest import COMPLETE, GAPS, Manifest, Missing, RecordedTopic, SliceEntry
 from shadowhound_data_logger.bags.naming import MANIFEST, METADATA, UNSAFE, prefix_of
 from shadowhound_data_logger.bags.remote import ARCHIVE
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import BagDamaged, BagError
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, MAX_SEGMENT_BYTES, check_key, check_name, is_segment, unique
@@ -179,7 +179,7 @@ def archive_of(found: FinishedBag, robot: str, bag: str, work: Path) -> UploadPl
         for file in sorted(each for each in folder.rglob('*') if each.is_file()):
             archive.add(file, f'{bag}/{file.relative_to(folder)}', recursive=False, filter=_anonymous)
     key = check_key(f'{prefix_of(robot)}{name}')
-    metadata = {words.ROBOT: robot, words.BAG: bag, words.MESSAGES: str(description.messages)}
+    metadata = {meta.ROBOT: robot, meta.BAG: bag, meta.MESSAGES: str(description.messages)}
     item = PlannedFile(
         name, key, path, *fingerprint(path), metadata, _index_time(description.t_start_ns), _index_time(description.t_end_ns)
     )
@@ -194,7 +194,7 @@ def _anonymous(member: tarfile.TarInfo) -> tarfile.TarInfo:
 
 def _outgoing(path: Path, name: str, robot: str, bag: str) -> PlannedFile:
     key = check_key(f'{prefix_of(robot, bag)}{name}')
-    return PlannedFile(name, key, path, *fingerprint(path), {words.ROBOT: robot, words.BAG: bag})
+    return PlannedFile(name, key, path, *fingerprint(path), {meta.ROBOT: robot, meta.BAG: bag})
 
 
 def _with_metadata(file: PlannedFile, info: SliceInfo | None, robot: str, bag: str) -> PlannedFile:
@@ -202,9 +202,9 @@ def _with_metadata(file: PlannedFile, info: SliceInfo | None, robot: str, bag: s
     if info is None:
         return file
     number = _NUMBER.search(file.name)
-    facts = {words.MESSAGES: info.messages, words.T_START_NS: info.t_start_ns, words.T_END_NS: info.t_end_ns}
-    facts |= {words.SLICE: int(number[1])} if number else {}
-    metadata = {words.ROBOT: robot, words.BAG: bag, **{name: str(value) for name, value in facts.items()}}
+    facts = {meta.MESSAGES: info.messages, meta.T_START_NS: info.t_start_ns, meta.T_END_NS: info.t_end_ns}
+    facts |= {meta.SLICE: int(number[1])} if number else {}
+    metadata = {meta.ROBOT: robot, meta.BAG: bag, **{name: str(value) for name, value in facts.items()}}
     return replace(file, metadata=metadata, t_start_ns=_index_time(info.t_start_ns), t_end_ns=_index_time(info.t_end_ns))
 
 

@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.description import Description, describe_files
 from shadowhound_data_logger.bags.manifest import Manifest, Missing
 from shadowhound_data_logger.bags.naming import BUCKET, MANIFEST, MCAP, METADATA, SLICES
 from shadowhound_data_logger.bags.remote import FOREIGN, RemoteBag, RemoteFile, document, state_of
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.untrusted import is_path
 from shadowhound_data_logger.formats.mcap.index import DATA_END_BYTES, McapIndex, check_crcs, read_end, read_summary, scan
@@ -162,7 +162,7 @@ def _check_remote(
     store: ObjectStore, file: RemoteFile, expected: _Expected, meter: Meter, deep: bool, on_progress: OnProgress
 ) -> FileCheck:
     held = store.head(BUCKET, file.key)
-    if held is not None and words.THINNED in held.metadata:  # thinned after the manifest was written, see the gap journal
+    if held is not None and meta.THINNED in held.metadata:  # thinned after the manifest was written, see the gap journal
         expected = _Expected(expected.name, None, held.sha256, None)
     kind = compare(held, expected.size, expected.sha256)
     if held is None:

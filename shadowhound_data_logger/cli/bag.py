@@ -45,7 +45,7 @@ from shadowhound_data_logger.cli.output import (
     volume,
     with_dates,
 )
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.errors import BagDamaged, BagError, NameRefused, StoreUnavailable
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
@@ -249,9 +249,9 @@ def _page(found: BagInfo) -> Iterator[RenderableType]:
 
 def _clock(clock: Mapping[str, str], start_ns: int | None) -> str:
     """What the times of a bag are worth whose clock was not set."""
-    if words.CLOCK_OFFSET_NS not in clock:
-        return f'was never set in boot {clock[words.BOOT_ID]}: the date is not known, and the times below are by that clock'
-    offset_ns = int(clock[words.CLOCK_OFFSET_NS])
+    if meta.CLOCK_OFFSET_NS not in clock:
+        return f'was never set in boot {clock[meta.BOOT_ID]}: the date is not known, and the times below are by that clock'
+    offset_ns = int(clock[meta.CLOCK_OFFSET_NS])
     began = f'the bag began {shown_time(start_ns + offset_ns)} UTC' if start_ns is not None else 'the bag has no messages'
     return f'was not set yet: {began}, and {offset_ns / 1e9:.3f} s must be added to the times below'
 

@@ -131,11 +131,11 @@ def _examine(checks: Sequence[Check], context: Context, timeout_s: float) -> lis
     waiting = [check.name for check in checks]
     with progress(f'asking {", ".join(waiting)}') as bar:
 
-        def tell(check: Check) -> None:
+        def on_end(check: Check) -> None:
             waiting.remove(check.name)
             bar.say(f'asking {", ".join(waiting)}')
 
-        return Examination(checks, context, timeout_s=timeout_s, tell=tell).run()
+        return Examination(checks, context, timeout_s=timeout_s, on_end=on_end).run()
 
 
 def _is_fixed(result: Result, fixed: Sequence[tuple[Result, str]]) -> bool:

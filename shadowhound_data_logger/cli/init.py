@@ -25,7 +25,7 @@ from shadowhound_data_logger.core.type_rules import not_logged, sensor_for
 from shadowhound_data_logger.ros.endpoints import alternatives
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.doctor.ros_watch import Heard
+    from shadowhound_data_logger.doctor.ros_watch import WatchedTopic
 
 LATCHED_S: Final = 3600.0
 """What is stored on a change is assumed to change once in so long."""
@@ -143,7 +143,7 @@ def _proposals(seconds: float, namespace: str, robot: str) -> list[Proposal]:
     return proposals
 
 
-def _sensor(one: Heard, named: Mapping[str, tuple[SensorSettings, str, str]], graph: Mapping[str, Sequence[str]],
+def _sensor(one: WatchedTopic, named: Mapping[str, tuple[SensorSettings, str, str]], graph: Mapping[str, Sequence[str]],
             taken: set[str]) -> tuple[SensorSettings | None, str]:  # fmt: skip
     """That of the default settings if the topic is one of its topics, else one by the rule for its type; or why none."""
     sensor, _, allowed = named.get(one.topic, (None, '', ''))
@@ -157,7 +157,7 @@ def _sensor(one: Heard, named: Mapping[str, tuple[SensorSettings, str, str]], gr
     return sensor_for(one.topic, one.type, {*taken, *DEFAULT_SENSORS}, is_latched=latched), ''
 
 
-def _stored_bytes(one: Heard, sensor: SensorSettings, robot: str, types: Any) -> float | None:
+def _stored_bytes(one: WatchedTopic, sensor: SensorSettings, robot: str, types: Any) -> float | None:
     from shadowhound_data_logger.formats.encoders import encode  # noqa: PLC0415 - numpy and encoders
 
     if not one.newest:

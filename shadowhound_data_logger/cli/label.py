@@ -35,7 +35,7 @@ from shadowhound_data_logger.cli.output import (
 from shadowhound_data_logger.cli.question import asking, quietly, ranges_option, report_skipped
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, visible
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, visible
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.bucket import Bucket
@@ -119,7 +119,7 @@ def label_import(*, file: Any, robot: str | None, user: str | None, as_json: boo
     A CSV names its columns: label, since and until, or key; and any of robot bucket x y width height note. The file names of a
     COCO file are keys, as `fetch` arranges images. Exit code 1 if the catalog lacks one of them: the others are imported.
     """
-    body = file.read(MOST_DOCUMENT_BYTES + 1)
+    body = file.read(MAX_DOCUMENT_BYTES + 1)
     now_ns = SystemClock.of_this_machine().wall_ns()
     robot = robot or os.environ.get('SHADOWHOUND_ROBOT') or ''
     with asking():

@@ -106,7 +106,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     is_robot = spool is not None or rtsp is not None
     settings = as_it_is(given, is_robot=is_robot)
     logging.basicConfig(level=logging.INFO, format='%(message)s')
-    heap.keep()
+    heap.keep_free_blocks()
 
     def announce(server: LiveServer) -> None:
         if as_json:
@@ -141,8 +141,8 @@ def as_it_is(given: LiveSettings, *, is_robot: bool) -> LiveSettings:
     return replace(given, robot=robot, is_of_store=is_of_store, waits=waits)
 
 
-async def serve(settings: LiveSettings, look: Callable[[], LiveSettings], announce: Callable[[LiveServer], None]) -> None:
-    """Serve until a signal; another page at the same port when what ``look`` finds is not what is served any more."""
+async def serve(settings: LiveSettings, poll: Callable[[], LiveSettings], announce: Callable[[LiveServer], None]) -> None:
+    """Serve until a signal; another page at the same port when what ``poll`` finds is not what is served any more."""
     from shadowhound_data_logger.live.server import LiveServer  # noqa: PLC0415 - aiohttp
 
     stop = asyncio.Event()
@@ -157,7 +157,7 @@ async def serve(settings: LiveSettings, look: Callable[[], LiveSettings], announ
             if is_first:
                 announce(server)
             is_first = False
-            served = await changed(replace(served, port=settings.port), look, stop)
+            served = await changed(replace(served, port=settings.port), poll, stop)
         finally:
             await server.close()
         if served is not None:
@@ -165,14 +165,14 @@ async def serve(settings: LiveSettings, look: Callable[[], LiveSettings], announ
             served = replace(served, port=server.port)
 
 
-async def changed(served: LiveSettings, look: Callable[[], LiveSettings], stop: asyncio.Event) -> LiveSettings | None:
+async def changed(served: LiveSettings, poll: Callable[[], LiveSettings], stop: asyncio.Event) -> LiveSettings | None:
     """The settings once they differ, because a node has started here or its spool is gone; None at the end."""
     while True:
         with suppress(asyncio.TimeoutError):
             await asyncio.wait_for(stop.wait(), LOOK_S)
             return None
         with suppress(DataLoggerError, BadUsage):  # it cannot be decided now
-            if (found := look()) != served:
+            if (found := poll()) != served:
                 return found
 
 

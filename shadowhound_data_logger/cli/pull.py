@@ -28,7 +28,7 @@ from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.mailbox import (
     BAG_SENSOR,
     DEFAULT_PRIORITY,
-    LONGEST_NS,
+    MAX_EXPIRY_NS,
     MAX_KEYS,
     KeptFilter,
     Offer,
@@ -62,7 +62,7 @@ _BAG: Final = re.compile(r'[A-Za-z0-9_.*?-]+')
 )
 @click.option(
     '--expires',
-    type=Age(LONGEST_NS),
+    type=Age(MAX_EXPIRY_NS),
     metavar='AGE',
     default='7d',
     show_default=True,

@@ -13,7 +13,7 @@ from shadowhound_data_logger.cli.common import BadUsage, ExitCode, exit_code
 from shadowhound_data_logger.cli.output import number
 from shadowhound_data_logger.core.errors import LakeError, SettingError, UnknownName
 from shadowhound_data_logger.core.stamps import BY_STAMP, CLOCKS
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_json
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, from_json
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
@@ -99,7 +99,7 @@ def _ranges(file: Any) -> list[Any] | None:
     if file is None:
         return None
     try:
-        told = from_json(file.read(MOST_DOCUMENT_BYTES + 1))
+        told = from_json(file.read(MAX_DOCUMENT_BYTES + 1))
     except ValueError as error:
         raise BadUsage(f'--ranges {file.name}: {error}', _RANGES) from error
     found = told.get('ranges') if isinstance(told, dict) else told

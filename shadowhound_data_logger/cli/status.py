@@ -104,14 +104,14 @@ def status(*, watch: bool, interval: float, as_json: bool, robot: str | None, sp
     """
     folder, clock = the_spool(spool), SystemClock.of_this_machine()
 
-    def look() -> Page:
+    def poll() -> Page:
         return _look(folder, robot, clock)
 
     console = Console(highlight=False)
     if watch:
-        _watch(look, console, interval, as_json=as_json)
+        _watch(poll, console, interval, as_json=as_json)
         return ExitCode.FINE
-    page = look()
+    page = poll()
     if as_json:
         print_json(page.as_dict())
     else:
@@ -138,12 +138,12 @@ def _look(spool: Path, robot: str | None, clock: Clock) -> Page:
     return Page(replace(chosen, findings=tuple(findings)), others, active, isolation)
 
 
-def _watch(look: Callable[[], Page], console: Console, interval: float, *, as_json: bool) -> None:
+def _watch(poll: Callable[[], Page], console: Console, interval: float, *, as_json: bool) -> None:
     """Until Ctrl-C; on a terminal the last view stays on the screen."""
     try:
         if as_json or not console.is_terminal or console.is_dumb_terminal:
             while True:
-                page = look()
+                page = poll()
                 if as_json:
                     print_json(page.as_dict(), is_line=True)
                 else:
@@ -151,11 +151,11 @@ def _watch(look: Callable[[], Page], console: Console, interval: float, *, as_js
                 time.sleep(interval)
         with Live(console=console, auto_refresh=False, screen=True) as live:
             while True:
-                live.update(Group(*fitted(view(look(), console), console)), refresh=True)
+                live.update(Group(*fitted(view(poll(), console), console)), refresh=True)
                 time.sleep(interval)
     except KeyboardInterrupt:
         if console.is_terminal and not as_json:
-            print_page(*view(look(), console), console=console)
+            print_page(*view(poll(), console), console=console)
 
 
 def view(page: Page, console: Console) -> list[RenderableType]:

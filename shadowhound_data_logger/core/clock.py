@@ -1,4 +1,4 @@
-"""Wall clock, boot clock and how far either can be trusted. Handed in wherever time matters, so that tests own it."""
+"""The wall clock and the boot clock. They are injected wherever time matters, so that tests control them."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import Final, Protocol
 
 SECOND: Final = 1_000_000_000
 EARLIEST_SANE_NS: Final = 1_704_067_200 * SECOND
-"""2024-01-01 UTC: a robot that claims an earlier time has a clock that was never set."""
+"""2024-01-01 UTC: a robot that reports an earlier time has a clock that was never set."""
 FUTURE_SLACK_NS: Final = 24 * 3600 * SECOND
-"""What is further ahead of the clock than this is wrong, not early."""
+"""A stamp further ahead of the clock than this is wrong, not early."""
 
 MAX_AGE_NS: Final = 10 * SECOND
-"""No message waits longer for its take; a difference beyond it is one between two clocks."""
+"""No message waits longer for its take; a larger difference is between two clocks."""
 
 
 class Clock(Protocol):
-    """What the package asks of time."""
+    """The clocks that this package reads."""
 
     @property
     def boot_id(self) -> str:
@@ -35,7 +35,7 @@ class Clock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SystemClock:
-    """The machine's own clocks."""
+    """The clocks of this machine."""
 
     boot_id: str
 

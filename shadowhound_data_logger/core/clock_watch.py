@@ -1,7 +1,7 @@
-"""Watches the wall clock by the boot clock: whether it was ever set, and when it steps.
+"""Compares the wall clock with the boot clock: whether it was ever set, and when it steps.
 
 A robot without a battery for its clock starts in 1970 (or in the year of its image) and learns the time minutes later, or
-never. The boot clock does not step; the difference between the two does when somebody sets the wall clock.
+never. The boot clock never steps; the difference between the two changes when the wall clock is set.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from shadowhound_data_logger.core.status import ClockState
 log = logging.getLogger(__name__)
 
 STEP_NS: Final = SECOND
-"""A clock that is slewed (at most 0.5 ms a second) never moves so far between two looks."""
+"""A slewed clock (at most 0.5 ms per second) never moves this far between two polls."""
 
 
 class ClockWatch:
-    """A Clock that knows how far it can be trusted. New; ``look`` once a second on one thread, the rest on any.
+    """A Clock that reports whether it can be trusted. New; call ``poll`` once per second on one thread, the rest on any thread.
 
-    ``_lock`` guards what the last look found. ``steps`` are those that earlier processes have counted.
+    ``_lock`` guards the results of the last poll. ``steps`` counts the steps seen by earlier processes.
     """
 
     def __init__(self, clock: Clock, hold_s: float, steps: int = 0) -> None:
@@ -33,7 +33,7 @@ class ClockWatch:
         self._offset_ns = clock.wall_ns() - clock.boot_ns()
         self._unset_since_ns = clock.boot_ns()
         self._was_set = self.is_set
-        self._told = self._gave_up = False
+        self._warned = self._gave_up = False
         self._steps = steps
         self._last_step_ns: int | None = None
         self._stepped_ns = 0
@@ -50,7 +50,7 @@ class ClockWatch:
 
     @property
     def unset_since_ns(self) -> int:
-        """By the boot clock: since when it is not set, as far as this process knows. It says nothing while it is set."""
+        """Since when the clock has not been set, by the boot clock, as far as this process knows. Meaningless while it is set."""
         with self._lock:
             return self._unset_since_ns
 
@@ -59,7 +59,7 @@ class ClockWatch:
         return self._clock.wall_ns() >= EARLIEST_SANE_NS
 
     def offset_ns(self) -> int | None:
-        """What has to be added to the boot clock to have UTC; None while the clock is not set."""
+        """UTC minus boot clock; None while the clock is not set."""
         wall_ns = self._clock.wall_ns()
         return wall_ns - self._clock.boot_ns() if wall_ns >= EARLIEST_SANE_NS else None
 
@@ -71,8 +71,8 @@ class ClockWatch:
             return ClockState(is_set, unset_ns > self._hold_ns, round(unset_ns / SECOND, 1), self._steps,
                               None if step is None else round(step / SECOND, 3), None if step is None else age_s)  # fmt: skip
 
-    def look(self) -> bool:
-        """Compare with the last look and say what changed; whether anything did."""
+    def poll(self) -> bool:
+        """Compare with the last poll and log what changed; return whether anything did."""
         with self._lock:
             was_set, self._was_set = self._was_set, self.is_set
             before_ns, self._offset_ns = self._offset_ns, self._clock.wall_ns() - self._clock.boot_ns()
@@ -83,18 +83,18 @@ class ClockWatch:
             if stepped:
                 self._steps += 1
                 self._last_step_ns, self._stepped_ns = step_ns, self._clock.boot_ns()
-        self._tell(step_ns if stepped else None, was_set=was_set)
+        self._log_changes(step_ns if stepped else None, was_set=was_set)
         return stepped or was_set != self._was_set
 
-    def _tell(self, step_ns: int | None, *, was_set: bool) -> None:
+    def _log_changes(self, step_ns: int | None, *, was_set: bool) -> None:
         state = self.state()
         if state.is_set and not was_set:
             log.warning('the clock was set; it stepped by %.3f s', (step_ns or 0) / SECOND)
         elif step_ns is not None:
             log.warning('the clock stepped by %.3f s', step_ns / SECOND)
-        if not state.is_set and not self._told:
+        if not state.is_set and not self._warned:
             log.warning('the clock of this machine is not set: objects wait up to %.0f s for their date; does it reach a time'
                         ' server? `timedatectl`', self._hold_ns / SECOND)  # fmt: skip
         if state.gave_up and not self._gave_up:
-            log.warning('the clock was not set for %.0f s: objects go to _unsynced/%s', state.unset_s, self.boot_id)
-        self._told, self._gave_up = not state.is_set, state.gave_up
+            log.warning('the clock was not set for %.0f s: objects are uploaded under _unsynced/%s', state.unset_s, self.boot_id)
+        self._warned, self._gave_up = not state.is_set, state.gave_up

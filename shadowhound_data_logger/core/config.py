@@ -1,7 +1,7 @@
-"""Settings, frozen and validated once. ROS parameters and environment variables end here: nobody else reads either.
+"""Settings, frozen and validated once. Only this module reads ROS parameters and environment variables.
 
-``Settings.load(parameters, environ)`` takes flat, dotted ROS parameter names (``camera.rate_hz``). The defaults in
-``options`` are what the node does with nothing set; ``launch_configs/go2.yaml`` spells them out (a test compares the two).
+``Settings.load(parameters, environ)`` takes flat, dotted ROS parameter names (``camera.rate_hz``). The defaults are in
+``options``; ``launch_configs/go2.yaml`` spells them out (a test compares the two).
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ GO2_PACKAGES: Final = ('go2_interfaces', 'unitree_go')
 MIN_RATE_HZ: Final = 1e-4
 """A message every three hours."""
 MAX_INT: Final = (1 << 63) - 1
-"""Of a ROS parameter."""
+"""The maximum of a ROS integer parameter."""
 _FIELD: Final = re.compile(r'[^:\s]+:[A-Za-z]\w*(\.\w+)*', re.ASCII)
-"""A part of the field that is a number counts in an array: lowstate:motor_state.0.temperature."""
+"""A number in the field's path is an array index: lowstate:motor_state.0.temperature."""
 _TYPE: Final = re.compile(r'[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*', re.ASCII)
 _BUCKET: Final = re.compile(r'[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]')
 """https://docs.aws.amazon.com/AmazonS3/latest/userguide/bucketnamingrules.html"""
@@ -88,12 +88,12 @@ _ENDPOINT: Final = re.compile(
 _REGION: Final = re.compile(r'[A-Za-z0-9_-]+')
 _VISIBLE: Final = re.compile(r'[!-~]*')
 NOT_SETTINGS: Final = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
-"""Parameters that rclpy itself declares; they are not ours to judge."""
+"""Parameters that rclpy itself declares; they are ignored here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Everything that can be set, once it has been checked."""
+    """All settings, validated."""
 
     robot: str
     home: Path
@@ -117,7 +117,7 @@ class Settings:
 
     @classmethod
     def load(cls, parameters: Mapping[str, Any], environ: Mapping[str, str], namespace: str = '/') -> Settings:
-        """Raises SettingError (unknown or wrong parameter or variable) naming it, its value and what is allowed."""
+        """Raises SettingError for an unknown or invalid parameter or variable."""
         given = {name: value for name, value in parameters.items() if name.split('.')[0] not in NOT_SETTINGS}
         robot = _robot(given.pop('robot', ''), environ, namespace)
         is_listed = 'sensors' in given
@@ -132,32 +132,32 @@ class Settings:
             read_rule(groups[name].when, f'{name}.when')
         if given:
             name, value = next(iter(given.items()))
-            raise SettingError(name, value, f'only a known name: {_near(name, sensors)}')
+            raise SettingError(name, value, f'only a known name: {_suggestions(name, sensors)}')
         folder = home(environ)
         return cls(robot=robot, home=folder, sensors=sensors, store=store_settings(environ, folder), **groups)
 
 
 def home(environ: Mapping[str, str]) -> Path:
-    """The folder of the spool and, without a server, of the store: SHADOWHOUND_HOME, else ``~/.shadowhound``.
+    """The folder of the spool and, without a server, of the store: SHADOWHOUND_HOME, otherwise ``~/.shadowhound``.
 
-    Raises SettingError for the home of a user who is not known here.
+    Raises SettingError if it names the home of an unknown user.
     """
     given = environ.get('SHADOWHOUND_HOME') or '~/.shadowhound'
     try:
         return Path(given).expanduser().absolute()
     except RuntimeError as error:
-        raise SettingError('SHADOWHOUND_HOME', given, 'a folder, not one of a user who has no home here') from error
+        raise SettingError('SHADOWHOUND_HOME', given, 'a folder, not the home of an unknown user') from error
 
 
 def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
-    """The store that the environment names. Raises SettingError for a value with which no S3 client can send a request."""
-    endpoint, of_s3 = environ.get('AWS_ENDPOINT_URL'), environ.get('AWS_ENDPOINT_URL_S3')
+    """The store that the environment names. Raises SettingError for a value that no S3 client can use."""
+    endpoint, s3_endpoint = environ.get('AWS_ENDPOINT_URL'), environ.get('AWS_ENDPOINT_URL_S3')
     region, other_region = environ.get('AWS_REGION'), environ.get('AWS_DEFAULT_REGION')
     for name, value in (('AWS_REGION', region), ('AWS_DEFAULT_REGION', other_region)):
         if value and not _REGION.fullmatch(value):
             raise SettingError(name, value, 'the name of a region, such as us-east-1, without blanks')
     return StoreSettings(
-        endpoint_url=endpoint_url(of_s3, ENDPOINTS[0]) if of_s3 else endpoint_url(endpoint) if endpoint else None,
+        endpoint_url=endpoint_url(s3_endpoint, ENDPOINTS[0]) if s3_endpoint else endpoint_url(endpoint) if endpoint else None,
         access_key_id=_key('AWS_ACCESS_KEY_ID', environ.get('AWS_ACCESS_KEY_ID')),
         secret_access_key=_key('AWS_SECRET_ACCESS_KEY', environ.get('AWS_SECRET_ACCESS_KEY')),
         session_token=_key('AWS_SESSION_TOKEN', environ.get('AWS_SESSION_TOKEN')),
@@ -167,16 +167,16 @@ def store_settings(environ: Mapping[str, str], folder: Path) -> StoreSettings:
 
 
 def _key(name: str, value: str | None) -> str | None:
-    """A blank would make the signature wrong, or could not be in a header."""
+    """Raises SettingError for a blank: it would make the signature wrong, or is not allowed in a header."""
     if not _VISIBLE.fullmatch(value or ''):
         raise SettingError(name, NOT_SHOWN, 'ASCII without blanks; does the line in the file of variables end with one?')
     return value or None
 
 
 def endpoint_url(given: str, name: str = ENDPOINTS[1]) -> str:
-    """The URL of an S3 server, without the slashes at its end. Raises SettingError for a URL that not all S3 clients can use.
+    """The URL of an S3 server, without trailing slashes. Raises SettingError for a URL that not all S3 clients can use.
 
-    What they make of a blank, a query or a user name differs: botocore refuses some of it, obstore panics.
+    Clients differ in how they handle a blank, a query or a user name: botocore refuses some, obstore panics.
     """
     match = _ENDPOINT.fullmatch(given)
     if match is None or int(match['port'] or 0) > MAX_PORT:
@@ -196,12 +196,12 @@ def default_parameters() -> dict[str, Any]:
 
 
 def _listed(value: Any) -> Any:
-    """As a parameter file has it."""
+    """The value as in a parameter file."""
     return list(value) if isinstance(value, tuple) else value
 
 
 def default_robot(environ: Mapping[str, str], namespace: str = '/') -> str:
-    """For a robot that no setting names: the namespace, ``thor`` if the messages of a Go2 are installed, or the host name."""
+    """The default name of the robot: the namespace, ``thor`` if the messages of a Go2 are installed, otherwise the host name."""
     if name := namespace.strip('/').replace('/', '_'):
         return name
     shares = [Path(prefix) / 'share' for prefix in environ.get('AMENT_PREFIX_PATH', '').split(':') if prefix]
@@ -214,13 +214,13 @@ def _robot(given: object, environ: Mapping[str, str], namespace: str) -> str:
     """The parameter, otherwise SHADOWHOUND_ROBOT, otherwise ``default_robot``."""
     if not isinstance(given, str):
         raise SettingError('robot', given, 'a string')
-    of_shell = environ.get('SHADOWHOUND_ROBOT')
-    name = given or of_shell or default_robot(environ, namespace)
+    variable = environ.get('SHADOWHOUND_ROBOT')
+    name = given or variable or default_robot(environ, namespace)
     try:
         return check_name(name, 'the robot name')
     except NameRefused as error:
-        said = 'SHADOWHOUND_ROBOT' if of_shell and not given else 'robot'
-        raise SettingError(said, name, f'a name: {error.remedy}') from error
+        setting = 'SHADOWHOUND_ROBOT' if variable and not given else 'robot'
+        raise SettingError(setting, name, f'a name: {error.remedy}') from error
 
 
 def _sensors(given: dict[str, Any], robot: str) -> tuple[SensorSettings, ...]:
@@ -249,7 +249,7 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
         raise SettingError('sensors', name, f'a name: {error.remedy}') from error
     names_types = f'{name}.types' in given
     sensor: SensorSettings = _fill(SensorSettings, name, given, {'name': name, **DEFAULT_SENSORS.get(name, {})})
-    if not names_types:  # those of the default topics, of which the settings may name fewer
+    if not names_types:  # the types of the default topics; the settings may name fewer topics
         sensor = replace(sensor, types=sensor.types[: len(sensor.topics)])
     if not sensor.topics or not all(sensor.topics):
         raise SettingError(f'{name}.topics', list(sensor.topics), 'at least one topic')
@@ -268,7 +268,7 @@ def _sensor(name: str, given: dict[str, Any], robot: str) -> SensorSettings:
 
 
 def _check_batches(sensor: SensorSettings) -> None:
-    """Raises SettingError where format and batches contradict each other."""
+    """Raises SettingError if format and batch length contradict each other."""
     text = f'0 with format {sensor.format!r}: only {", ".join(BATCHED)} objects hold several messages'
     if sensor.batch_s and sensor.format not in BATCHED:
         raise SettingError(f'{sensor.name}.batch_s', sensor.batch_s, text)
@@ -278,7 +278,7 @@ def _check_batches(sensor: SensorSettings) -> None:
 
 
 def _check_fields(mission: MissionSettings) -> None:
-    """Raises SettingError for what is no topic with a field."""
+    """Raises SettingError for a value that is not a topic with a field."""
     for name in ('battery', 'temperature'):
         given = getattr(mission, name)
         if given and not all(map(_FIELD.fullmatch, given.split('|'))):
@@ -286,18 +286,18 @@ def _check_fields(mission: MissionSettings) -> None:
 
 
 def is_type(source: str) -> bool:
-    """Whether an alternative of a mission's setting is a message type, which stands for every topic of it."""
+    """Whether an alternative in a mission's setting is a message type, which selects every topic of that type."""
     return _TYPE.fullmatch(source) is not None
 
 
 def fields_of(given: str) -> list[tuple[str, list[str]]]:
-    """(topic or type, path of the field) of each alternative of a mission's setting, the preferred one first."""
+    """(topic or type, path of the field) of each alternative in a mission's setting, the preferred one first."""
     pairs = (each.partition(':') for each in given.split('|') if each)
     return [(topic, field.split('.')) for topic, _, field in pairs]
 
 
 def _check_expressions(prefix: str, group: BagSettings | EventSettings, names: Sequence[str]) -> None:
-    """Raises SettingError for what is no regular expression."""
+    """Raises SettingError for an invalid regular expression."""
     for name in names:
         given = getattr(group, name)
         try:
@@ -307,7 +307,7 @@ def _check_expressions(prefix: str, group: BagSettings | EventSettings, names: S
 
 
 def _check_events(events: EventSettings) -> None:
-    """Raises SettingError for conditions that are none, or that would trigger nothing."""
+    """Raises SettingError for invalid conditions, or conditions that would trigger nothing."""
     _check_expressions('events', events, ('regex', 'exclude', 'log_event'))
     if conditions(events.conditions) and not events.enabled:
         allowed = 'an empty list while events.topics and events.regex name nothing'
@@ -317,7 +317,7 @@ def _check_events(events: EventSettings) -> None:
 
 
 def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str, Any] | None = None) -> Any:
-    """An instance of a settings class from ``prefix.field`` entries, which it takes out of ``given``."""
+    """An instance of a settings class from ``prefix.field`` entries, which it removes from ``given``."""
     values = dict(defaults or {})
     for spec in fields(kind):
         name = f'{prefix}.{spec.name}'
@@ -328,7 +328,7 @@ def _fill(kind: type, prefix: str, given: dict[str, Any], defaults: Mapping[str,
 
 
 def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> Any:
-    """The value in the field's own type; raises SettingError."""
+    """The value in the type of its field; raises SettingError."""
     low, high, choices = metadata['low'], metadata['high'], metadata['choices']
     if isinstance(default, tuple):
         if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(part, str) for part in value):
@@ -349,8 +349,8 @@ def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> 
     return value
 
 
-def _near(name: str, sensors: Sequence[SensorSettings]) -> str:
-    """The names that could have been meant: those of the same group, else the groups, and how a sensor becomes one."""
+def _suggestions(name: str, sensors: Sequence[SensorSettings]) -> str:
+    """Suggestions for an unknown name: the names in the same group, otherwise the groups, and how to add a sensor."""
     prefix, dot, last = name.partition('.')
     names = {sensor.name for sensor in sensors}
     kind = GROUPS.get(prefix) or (SensorSettings if prefix in names else None)

@@ -1,4 +1,4 @@
-"""What ``pathlib`` does not do: sync files, replace them as a whole, lock them. Everything raises OSError."""
+"""File operations that ``pathlib`` lacks: sync, atomic replacement, locks. All of them raise OSError."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ READ_BYTES: Final = 1 << 20
 def sync(path: Path) -> None:
     """Wait until a file's content, or the names in a folder, have reached the disk.
 
-    A new file that was synced is lost all the same while its folder was not.
+    A new file is only safe once its folder has been synced too.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -27,7 +27,7 @@ def sync(path: Path) -> None:
 
 
 def fingerprint(path: Path) -> tuple[int, str]:
-    """Bytes and SHA-256 (hex) of a file, read in bounded memory."""
+    """Size and SHA-256 (hex) of a file, read in bounded memory."""
     digest, size = hashlib.sha256(), 0
     with path.open('rb', buffering=0) as file:
         while chunk := file.read(READ_BYTES):
@@ -38,9 +38,9 @@ def fingerprint(path: Path) -> tuple[int, str]:
 
 @contextmanager
 def replacing(path: Path, *, is_synced: bool = False, mode: int = 0o666, part: Path | None = None) -> Iterator[IO[bytes]]:
-    """A file to write that takes the place of ``path`` afterwards: a reader sees the old one or the new one, each whole.
+    """A file to write that replaces ``path`` afterwards: a reader sees the old file or the new one, each complete.
 
-    It lies beside it as ``<path>.part`` (or as ``part``) until then, and stays there where writing fails.
+    Until then it is ``<path>.part`` (or ``part``) in the same folder, and it stays there if writing fails.
     """
     part = part or path.with_name(f'{path.name}.part')
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, mode), 'wb') as file:
@@ -52,7 +52,7 @@ def replacing(path: Path, *, is_synced: bool = False, mode: int = 0o666, part: P
 
 
 def lock(file: int | IO[bytes], *, wait: bool = True, shared: bool = False) -> bool:
-    """An advisory lock on an open file, until it is closed or its process dies; whether it was had."""
+    """Take an advisory lock on an open file, held until it is closed or its process exits; return whether it was acquired."""
     how = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         fcntl.flock(file, how if wait else how | fcntl.LOCK_NB)
@@ -65,7 +65,7 @@ def lock(file: int | IO[bytes], *, wait: bool = True, shared: bool = False) -> b
 
 @contextmanager
 def flock(path: Path, *, wait: bool = True, shared: bool = False, mode: int = 0o600) -> Iterator[bool]:
-    """The same on a file that is made for it, with this mode; yields whether it was had."""
+    """The same on a file that is created for it with this mode; yields whether the lock was acquired."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
     try:
         yield lock(descriptor, wait=wait, shared=shared)

@@ -1,4 +1,4 @@
-"""Distances on Earth, as of a sphere: within 0.6 % of those on the ellipsoid of WGS 84."""
+"""Distances on Earth as a sphere: within 0.6 % of the WGS 84 ellipsoid."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from typing import Final
 
 RADIUS_M: Final = 6_371_008.8
-"""Its mean radius (IUGG), meters."""
+"""The mean radius of the Earth (IUGG), meters."""
 MAX_LATITUDE, MAX_LONGITUDE = 90.0, 180.0
 TOLERANCE: Final = 1e-18
-"""Of a haversine: 13 mm of rounding."""
+"""Rounding tolerance of a haversine: 13 mm."""
 
 
 def is_place(latitude: float, longitude: float) -> bool:
@@ -18,12 +18,12 @@ def is_place(latitude: float, longitude: float) -> bool:
 
 
 def haversine(angle: float) -> float:
-    """Of an angle in radians, at most pi."""
+    """The haversine of an angle in radians, at most pi."""
     return math.sin(min(angle, math.pi) / 2) ** 2
 
 
 def is_within(latitude: float, longitude: float, of_latitude: float, of_longitude: float, radius_m: float) -> bool:
-    """Whether two places, in degrees, are at most so many meters apart; right at the poles and across the antimeridian."""
+    """Whether two places, in degrees, are at most this many meters apart; correct at the poles and across the antimeridian."""
     north, east = math.radians(latitude - of_latitude), math.radians(longitude - of_longitude)
     parallel = math.cos(math.radians(latitude)) * math.cos(math.radians(of_latitude))
     return math.sin(north / 2) ** 2 + parallel * math.sin(east / 2) ** 2 <= haversine(radius_m / RADIUS_M) + TOLERANCE

@@ -1,7 +1,7 @@
-"""One tree of errors: each says what happened, carries its data, and names a remedy.
+"""The error tree: each error has a message, data and a remedy.
 
-``str(error)`` is one sentence an operator can act on; ``error.data`` is for programs; no error ever holds a secret. An error
-without a remedy of its own has that of its class, ``DEFAULT_REMEDY``.
+``str(error)`` is one sentence an operator can act on; ``error.data`` is for programs; an error never contains a secret. An error
+without a specific remedy has ``DEFAULT_REMEDY`` of its class.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class DataLoggerError(Exception):
 
     @property
     def what(self) -> str:
-        """What happened, and where, without the remedy."""
+        """The message without the remedy."""
         return super().__str__()
 
     def __str__(self) -> str:
@@ -73,11 +73,11 @@ class SpoolError(DataLoggerError):
 class NodeUnavailable(DataLoggerError):
     """No node runs here, it cannot be chosen among several, or the one that runs does not answer."""
 
-    DEFAULT_REMEDY = 'shadowhound-data status says whether a node runs here'
+    DEFAULT_REMEDY = 'shadowhound-data status reports whether a node runs here'
 
 
 class StoreError(DataLoggerError):
-    """Base of what a store reports about a request; the subclass decides what delivery does next."""
+    """Base of errors of a request to a store; the subclass decides what delivery does next."""
 
     DEFAULT_REMEDY = 'shadowhound-data doctor --only s3 looks for the cause'
 
@@ -91,7 +91,7 @@ class StoreUntrusted(StoreUnavailable):
 
 
 class CredentialsRejected(StoreError):
-    """The store rejects the access key, the signature or the clock. Everything waits."""
+    """The store rejects the access key, the signature or the clock. All uploads wait."""
 
 
 class BucketMissing(StoreError):
@@ -111,7 +111,7 @@ class ForeignObject(StoreError):
 
 
 class TrackingError(DataLoggerError):
-    """Base of what the tracking server (MLflow) reports about a request."""
+    """Base of errors of a request to the tracking server (MLflow)."""
 
     DEFAULT_REMEDY = 'shadowhound-data doctor --only mlflow looks for the cause'
 
@@ -121,13 +121,13 @@ class TrackingUnavailable(TrackingError):
 
 
 class TrackingRefused(TrackingError):
-    """The server will never accept what was sent."""
+    """The server will never accept this request."""
 
 
 class BagError(DataLoggerError):
-    """A bag, or a file that should be one, does not allow the operation."""
+    """A bag, or a file that should be a bag, does not allow the operation."""
 
-    DEFAULT_REMEDY = 'shadowhound-data bag list shows the bags there are'
+    DEFAULT_REMEDY = 'shadowhound-data bag list shows the bags'
 
 
 class UnknownBag(BagError, UnknownName):
@@ -145,13 +145,13 @@ class BagDamaged(BagError):
 
 
 class LakeError(DataLoggerError):
-    """A query of the catalog cannot be answered: an invalid query, or a catalog that contradicts itself."""
+    """A query of the catalog cannot be answered: the query is invalid, or the catalog is inconsistent."""
 
     DEFAULT_REMEDY = 'shadowhound-data query --help has examples; lake status describes the catalog'
 
 
 class SinkUnavailable(LakeError):
-    """A server that the catalog is sent to does not answer, or is overloaded."""
+    """The server that receives the catalog does not answer, or is overloaded."""
 
     DEFAULT_REMEDY = 'run it again: it continues where it stopped'
 
@@ -165,7 +165,7 @@ class PolicyError(DataLoggerError):
 class PolicyRefused(PolicyError):
     """A policy must not run here; ``data['reason']`` is one of the reasons in docs/policies.md."""
 
-    DEFAULT_REMEDY = 'docs/policies.md says what each reason means'
+    DEFAULT_REMEDY = 'docs/policies.md explains each reason'
 
     def __init__(self, reason: str, message: str, *, remedy: str = '', **data: Any) -> None:
         super().__init__(message, remedy=remedy, reason=reason, **data)

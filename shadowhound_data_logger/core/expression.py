@@ -29,26 +29,26 @@ MAX_DEPTH: Final = 32
 MAX_TESTS: Final = 64
 MAX_HOLD_S: Final = 86_400.0
 MAX_SHOWN: Final = 200
-"""Characters of an expression in an error."""
+"""Maximum characters of an expression in an error."""
 FUNCTIONS: Final = ('first', 'last', 'min', 'max', 'mean', 'count', 'nan_count')
 """Statistics of a field in one object (``formats/statistics.py``)."""
 COMPARISONS: Final[dict[str, Callable[[Any, Any], Any]]] = {
     '<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '==': operator.eq, '!=': operator.ne,
 }  # fmt: skip
-"""Signs and what they compare."""
+"""Signs and their comparison functions."""
 TOPIC, SENSOR, FUNCTION, HOLD, NETWORK, TIME, MISSION, NOT, JOINED = PARTS = (
     'a number of a topic (lowstate:bms_state.soc > 30)', 'a number of a sensor (imu.accelerometer.2 > 15)',
     'a statistic of an object (max(imu.temperature) > 60)',
     "'for' seconds", 'wifi.ssid == "lab"', 'the time of day (time 22:00-06:00)', 'mission, or mission == "patrol"',
     "'not'", "'and', 'or' and parentheses",
 )  # fmt: skip
-"""The parts of the language, as errors name them."""
+"""The parts of the language, as named in errors."""
 MACHINE: Final = frozenset({TOPIC, HOLD, NETWORK, TIME, MISSION, NOT, JOINED})
-"""What a rule about the robot and its surroundings may contain."""
+"""Parts allowed in a rule about the robot and its surroundings."""
 MESSAGE: Final = frozenset({TOPIC, HOLD})
-"""What may trigger an event: one number of a topic's messages."""
+"""Parts allowed in an event's condition: one number of a topic's messages."""
 STORED: Final = frozenset({SENSOR, FUNCTION, JOINED})
-"""What can be asked about stored objects."""
+"""Parts allowed in a query of stored objects."""
 _SIGNS: Final = {'=': '==', '<>': '!='}
 _NUMBER: Final = r'[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?'
 _PATH: Final = r'(?:\w+|\*)(?:\.(?:\w+|\*))*'
@@ -66,18 +66,18 @@ class Comparison:
 
     text: str
     source: str
-    """The topic as it was written, or the sensor."""
+    """The topic as written, or the sensor."""
     path: str
     """The field, such as ``bms_state.soc``."""
     sign: str
     value: float
     hold_s: float = 0.0
-    """For how many seconds it must be true."""
+    """For how many seconds the test must be true."""
     function: str = ''
-    """Of ``FUNCTIONS``; empty for the number in each message."""
+    """One of ``FUNCTIONS``; empty for the number in each message."""
 
     def holds(self, values: Any) -> Any:
-        """Of a number or an array; never of NaN."""
+        """Of a number or an array; False for NaN."""
         return COMPARISONS[self.sign](values, self.value) & (values == values)  # noqa: PLR0124 - false only for NaN
 
 
@@ -92,7 +92,7 @@ class Network:
 
 @dataclass(frozen=True, slots=True)
 class TimeOfDay:
-    """Local time, from the first minute up to, not including, the last; across midnight if that is the smaller one."""
+    """Local time, from the first minute up to, not including, the last; across midnight if ``last`` is smaller."""
 
     text: str
     first: int
@@ -101,24 +101,24 @@ class TimeOfDay:
 
 @dataclass(frozen=True, slots=True)
 class MissionActive:
-    """Whether a mission is active, or one of a type."""
+    """Whether a mission is active, or a mission of this type."""
 
     text: str
     type: str | None
-    """None for any."""
+    """None for any type."""
     is_it: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """The opposite."""
+    """Negation."""
 
     part: Expression
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """Expressions, all of which must be true (``and``), or any (``or``)."""
+    """Expressions that must all be true (``and``), or one of them (``or``)."""
 
     word: str
     parts: tuple[Expression, ...]
@@ -137,17 +137,17 @@ class Condition:
 
 
 def parse(text: str, setting: str, allowed: Collection[str]) -> Expression:
-    """The expression; ``allowed`` are the parts of the language that the setting can evaluate.
+    """Parse an expression; ``allowed`` are the parts of the language that the setting can evaluate.
 
-    Raises SettingError, which names the position of what is wrong and what was expected.
+    Raises SettingError with the position of the error and what was expected.
     """
     return _Parser(text, setting, allowed).parse()
 
 
 def conditions(texts: Iterable[str], setting: str = 'events.conditions') -> tuple[Condition, ...]:
-    """Of texts such as ``low_battery: lowstate:bms_state.soc < 20 for 5``, without the empty ones.
+    """Parse texts such as ``low_battery: lowstate:bms_state.soc < 20 for 5``; empty ones are skipped.
 
-    Raises SettingError for an invalid one, or a name that occurs twice.
+    Raises SettingError for an invalid text, or a name that occurs twice.
     """
     found: dict[str, Condition] = {}
     for text in texts:
@@ -185,7 +185,7 @@ def leaves(expression: Expression) -> Iterator[Test]:
 
 
 def topics(expression: Expression) -> list[str]:
-    """The topics whose messages it needs, as they were written."""
+    """The topics whose messages the expression needs, as written."""
     return [test.source for test in leaves(expression) if isinstance(test, Comparison)]
 
 
@@ -341,7 +341,7 @@ class _Parser:
         return self._text[self._tokens[begin][2] : last[2] + len(last[1])]
 
     def _need(self, part: str) -> None:
-        """The token before is one of a part of the language that is evaluated here."""
+        """Check that the previous token belongs to a part of the language that is evaluated here."""
         if part not in self._allowed:
             self._place -= 1
             raise self._wrong(f'no use of {part}, which {self._setting} cannot evaluate,')

@@ -1,4 +1,4 @@
-"""Object keys: templates, uniqueness and safety. A name from outside never becomes part of a key unchecked."""
+"""Object keys: templates, uniqueness and safety. A name from outside is checked before it becomes part of a key."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from shadowhound_data_logger.core.errors import NameRefused, SettingError
 MAX_KEY_BYTES: Final = 1024
 """S3's limit on a key; https://docs.aws.amazon.com/AmazonS3/latest/userguide/object-keys.html"""
 MAX_SEGMENT_BYTES: Final = 200
-"""Below the 255 of a file name, with room for ``_NNN`` and ``.part``: the spool's tree is the bucket's."""
+"""Below the 255 bytes of a file name, with room for ``_NNN`` and ``.part``: the spool's tree mirrors the bucket."""
 MAX_NAME_BYTES: Final = 64
-"""A robot, sensor or mission type is a word, not a text."""
+"""A robot, sensor or mission type is a word, not a sentence."""
 MAX_BAG_BYTES: Final = 160
-"""Of a bag's name: such a word with a boot's id or a time behind it. Its files have it with a number in their names."""
+"""The name of a bag: such a word followed by a boot id or a time. Its files append a number to it."""
 
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9_.-]*')
 _SEGMENT = re.compile(r"[A-Za-z0-9!_.*'()=+@-]+")
@@ -26,35 +26,35 @@ _FIELDS: Final = ('robot', 'sensor', 'date', 'time', 'ext')
 
 
 UNSEEN: Final = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
-"""Unicode categories that move the cursor, turn the direction or break lines; https://www.unicode.org/reports/tr44/"""
+"""Unicode categories that move the cursor, change the direction or break lines; https://www.unicode.org/reports/tr44/"""
 
 
 def printable(text: str) -> str:
-    """Text from outside for a log, a terminal or a status: what would not be seen as a letter becomes a question mark."""
+    """Text from outside for a log, a terminal or a status; invisible characters become question marks."""
     return ''.join('?' if unicodedata.category(letter) in UNSEEN else letter for letter in text)
 
 
-def check_name(name: str, what: str, most: int = MAX_NAME_BYTES) -> str:
-    """The name unchanged, if it can stand in a key: letters, digits, ``_ - .``, at most 64 bytes (``most``), no ``..``.
+def check_name(name: str, what: str, max_bytes: int = MAX_NAME_BYTES) -> str:
+    """The name unchanged, if it can be part of a key: letters, digits, ``_ - .``, at most ``max_bytes``, no ``..``.
 
-    Raises NameRefused otherwise; ``what`` says in the error whose name it is.
+    Raises NameRefused otherwise; ``what`` describes the name in the error.
     """
-    if not is_name(name, most):
+    if not is_name(name, max_bytes):
         raise NameRefused(
             f'{what} {name[:80]!r} cannot be part of an object key',
-            remedy=f'use letters, digits, "_", "-" and ".", at most {most}, beginning with a letter or digit',
+            remedy=f'use letters, digits, "_", "-" and ".", at most {max_bytes}, starting with a letter or digit',
             name=name,
         )
     return name
 
 
-def is_name(name: str, most: int = MAX_NAME_BYTES) -> bool:
+def is_name(name: str, max_bytes: int = MAX_NAME_BYTES) -> bool:
     """Whether ``check_name`` allows it."""
-    return bool(_NAME.fullmatch(name)) and '..' not in name and len(name.encode(errors='replace')) <= most
+    return bool(_NAME.fullmatch(name)) and '..' not in name and len(name.encode(errors='replace')) <= max_bytes
 
 
 def check_key(key: str) -> str:
-    """The key unchanged, if every S3 server, a Linux file system and a shell can hold it; raises NameRefused."""
+    """The key unchanged, if every S3 server, a Linux file system and a shell can handle it; raises NameRefused."""
     segments = key.split('/')
     if len(key.encode(errors='surrogatepass')) > MAX_KEY_BYTES:
         raise NameRefused(f'the key {key[:80]!r}... has more than {MAX_KEY_BYTES} bytes', name=key)
@@ -72,7 +72,7 @@ def is_segment(name: str) -> bool:
 def unique(key: str, attempt: int) -> str:
     """The ``attempt``-th name of a key: ``a/120000_front.jpg``, then ``a/120000_front_1.jpg``, ``_2``, ...
 
-    A name at the limit of its length loses the end of its stem, so that a key stays one that ``check_key`` allows.
+    A name at the length limit loses the end of its stem, so that ``check_key`` still allows the key.
     """
     if attempt == 0:
         return key
@@ -80,7 +80,7 @@ def unique(key: str, attempt: int) -> str:
     stem, dot, extension = name.partition('.')
     tail = f'_{attempt}{dot}{extension}'
     room = min(MAX_SEGMENT_BYTES, MAX_KEY_BYTES - len(folder) - len(slash)) - len(tail)
-    if room < 0:  # hardly a stem to number, such as ``.x...x``
+    if room < 0:  # no stem to number, such as ``.x...x``
         return f'{folder}{slash}{name[: room + len(dot) + len(extension)]}_{attempt}'
     return f'{folder}{slash}{stem[:room]}{tail}'
 
@@ -89,8 +89,8 @@ def unique(key: str, attempt: int) -> str:
 class KeyTemplate:
     """A key with ``{robot} {sensor} {date} {time} {ext}`` in it.
 
-    ``{date}`` is YYYYMMDD, ``{time}`` HHMMSS or, where objects can come faster than one a second or on fractions
-    of it, HHMMSS_mmm; both UTC. A template without them would give two objects one name, and is refused.
+    ``{date}`` is YYYYMMDD. ``{time}`` is HHMMSS, or HHMMSS_mmm if objects can be less than a second apart or start within a
+    second. Both are UTC. A template without them would give two objects the same name, and is rejected.
     """
 
     template: str
@@ -117,7 +117,7 @@ class KeyTemplate:
         return cls(template)
 
     def render(self, *, robot: str, sensor: str, stamp_ns: int, period_ns: int, ext: str) -> str:
-        """The key of an object that begins at ``stamp_ns``; ``period_ns`` is the least time between two of them."""
+        """The key of an object that starts at ``stamp_ns``; ``period_ns`` is the minimum time between two objects."""
         return dated(self.pattern(robot=robot, sensor=sensor, period_ns=period_ns, ext=ext), stamp_ns)
 
     def pattern(self, *, robot: str, sensor: str, period_ns: int, ext: str) -> str:
@@ -127,7 +127,7 @@ class KeyTemplate:
 
 
 def dated(pattern: str, stamp_ns: int) -> str:
-    """The key of a pattern at this time. Raises NameRefused where that is not a valid key."""
+    """The key of a pattern at this time. Raises NameRefused if that is not a valid key."""
     when = utc(stamp_ns)
     values = {
         '{date}': when.strftime('%Y%m%d'),
@@ -140,7 +140,7 @@ def dated(pattern: str, stamp_ns: int) -> str:
 
 
 def unsynced(robot: str, boot_id: str, sensor: str, boot_ns: int, key: str) -> str:
-    """The key of an object whose time is known by the boot clock alone; it ends as ``key`` does.
+    """The key of an object whose time is known only by the boot clock; its ending is that of ``key``.
 
     ``thor/_unsynced/<boot_id>/camera/00000123_456_camera.jpg``: seconds since boot, milliseconds.
     """

@@ -1,4 +1,4 @@
-"""The few requests to an MLflow server that are made by hand, because MLflow's own client takes seconds to import.
+"""The few requests to an MLflow server that do without MLflow's own client, which takes seconds to import.
 
 https://mlflow.org/docs/latest/api_reference/rest-api.html
 """
@@ -22,31 +22,31 @@ from shadowhound_data_logger.core.untrusted import from_json
 
 LOGIN: Final = ('MLFLOW_TRACKING_USERNAME', 'MLFLOW_TRACKING_PASSWORD')
 BUNDLES: Final = ('MLFLOW_TRACKING_SERVER_CERT_PATH', 'REQUESTS_CA_BUNDLE', 'CURL_CA_BUNDLE')
-"""Variables that name the authorities to trust, the first that is set."""
+"""Variables that name the trusted authorities; the first that is set counts."""
 TEXT: Final = 300
-"""Letters of an answer that are shown."""
-ANSWER_S: Final = 4.0
-"""A Tower that needs longer for an answer is not a Tower to work with; the sum of all waits has to fit into the run."""
-MOST_ANSWER_BYTES: Final = 1 << 20
+"""Maximum characters of a response in an error."""
+TIMEOUT_S: Final = 4.0
+"""A Tower that needs longer for a response is unusable; the sum of all waits must fit into the run."""
+MAX_RESPONSE_BYTES: Final = 1 << 20
 
 
 class _NoRedirects(HTTPRedirectHandler):
-    """A redirect is refused: whoever it leads to would be told the password."""
+    """Refuses redirects: the target would receive the password."""
 
     def redirect_request(self, *_: Any) -> None:
         return None
 
 
 class MlflowRest:
-    """Asks one MLflow server by REST.
+    """Client of one MLflow server's REST API.
 
-    Raises TrackingUnavailable without an answer, TrackingRefused (data: status, code, text) after others.
+    Raises TrackingUnavailable without a response, TrackingRefused (data: status, code, text) for an error.
     """
 
     def __init__(self, url: str, environ: Mapping[str, str], home: Path) -> None:
-        """``url`` is without user and password and a slash at its end.
+        """``url`` has no user, password or trailing slash.
 
-        ``home`` is the user's, where MLflow's clients look for a user and a password that are not in the environment.
+        ``home`` is the user's home, where MLflow's clients look for a user and password that are not in the environment.
         """
         self._url = url
         self.user, password = login(environ, home)
@@ -64,7 +64,7 @@ class MlflowRest:
         self._opener = build_opener(_NoRedirects, HTTPSHandler(context=self._trust))
 
     def experiment(self, name: str) -> dict[str, Any] | None:
-        """By its name, deleted ones as well."""
+        """An experiment by its name, including deleted ones."""
         try:
             answer = self.json('GET', 'experiments/get-by-name?' + urlencode({'experiment_name': name}))
         except TrackingRefused as error:
@@ -75,9 +75,9 @@ class MlflowRest:
         return found
 
     def is_open(self) -> bool:
-        """Whether it shows its experiments to somebody without a password."""
+        """Whether it shows its experiments without a password."""
         try:
-            self.ask('POST', f'{self._url}/api/2.0/mlflow/experiments/search', b'{"max_results": 1}', as_stranger=True)
+            self.send('POST', f'{self._url}/api/2.0/mlflow/experiments/search', b'{"max_results": 1}', anonymous=True)
         except TrackingRefused:
             return False
         return True
@@ -92,17 +92,17 @@ class MlflowRest:
         self.json('POST', 'experiments/set-experiment-tag', {'experiment_id': experiment_id, 'key': name, 'value': value})
 
     def artifact_url(self, path: str) -> str:
-        """Of the server's own proxy for artifacts."""
+        """The URL of the server's artifact proxy."""
         return f'{self._url}/api/2.0/mlflow-artifacts/artifacts/{quote(path)}'
 
     def get(self, path: str) -> str:
         """A page of the server, such as ``/health``."""
-        return self.ask('GET', f'{self._url}{path}').decode(errors='replace').strip()
+        return self.send('GET', f'{self._url}{path}').decode(errors='replace').strip()
 
     def json(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """One request of the REST API, such as ``runs/get``, and its answer."""
+        """One request to the REST API, such as ``runs/get``, and its response."""
         data = json.dumps(body).encode() if body is not None else None
-        answer = self.ask(method, f'{self._url}/api/2.0/mlflow/{path}', data)
+        answer = self.send(method, f'{self._url}/api/2.0/mlflow/{path}', data)
         try:
             found = from_json(answer)
         except ValueError as error:
@@ -111,40 +111,42 @@ class MlflowRest:
             raise TrackingUnavailable(f'{self._url} does not answer like an MLflow server', code='')
         return found
 
-    def ask(self, method: str, url: str, data: bytes | None = None, *, as_stranger: bool = False) -> bytes:
-        """One request."""
+    def send(self, method: str, url: str, data: bytes | None = None, *, anonymous: bool = False) -> bytes:
+        """Send one request."""
         try:
-            headers = self._headers if as_stranger else {**self._headers, **self._authorization}
+            headers = self._headers if anonymous else {**self._headers, **self._authorization}
             request = Request(url, data, headers, method=method)  # noqa: S310 - http(s), see services
-            with self._opener.open(request, timeout=ANSWER_S) as answer:
-                content: bytes = answer.read(MOST_ANSWER_BYTES + 1)
+            with self._opener.open(request, timeout=TIMEOUT_S) as answer:
+                content: bytes = answer.read(MAX_RESPONSE_BYTES + 1)
         except HTTPError as error:
             raise _refused(self._url, error) from error
         except (URLError, OSError, http.client.HTTPException, ValueError) as error:
             reason = getattr(error, 'reason', error)
-            what = f'gives no answer within {ANSWER_S:g} s' if isinstance(reason, TimeoutError) else f'cannot be asked: {reason}'
+            what = (
+                f'gives no answer within {TIMEOUT_S:g} s' if isinstance(reason, TimeoutError) else f'cannot be reached: {reason}'
+            )
             raise TrackingUnavailable(f'{self._url} {what}', code='') from error
-        if len(content) > MOST_ANSWER_BYTES:
-            raise TrackingUnavailable(f'{self._url} answers with more than {MOST_ANSWER_BYTES:,} bytes', code='')
+        if len(content) > MAX_RESPONSE_BYTES:
+            raise TrackingUnavailable(f'{self._url} answers with more than {MAX_RESPONSE_BYTES:,} bytes', code='')
         return content
 
 
 def _refused(url: str, error: HTTPError) -> TrackingError:
     try:
         with error:
-            text = error.read(MOST_ANSWER_BYTES).decode(errors='replace')
-    except (OSError, http.client.HTTPException, ValueError):  # it breaks off
+            text = error.read(MAX_RESPONSE_BYTES).decode(errors='replace')
+    except (OSError, http.client.HTTPException, ValueError):  # the connection breaks off
         text = ''
     try:
-        said = from_json(text.encode())
-        code, message = str(said['error_code']), str(said.get('message', ''))
+        body = from_json(text.encode())
+        code, message = str(body['error_code']), str(body.get('message', ''))
     except (ValueError, KeyError, TypeError):
         code, message = '', ' '.join(text.split())
     return TrackingRefused(f'{url} answers {error.code} {code}: {message[:TEXT]}', status=error.code, code=code, text=message)
 
 
 def login(environ: Mapping[str, str], home: Path) -> tuple[str, str]:
-    """User and password as MLflow's clients find them, each empty where there is none: variables, then ~/.mlflow/credentials."""
+    """User and password as MLflow's clients find them, empty if missing: variables, then ~/.mlflow/credentials."""
     parser = configparser.ConfigParser(interpolation=None)
     try:
         parser.read_string((home / '.mlflow/credentials').read_text(encoding='utf-8'))

@@ -1,4 +1,4 @@
-"""The only things that stages exchange: frozen, slotted, without behavior of their own."""
+"""The values that stages exchange: frozen, slotted, without behavior."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from enum import Enum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.stamps import Times, by_arrival
 
 UPLOAD_WHEN: Final = 'upload.when'
 EVENTS_WHEN: Final = 'events.when'
-"""Settings that objects wait for (``waits_for``)."""
+"""Settings that delay the upload of objects (``waits_for``)."""
 ON_ROBOT, LOST = 'robot', 'lost'
-"""Where an object is that a robot kept (the column ``where`` of ``catalog.schema.KEPT``)."""
+"""The state of an object that a robot kept (the column ``where`` of ``catalog.schema.KEPT``)."""
 PREVIEWS: Final = '_previews'
-"""The folder of previews; a preview's sensor has this behind its name."""
+"""The folder of previews, and the suffix of a preview's sensor."""
 
 
 class Sample(NamedTuple):
-    """One message as it was taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
+    """One message as taken: its time and its serialized form (CDR with the 4-byte encapsulation header)."""
 
     stamp_ns: int
-    """By ``stamps.StampTrack``."""
+    """From ``stamps.StampTrack``."""
     cdr: bytes
     received_ns: int = 0
-    """When it arrived, as of ``Taken``."""
+    """Arrival time, as in ``Taken``."""
     publisher: str | None = None
-    """Who sent it, as of ``Taken``."""
+    """The publisher, as in ``Taken``."""
     untrusted_ns: int = 0
-    """Its own stamp if it is dated by its arrival instead, as of ``Taken``."""
+    """Its own stamp if it is dated by its arrival instead, as in ``Taken``."""
 
     @property
     def times(self) -> Times:
@@ -40,17 +40,17 @@ class Sample(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A serialized message with what the middleware knows of it; None where it does not say."""
+    """A serialized message with the middleware's information about it; None where unknown."""
 
     cdr: bytes
     source_ns: int
-    """When it was sent, Unix nanoseconds; to the consumers of a stream, its arrival where that cannot be trusted."""
+    """Time of sending, Unix ns; for the consumers of a stream, the arrival if the time of sending cannot be trusted."""
     publisher: str | None
     number: int | None
     received_ns: int = 0
-    """When the middleware of this machine received it, Unix nanoseconds; 0 if it does not report that."""
+    """When the middleware of this machine received it, Unix ns; 0 if it does not report that."""
     stamp_ns: int = 0
-    """The time of the message by ``stamps.StampTrack``; 0 before its stream has decided that."""
+    """The time of the message by ``stamps.StampTrack``; 0 until its stream has decided."""
     clock: str | None = None
     """The publisher, if its stamps are trusted and more than a second from their arrival: they follow another clock."""
     untrusted_ns: int = 0
@@ -63,7 +63,7 @@ class Taken(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The samples of one sensor that become one object; ``samples`` is never empty and of one type."""
+    """The samples of one sensor that become one object; ``samples`` is never empty and has one type."""
 
     sensor: str
     topic: str
@@ -77,8 +77,8 @@ class Batch:
 class FileBody:
     """A finished file, synced by its writer, as the content of an object: the spool takes it over without reading it.
 
-    It has to be closed for good. Where ``path`` is on the spool's file system it is linked, else copied; it is removed once
-    the object is durable, and stays where that never happened.
+    It must be closed. If ``path`` is on the spool's file system it is linked, otherwise copied. It is removed once the object is
+    durable, and kept if that fails.
     """
 
     path: Path
@@ -92,7 +92,7 @@ class FileBody:
 
 @dataclass(frozen=True, slots=True)
 class DataObject:
-    """A finished object on its way into the spool: where it wants to go, its bytes, and what it is."""
+    """A finished object for the spool: its wanted key, its content, and its metadata."""
 
     bucket: str
     key: str
@@ -101,7 +101,7 @@ class DataObject:
     content_type: str
     sensor: str
     topic: str | None
-    """The ROS topic its samples count for in the ledger; None for bookkeeping."""
+    """The ROS topic that the ledger counts its samples for; None for bookkeeping."""
     type: str
     samples: int
     t_start_ns: int
@@ -111,40 +111,41 @@ class DataObject:
     protected: bool = False
     """Never evicted."""
     held: str | None = None
-    """Why it has no final name yet; None when it may be shipped."""
+    """Why it has no final name yet; None if it can be uploaded."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Further S3 user metadata: lower-case names, printable ASCII values."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Messages by account (``spool.accounts``) of an object that holds those of several; ``topic`` is None then."""
+    """Messages by account (``spool.accounts``), if the object has messages of several topics; ``topic`` is None then."""
     dedup: bool = False
-    """Not stored where its content is that of the object which its sensor stored before it (``spool.repeats``)."""
+    """Do not store it if its content equals the previous object of its sensor (``spool.repeats``)."""
     key_pattern: str | None = None
-    """The wanted key with its time left open (``keys.dated``), should that not be known yet."""
+    """The wanted key without its time (``keys.dated``), if that is not known yet."""
     statistics: bytes = b''
-    """Statistics of the numbers in it, for the catalog, as ``formats.statistics.pack_statistics`` returns them."""
+    """Statistics of its numbers, for the catalog, as returned by ``formats.statistics.pack_statistics``."""
     catalogs: tuple[int, ...] = ()
-    """A part of the catalog: the ids of the objects that it has rows of. It is left out where another part has one of them."""
-    tells: tuple[tuple[int, str], ...] = ()
-    """A part of the table of what is kept: the ids and states of its rows. It is left out where another part has one of them."""
+    """Set on a part of the catalog: the ids of the objects it has rows for. It is skipped if another part has one of them."""
+    reports: tuple[tuple[int, str], ...] = ()
+    """Set on a part of the table of kept objects: the ids and states of its rows. It is skipped if another part has one of them.
+    """
     answers: tuple[str, int, str] | None = None
-    """An answer to a request: its id, the answer's number and the state that it tells. It is left out where that was given."""
+    """Set on an answer to a request: its id, the answer's number and state. It is skipped if that answer was given."""
 
     @property
     def last_times(self) -> Times:
-        """Of its last message. Files of several topics are bags, which are dated by arrival."""
+        """The times of its last message. Files with several topics are bags, which are dated by arrival."""
         if self.counts:
             return by_arrival(self.t_end_ns)
-        received = self.metadata.get(words.RECEIVED_END_NS, '')
+        received = self.metadata.get(meta.RECEIVED_END_NS, '')
         return Times(self.t_end_ns, int(received) if received.isdecimal() and len(received) < 20 else 0)
 
     @property
     def is_on_request(self) -> bool:
-        """Whether it stays on the robot until somebody asks for it."""
-        return self.metadata.get(words.SHIP) == words.ON_REQUEST
+        """Whether it is kept on the robot until requested."""
+        return self.metadata.get(meta.SHIP) == meta.ON_REQUEST
 
 
 class State(str, Enum):
-    """Where a spooled object is; the value is the ledger's word for it."""
+    """The state of a spooled object; the values are the ledger's terms."""
 
     PENDING = 'pending'
     HELD = 'held'
@@ -153,12 +154,12 @@ class State(str, Enum):
     QUARANTINED = 'quarantined'
     DEDUPLICATED = 'deduplicated'
     KEPT = 'kept'
-    """Stays on the robot's disk until somebody asks for it."""
+    """Kept on the robot's disk until requested."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpooledObject:
-    """A durable object as the index knows it: its bytes lie at ``path`` until the store confirmed them."""
+    """A durable object as in the index: its file is at ``path`` until the store has confirmed it."""
 
     id: int
     bucket: str
@@ -169,29 +170,29 @@ class SpooledObject:
     """Lower-case hex of the content."""
     content_type: str
     metadata: Mapping[str, str]
-    """S3 user metadata, ``sha256`` among it."""
+    """S3 user metadata, including ``sha256``."""
     priority: int
     created_ns: int
     waits_for: str = ''
-    """The rule that has to hold for it to be uploaded (``waits_for``); empty for none."""
+    """The rule that must be true before it is uploaded (``waits_for``); empty for none."""
 
 
 def waits_for(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> str:
-    """The setting that says when an object is uploaded; empty for what always is.
+    """The setting that decides when an object is uploaded; empty if it is always uploaded.
 
-    Always: what tells of the robot and of other objects (catalog, gaps, ledger, previews, answers), and what is never evicted
-    (endings of bags, summaries of missions, what was asked for), but for the bags of events.
+    Always uploaded: data about the robot and about other objects (catalog, gaps, ledger, previews, answers), and everything that
+    is never evicted (ends of bags, summaries of missions, requested objects), except the bags of events.
     """
     if sensor.startswith('_') or sensor.endswith(PREVIEWS):
         return ''
     if not protected:
         return UPLOAD_WHEN
-    return EVENTS_WHEN if words.EVENT in metadata else ''
+    return EVENTS_WHEN if meta.EVENT in metadata else ''
 
 
 @dataclass(frozen=True, slots=True)
 class HeldObject:
-    """An object that has no final name yet, as the index knows it."""
+    """An object in the index that has no final name yet."""
 
     id: int
     bucket: str
@@ -205,19 +206,19 @@ class HeldObject:
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """What a held object becomes; its content stays."""
+    """What a held object becomes; its content is unchanged."""
 
     id: int
     key: str
     """The wanted key; the spool makes it unique."""
     metadata: Mapping[str, str]
-    """All of it but ``sha256``, which stays."""
+    """Complete except for ``sha256``, which does not change."""
     t_start_ns: int
     t_end_ns: int
 
 
 class SliceRow(NamedTuple):
-    """A closed slice of a recording, as the index and each later slice know it."""
+    """A closed slice of a recording, as stored in the index and in each later slice."""
 
     number: int
     bytes: int
@@ -226,14 +227,14 @@ class SliceRow(NamedTuple):
     t_end_ns: int
     messages: int
     counts: str
-    """JSON: a list of its messages by topic, in the order of the recording's channels; null for a topic that it has not."""
+    """JSON: its message counts by topic, in the order of the recording's channels; null for a topic that is not in it."""
 
 
 class MissingRow(NamedTuple):
-    """Something that should have been in a recording (``bags.manifest.Missing``)."""
+    """Something missing from a recording (``bags.manifest.Missing``)."""
 
     place: int
-    """Among all that is missing in it, from 0."""
+    """Its position in the recording's list of missing things, from 0."""
     file: str
     what: str
     messages: int | None
@@ -243,35 +244,35 @@ class MissingRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingRows:
-    """What the index keeps of a bag that is not whole in the spool yet, or what one commit adds to that."""
+    """What the index stores of an incomplete bag, or what one commit adds to that."""
 
     folder: str
-    """The name of its folder: no other recording of its owner has it."""
+    """The name of its folder, unique among the recordings of its owner."""
     said: str = ''
-    """JSON: what is known of it (``bags.state``)."""
+    """JSON: facts about it (``bags.state``)."""
     channels: str = ''
-    """JSON: a list of its channels without definitions, as they first appeared."""
+    """JSON: a list of its channels without definitions, in order of first appearance."""
     slices: tuple[SliceRow, ...] = ()
     missing: tuple[MissingRow, ...] = ()
     is_whole: bool = False
-    """All that is known of it goes."""
+    """Everything about it is removed."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectInfo:
-    """What a store says of one object that it holds."""
+    """What a store reports of one object."""
 
     bucket: str
     key: str
     size: int
     sha256: str | None
-    """From the object's metadata; None where a listing does not tell, or a foreign writer set none."""
+    """From the object's metadata; None if a listing does not contain it, or a foreign writer did not set it."""
     metadata: Mapping[str, str] = field(default_factory=dict)
     content_type: str = ''
     etag: str = ''
-    """Of a listing, and of content that is read: changes with the content; empty where the store has none."""
+    """From a listing or a read: changes with the content; empty if the store has none."""
     modified: datetime | None = None
-    """Of a listing."""
+    """From a listing."""
 
 
 class Put(str, Enum):
@@ -279,12 +280,12 @@ class Put(str, Enum):
 
     CREATED = 'created'
     IDENTICAL = 'identical'
-    """The key held the very same content already (an earlier try whose answer was lost): a success."""
+    """The key already had the same content (an earlier attempt whose response was lost): a success."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What delivery found out about an object: it leaves PENDING for ``state``."""
+    """The result of a delivery: the object moves from PENDING to ``state``."""
 
     item: SpooledObject
     state: State

@@ -1,4 +1,4 @@
-"""Everything that can be set, with its default, its bounds and its help text. Values only: ``config`` reads and checks them."""
+"""All settings, with default, bounds and help text. Values only: ``config`` reads and checks them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MEBI: Final = 1 << 20
 GIBI: Final = 1 << 30
 FORMATS: Final = ('jpeg', 'png', 'pcd', 'json', 'cdr', 'zip', 'tar')
 ARCHIVES: Final = ('zip', 'tar')
-"""Formats that hold a file of each message; they make sense for batches alone."""
+"""Formats with one file per message; they require batches."""
 BATCHED: Final = ('json', *ARCHIVES)
 """Formats that can hold several messages."""
 CAPTURES: Final = ('always', 'mission')
@@ -28,19 +28,19 @@ COMPRESSED_IMAGE: Final = 'sensor_msgs/msg/CompressedImage'
 IMAGE: Final = 'sensor_msgs/msg/Image'
 POINT_CLOUD: Final = 'sensor_msgs/msg/PointCloud2'
 BULK: Final = frozenset({COMPRESSED_IMAGE, IMAGE, POINT_CLOUD})
-"""Types of which one message is as large as hundreds of others."""
+"""Types whose single message is as large as hundreds of others."""
 
 
 def _setting(default: Any, text: str, *, low: float | None = None, high: float | None = None,
              choices: Sequence[str] = (), live: bool = False) -> Any:  # fmt: skip
-    """A dataclass field that knows its help text, what values it allows, and whether it can be changed while the node runs."""
+    """A dataclass field with its help text, the values it allows, and whether it can be changed while the node runs."""
     metadata = {'help': text, 'low': low, 'high': high, 'choices': tuple(choices), 'live': live}
     return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorSettings:
-    """One sensor: the topic it is taken from, what is kept of it, and what becomes of that."""
+    """One sensor: its topics, what is kept of them, and how that is stored."""
 
     name: str
     enabled: bool = _setting(True, 'Log this sensor.', live=True)
@@ -79,7 +79,7 @@ class SensorSettings:
 
     @property
     def period_ns(self) -> int:
-        """The time between two objects as far as their names go, ns; 0 where they can follow each other at any distance."""
+        """Time between two objects as far as their names are concerned, ns; 0 if any distance is possible."""
         if self.batch_s:
             return round(self.batch_s * 1e9)
         if self.on_change:
@@ -128,7 +128,7 @@ class SpoolSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeepSettings:
-    """What stays on the robot until it is requested (``ship: on_request``)."""
+    """Data kept on the robot until requested (``ship: on_request``)."""
 
     max_bytes: int = _setting(
         500 * GIBI, 'Maximum bytes to keep on the robot; beyond it the oldest objects are evicted.', low=MEBI
@@ -142,7 +142,7 @@ class KeepSettings:
     preview_s: float = _setting(
         1.0, 'Seconds between two previews of a camera, which are uploaded immediately; 0 makes none.', low=0.0, high=3600.0
     )
-    poll_s: float = _setting(10.0, 'Seconds between two looks at requests.', low=0.5, high=3600.0)
+    poll_s: float = _setting(10.0, 'Seconds between two checks for requests.', low=0.5, high=3600.0)
     when: str = _setting('', 'Upload requested objects only while this rule is true; empty: always.')
 
 
@@ -152,7 +152,7 @@ class UploadSettings:
 
     threads: int = _setting(4, 'Objects uploaded at a time.', low=1, high=64)
     connect_timeout_s: float = 5.0
-    """Not a parameter: of the doctor and of tests."""
+    """Not a parameter: set by the doctor and by tests."""
     read_timeout_s: float = _setting(30.0, 'Seconds to wait for an answer of the store.', low=0.1, high=600.0)
     backoff_s: float = _setting(
         60.0, 'Longest pause between two attempts while the store cannot be reached.', low=0.1, high=3600.0
@@ -165,14 +165,14 @@ class UploadSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShutdownSettings:
-    """What a SIGINT or SIGTERM may take."""
+    """How long SIGINT and SIGTERM may take."""
 
     drain_s: float = _setting(3.0, 'Seconds to continue uploading when the node is stopped.', low=0.0, high=600.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockSettings:
-    """Which times are trusted, and what becomes of objects that are taken before the clock of this machine was set."""
+    """Which times are trusted, and how objects from before the clock was set are handled."""
 
     max_offset_s: float = _setting(
         86_400.0,
@@ -218,7 +218,7 @@ class MissionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CatalogSettings:
-    """The catalog of what the store holds, written after delivery."""
+    """The catalog of the store's objects, written after delivery."""
 
     enabled: bool = _setting(True, 'Write a row for each delivered object to the catalog.')
     period_s: float = _setting(60.0, 'Seconds between two files of the catalog.', low=1.0, high=86_400.0)
@@ -226,7 +226,7 @@ class CatalogSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagSettings:
-    """Recording at full rate, whatever the sensors keep."""
+    """Recording at full rate, independent of the sensors."""
 
     record: str = _setting(
         'service', 'When: service (from bag start to bag stop), mission (in every mission as well) or always.', choices=RECORDS
@@ -247,7 +247,7 @@ class BagSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSettings:
-    """The last seconds of some topics, in memory, of which an event makes a bag; off while no topic is named."""
+    """A ring in memory with the last seconds of some topics; an event writes it to a bag. Off while no topic is named."""
 
     topics: tuple[str, ...] = _setting(('',), 'Topics to keep; with neither topics nor a regex, there are no events.')
     regex: str = _setting('', 'Keep also topics whose name matches this regular expression; ".*|/_" includes hidden ones.')
@@ -283,7 +283,7 @@ class EventSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoreSettings:
-    """Where objects go: an S3 server, or without an endpoint a folder of the same layout."""
+    """Where objects are stored: an S3 server, or without an endpoint a folder with the same layout."""
 
     endpoint_url: str | None = None
     access_key_id: str | None = field(default=None, repr=False)

@@ -1,11 +1,11 @@
-"""Who is told how far a transfer is."""
+"""Reports the progress of a transfer."""
 
 
 class ProgressListener:
-    """Is told how far a transfer is; any thread calls it. This one ignores it."""
+    """Receives the progress of a transfer; any thread calls it. This one ignores it."""
 
     def begin(self, total: int) -> None:
-        """The transfer has this many bytes in all."""
+        """The transfer has this many bytes."""
 
     def have(self, count: int) -> None:
-        """This many more are here, downloaded or there already; negative for those that turned out wrong."""
+        """This many more bytes are present, downloaded or already there; negative for those that turned out to be wrong."""

@@ -1,4 +1,4 @@
-"""When a failed request is repeated: how long to wait, and how often."""
+"""When to repeat a failed request: how long to wait, and how often."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Final, TypeVar
 from shadowhound_data_logger.core.errors import DataLoggerError, StoreUnavailable, StoreUntrusted
 
 BASE_S: Final = 0.5
-"""The longest pause before the second try; it doubles with each further one."""
+"""Maximum pause before the second try; it doubles with each further one."""
 TRIES: Final = 4
-"""Of a request that somebody waits for: a store that is away for good is told within seconds."""
+"""For a request that a caller waits for: a store that stays unreachable is reported within seconds."""
 CAP_S: Final = 5.0
 
 _Answer = TypeVar('_Answer')
@@ -27,24 +27,24 @@ def backoff(attempt: int, cap_s: float, rng: random.Random) -> float:
     return rng.uniform(0.0, min(cap_s, BASE_S * 2.0 ** min(attempt - 1, 32)))
 
 
-def steadily(ask: Callable[[], _Answer], *, tries: float | None = None, until_s: float = float('inf'), cap_s: float = CAP_S,
-             pause: Callable[[float], object] = time.sleep, away: type[DataLoggerError] = StoreUnavailable,
-             failed: Callable[[DataLoggerError], object] = lambda _: None) -> _Answer:  # fmt: skip
-    """The answer, after some tries (``TRIES``) where the store is away in passing. Raises what the last one raised.
+def with_retries(call: Callable[[], _Answer], *, tries: float | None = None, until_s: float = float('inf'), cap_s: float = CAP_S,
+             pause: Callable[[float], object] = time.sleep, unavailable: type[DataLoggerError] = StoreUnavailable,
+             on_failure: Callable[[DataLoggerError], object] = lambda _: None) -> _Answer:  # fmt: skip
+    """Repeat a request while the server is temporarily unavailable, up to ``tries`` (``TRIES``) times. Raises the last error.
 
-    No try begins after ``until_s`` of the monotonic clock. ``away`` is what another server's absence raises; ``failed`` is called
+    No try starts after ``until_s`` of the monotonic clock. ``unavailable`` is the error that is retried; ``on_failure`` is called
     before each further try.
     """
-    failures, most = 0, TRIES if tries is None else tries
+    failures, max_tries = 0, TRIES if tries is None else tries
     while True:
         try:
-            return ask()
-        except StoreUntrusted:  # somebody has to do something first
+            return call()
+        except StoreUntrusted:  # retrying does not help until the operator acts
             raise
-        except away as error:
+        except unavailable as error:
             failures += 1
             pause_s = backoff(failures, cap_s, _rng)
-            if failures >= most or time.monotonic() + pause_s >= until_s:
+            if failures >= max_tries or time.monotonic() + pause_s >= until_s:
                 raise
-            failed(error)
+            on_failure(error)
             pause(pause_s)

@@ -1,4 +1,4 @@
-"""What the command line and the parameter files of a node say, read without ROS.
+"""Reads the command line and the parameter files of a node without ROS.
 
 https://docs.ros.org/en/humble/How-To-Guides/Node-arguments.html
 """
@@ -16,13 +16,13 @@ NODE: Final = 'sensor_logger_node'
 
 
 class ParametersUnreadable(DataLoggerError):
-    """A parameter file is not one."""
+    """A file is not a valid parameter file."""
 
 
 def parameter(arguments: Sequence[str], name: str) -> Any:
-    """The value that the command line gives to a parameter of our node, the last one counts; None where it gives none.
+    """The value that the command line gives to a parameter of our node, the last one if several; None if not given.
 
-    Raises ParametersUnreadable. What rcl itself will refuse is not judged here.
+    Raises ParametersUnreadable. Errors that rcl itself reports are not checked here.
     """
     words = list(_of_ros(arguments))
     rules = dict(rule for flag, value in words if flag in {'-r', '--remap'} and (rule := _rule(value))[0] in {'__ns', '__node'})
@@ -40,7 +40,7 @@ def parameter(arguments: Sequence[str], name: str) -> Any:
 
 
 def rules_for(arguments: Sequence[str], node: str) -> list[str]:
-    """The remap rules that are for the node of this name alone, without its name: ``odom:=/x`` of ``NODE:odom:=/x``."""
+    """The remap rules for the node of this name only, without its name: ``odom:=/x`` of ``NODE:odom:=/x``."""
     rules = (value for flag, value in _of_ros(arguments) if flag in {'-r', '--remap'})
     return [rule.removeprefix(f'{node}:') for rule in rules if rule.startswith(f'{node}:') and not rule.startswith(f'{node}:=')]
 
@@ -48,10 +48,10 @@ def rules_for(arguments: Sequence[str], node: str) -> list[str]:
 def read_parameters(path: Path, node: str | None = None) -> dict[str, Any]:
     """The parameters of a ROS 2 parameter file for a node, flat. Raises ParametersUnreadable.
 
-    ``node`` is its full name; without it every section counts that is for our node, whatever its namespace.
+    ``node`` is its full name; without it every section for our node counts, whatever its namespace.
     """
     try:
-        import yaml  # noqa: PLC0415 - rclpy needs it, too; without ROS it may be missing, and then nobody has such a file
+        import yaml  # noqa: PLC0415 - rclpy needs it, too; without ROS it may be missing, and then there are no such files
     except ImportError as error:
         raise ParametersUnreadable(f'{path} cannot be read: {error}', remedy='pip install pyyaml') from error
     try:
@@ -68,7 +68,7 @@ def read_parameters(path: Path, node: str | None = None) -> dict[str, Any]:
 
 
 def _of_ros(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """(flag, value) of what stands between ``--ros-args`` and ``--``."""
+    """(flag, value) of the arguments between ``--ros-args`` and ``--``."""
     inside, flag = False, ''
     for word in arguments:
         if word == '--ros-args':
@@ -89,7 +89,7 @@ def _rule(text: str) -> tuple[str, str]:
 
 
 def _sections(given: Mapping[str, Any], above: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """(full name of the node, its parameters); namespaces may be keys of their own."""
+    """(full name of the node, its parameters); namespaces may be separate keys."""
     for name, content in given.items():
         full = name if name.startswith('/') and not above else f'{above}/{name.strip("/")}'
         if 'ros__parameters' in content:
@@ -101,7 +101,7 @@ def _sections(given: Mapping[str, Any], above: str = '') -> Iterator[tuple[str, 
 
 
 def _pattern(section: str) -> re.Pattern[str]:
-    """``*`` stands for one part of a name and ``**`` for any number of them."""
+    """``*`` matches one part of a name, ``**`` any number of parts."""
     parts = section.strip('/').split('/')
     return re.compile(''.join({'**': r'(?:/\w+)*', '*': r'/\w+'}.get(part, '/' + re.escape(part)) for part in parts))
 

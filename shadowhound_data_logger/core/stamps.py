@@ -20,24 +20,23 @@ from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, MAX_AGE_NS, SEC
 DAY_NS: Final = 24 * 3600 * SECOND
 UNSET, TOO_OLD, AHEAD, ERRATIC, STUCK = 'before_2024', 'too_old', 'ahead', 'erratic', 'stuck'
 STAMP, SENT = 'stamp_', 'sent_'
-"""What was not trusted: the stamp in the message's header, or the time of sending that the middleware delivers with it."""
+"""The time that was not trusted: the stamp in the message's header, or the time of sending from the middleware."""
 STABLE, OFFSET = 'stable', 'offset'
-"""States of a publisher's stamps besides ``ERRATIC``, ``STUCK`` and the reasons of ``StampRule``: within a second of the arrival,
-or steadily further from it."""
+"""Further states of a publisher's stamps: within a second of the arrival, or further from it by a stable offset."""
 SAME_NS: Final = SECOND
 """Offsets that differ by less belong to the same clock; stamps within this of their arrival are always trusted."""
 CONFIRMING: Final = 5
-"""Consecutive messages with a new offset after which it counts: a clock that was set, not a stray stamp."""
+"""Consecutive messages after which a new offset is accepted: a clock that was set, not a stray stamp."""
 RECENT: Final = 50
-"""The messages by which a publisher's stamps are judged as erratic."""
+"""The number of messages used to decide whether a publisher's stamps are erratic."""
 MAX_DOUBTED, FEW_DOUBTED = RECENT // 5, RECENT // 10
 """Of these: with more that do not fit the offset none is trusted, with at most this few they are trusted again."""
 HEARD_NS: Final = 60 * SECOND
 """Publishers that were silent for longer than this before the topic's newest message are not reported."""
 MAX_PUBLISHERS: Final = 64
-"""Publishers of a topic that are followed; the one that came first gives way."""
+"""Publishers of a topic that are tracked; the oldest is dropped for a new one."""
 SMOOTHING: Final = 32
-"""The offset and its spread follow a message by one part in so many: 500 ppm of drift at 1 Hz stay within ``SAME_NS``."""
+"""Weight of a message in the smoothed offset and spread: 500 ppm of drift at 1 Hz stay within ``SAME_NS``."""
 _MASK: Final = (1 << RECENT) - 1
 
 
@@ -45,7 +44,7 @@ class Times(NamedTuple):
     """The two times of a message, ns since 1970; 0 for one that is unknown."""
 
     stamp_ns: int = 0
-    """The time by which it is dated: its stamp if that is trusted, otherwise its arrival."""
+    """The time that dates it: its stamp if that is trusted, otherwise its arrival."""
     received_ns: int = 0
     """When it arrived at the robot's computer."""
 
@@ -53,15 +52,15 @@ class Times(NamedTuple):
 NO_TIMES: Final = Times()
 BY_STAMP, BY_RECEIVED = 'stamp', 'received'
 CLOCKS: Final = (BY_STAMP, BY_RECEIVED)
-"""By which of the two times data is placed where it is read: query, coverage, export, MissionDataset and the live page's past."""
+"""Which of the two times places data on a time axis: in query, coverage, export, MissionDataset and the live page's past."""
 
 
 def by_arrival(received_ns: int) -> Times:
-    """Those of a message that is dated by its arrival."""
+    """The times of a message that is dated by its arrival."""
     return Times(received_ns, received_ns)
 
 
-def is_of_two_clocks(one: Times, other: Times) -> bool:
+def clocks_differ(one: Times, other: Times) -> bool:
     """Whether the offsets of two messages differ by more than a second; False if an arrival is unknown."""
     if min(one.received_ns, other.received_ns) < EARLIEST_SANE_NS:
         return False
@@ -74,29 +73,30 @@ class Dated(NamedTuple):
     ns: int
     """UTC, or the boot clock's time while the clock of this machine is not set: a time before 2024 is one since boot."""
     refused: str = ''
-    """Why the message's own time was not used (``stamp_too_old``, ...); empty where it was, or where it has none."""
+    """Why the message's own time was not used (``stamp_too_old``, ...); empty if it was used, or if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class StampRule:
-    """The bound within which a stamp is believed at all. It has no state of its own; use it from any thread."""
+    """The bound within which a stamp can be trusted. Stateless; use it from any thread."""
 
     clock: Clock
     max_offset_ns: int = DAY_NS
     """How far a stamp may be from the arrival, before or after it."""
 
     def date(self, header_ns: int, source_ns: int, received_ns: int) -> Dated:
-        """The time of a message that was just taken; all times are Unix ns, 0 where there is none.
+        """The time of a message that was just taken; all times are Unix ns, 0 if unknown.
 
-        ``header_ns`` is the stamp in the message, ``source_ns`` when its publisher's middleware sent it, and ``received_ns``
-        when the middleware of this machine received it. A message without a header's stamp is dated by ``source_ns``.
+        ``header_ns`` is the stamp in the message, ``source_ns`` the time of sending by its publisher's middleware, and
+        ``received_ns`` the arrival by the middleware of this machine. A message without a header's stamp is dated by
+        ``source_ns``.
 
         ========================  ==================================================================================
-        our clock is set          the message's own time within the bound about the arrival, otherwise the arrival
-        it is not, the            the message's own time within the bound about ``source_ns``, otherwise
+        our clock is set          the message's own time within the bound around the arrival, otherwise the arrival
+        it is not, the            the message's own time within the bound around ``source_ns``, otherwise
         publisher's is            ``source_ns``: another machine knows the time
-        neither is                our boot clock's time of the sending where both run by the same wall clock (it was
-                                  sent some seconds ago at most), otherwise of the take
+        neither is                our boot clock's time of sending if both run by the same wall clock (sent at most
+                                 some seconds ago), otherwise of the take
         ========================  ==================================================================================
         """
         arrival_ns = received_ns if received_ns >= EARLIEST_SANE_NS else self.clock.wall_ns()
@@ -131,26 +131,28 @@ class StampTrack:
         self.offset_ns: int | None = None
         """Received minus stamp, smoothed: positive where stamps are older than the arrival. None before the first message."""
         self.spread_ns = 0
-        """How far messages are from that, on average."""
+        """Mean distance of messages from that offset."""
         self.sent_offset_ns: int | None = None
-        """Received minus the time of sending, which tells late stamps from a wrong clock; None if it is unknown."""
+        """Received minus time of sending, which distinguishes late stamps from a wrong clock; None if unknown."""
         self.messages = 0
-        """How many were judged: a latched one alone says nothing about a clock."""
+        """Number of messages judged: a single latched one is no evidence about a clock."""
         self.received_ns = 0
         """When the newest message arrived."""
         self.since_ns = 0
-        """When the present state began, by the arrival."""
+        """When the present state began, by arrival."""
         self.refused = ''
-        """Why the newest message was not dated by its stamp; empty where it was."""
+        """Why the newest message was not dated by its stamp; empty if it was."""
         self._newest_ns = self._advanced_ns = 0  # the newest trusted stamp, and when it arrived
-        self._candidate_ns = self._agreeing = 0  # an offset that may become the new one, and how many messages had it
-        self._before_ns: int | None = None  # the offset before a queue was held up: while it empties, offsets fall back to this
+        self._candidate_ns = self._agreeing = 0  # a candidate for the new offset, and how many messages had it
+        self._before_ns: int | None = (
+            None  # the offset before a queue was delayed: offsets fall back to it while the queue drains
+        )
         self._doubted = 0  # one bit for each of the recent messages
         self._is_erratic = False
 
     @property
     def state(self) -> str:
-        """``stable``, ``offset``, ``erratic``, ``stuck``, or why the bound refuses the stamps (``before_2024``, ...)."""
+        """``stable``, ``offset``, ``erratic``, ``stuck``, or why the bound rejects the stamps (``before_2024``, ...)."""
         if self._is_erratic:
             return ERRATIC
         if self.refused and not self.refused.endswith(ERRATIC):
@@ -159,7 +161,7 @@ class StampTrack:
 
     @property
     def cause(self) -> str:
-        """Why the state probably is what it is: a key of ``CAUSES``; empty if it is stable."""
+        """The probable cause of the state: a key of ``CAUSES``; empty if it is stable."""
         if (state := self.state) != OFFSET:
             return {UNSET: 'sim_time', TOO_OLD: 'replay', AHEAD: 'replay', STABLE: ''}.get(state, state)
         assert self.offset_ns is not None
@@ -189,7 +191,7 @@ class StampTrack:
         return dated
 
     def _doubt(self, stamp_ns: int, received_ns: int) -> str:
-        """Why a stamp within the bound is not trusted; empty where it is."""
+        """Why a stamp within the bound is not trusted; empty if it is."""
         if stamp_ns == self._newest_ns and received_ns - self._advanced_ns > SAME_NS:
             return STUCK
         is_trusted = self._fits(stamp_ns, received_ns)
@@ -205,7 +207,7 @@ class StampTrack:
         return '' if is_trusted else ERRATIC
 
     def _fits(self, stamp_ns: int, received_ns: int) -> bool:
-        """Whether a stamp is that of the clock that the publisher's stamps were last known to follow, or of a new one."""
+        """Whether a stamp belongs to the clock that the publisher's stamps last followed, or to a new one."""
         offset_ns, known_ns = received_ns - stamp_ns, self.offset_ns
         if known_ns is not None and abs(offset_ns - known_ns) <= SAME_NS:
             self.offset_ns = known_ns + (offset_ns - known_ns) // SMOOTHING
@@ -224,23 +226,23 @@ class StampTrack:
             self.offset_ns, self.spread_ns, self.since_ns, self._agreeing = offset_ns, 0, received_ns, 0
             self._newest_ns = 0
             return True
-        return is_late  # but in order: a queue that was held up, or one that empties
+        return is_late  # but in order: a queue that was delayed, or one that drains
 
 
 @dataclass(frozen=True, slots=True)
 class StampReport:
-    """What is wrong with the stamps of a publisher, or unusual; the field names are those of ``status --json``."""
+    """What is wrong with or unusual about a publisher's stamps; the field names are those of ``status --json``."""
 
     publisher: str | None
     state: str
-    """As of ``StampTrack.state``; never ``stable``."""
+    """As in ``StampTrack.state``; never ``stable``."""
     offset_s: float | None
     """Received minus stamp: positive where stamps are older than the arrival. None if no stamp was within the bound."""
     spread_s: float
     since_ns: int
-    """By the arrival."""
+    """By arrival."""
     cause: str
-    """The likely one, of ``CAUSES``."""
+    """The probable one, a key of ``CAUSES``."""
 
 
 CAUSES: Final = {
@@ -248,14 +250,14 @@ CAUSES: Final = {
     'late': 'the driver stamps its messages late, or publishes them late',
     'early': 'the driver stamps its messages ahead of the time at which it sends them',
     'erratic': 'the driver mixes clocks, or several publishers share a name that cannot be told apart',
-    'stuck': 'the driver repeats a stamp: its source stands still, or it forgets to set the stamp',
+    'stuck': 'the driver repeats a stamp: its source does not advance, or it does not set the stamp',
     'sim_time': 'use_sim_time without a simulation, or a clock that was never set',
     'replay': 'a bag that is replayed, or a clock that is more than a day off',
 }
 
 
 def describe(report: StampReport) -> str:
-    """What is said of a report, after the names of the topics: ``... stamps are 146.0 s older than their arrival since ...``."""
+    """A report as text, to follow the names of the topics: ``... stamps are 146.0 s older than their arrival since ...``."""
     offset_s, since = report.offset_s, iso(report.since_ns)
     if report.state == OFFSET and offset_s is not None:
         what = f'stamps are {abs(offset_s):,.1f} s {"older" if offset_s > 0 else "newer"} than their arrival since {since}'
@@ -276,7 +278,7 @@ class StampTracks:
         self._tracks: dict[str | None, StampTrack] = {}
 
     def of(self, publisher: str | None) -> StampTrack:
-        """That of a publisher; None stands for all whose name is unknown."""
+        """The track of a publisher; None is the track of all publishers whose name is unknown."""
         track = self._tracks.get(publisher)
         if track is None:
             while len(self._tracks) >= MAX_PUBLISHERS:
@@ -285,7 +287,7 @@ class StampTracks:
         return track
 
     def report(self) -> StampReport | None:
-        """The publisher with the worst stamps among those heard in the last minute; None if all are stable."""
+        """The publisher with the worst stamps among those received in the last minute; None if all are stable."""
         newest_ns = max((track.received_ns for track in self._tracks.values()), default=0)
         found = [
             (track.refused != '', abs(track.offset_ns or 0), publisher or '', track.state, track)

@@ -1,7 +1,7 @@
-"""What a node reports of itself once per second: the content of the status file, the source of ``/diagnostics``.
+"""What a node reports about itself once per second: the content of the status file, the source of ``/diagnostics``.
 
 Field names are those of ``shadowhound-data status --json``. Every field has a default, so that a newer program can read the
-status of an older node. Unknown figures are None.
+status of an older node. Unknown values are None.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class ClockState:
 
     is_set: bool = True
     gave_up: bool = False
-    """Whether it was not set for so long that nothing is held for it any more."""
+    """Whether it was not set for so long that objects no longer wait for it."""
     unset_s: float = 0.0
     """How long it has not been set, as far as this process knows; 0 when it is set."""
     steps: int = 0
@@ -56,7 +56,7 @@ class ClockState:
 
 @dataclass(frozen=True, slots=True)
 class OtherType:
-    """A type under which a topic is published in addition to the one that is logged."""
+    """Another type under which the topic is published besides the one that is logged."""
 
     publishers: tuple[str, ...] = ()
     """Nodes; some of them if there are many."""
@@ -76,7 +76,7 @@ class Totals:
     skipped: int = 0
     rejected: int = 0
     dropped: int = 0
-    """Without those of a pause, which an operator requested."""
+    """Without those during a pause that an operator requested."""
     paused: int = 0
     missed: int | None = None
     """None if it is not known exactly."""
@@ -84,7 +84,7 @@ class Totals:
     """None if it is known exactly, or unknown."""
     open: int = 0
     wrong_type: int = 0
-    """Of ``received`` and ``rejected``: messages of another type than the topic's own."""
+    """Part of ``received`` and ``rejected``: messages of another type than the topic's own."""
     other_types: Mapping[str, OtherType] = field(default_factory=dict)
     missed_by: Mapping[str, int] = field(default_factory=dict)
     """By cause, estimates included."""
@@ -95,7 +95,7 @@ class Totals:
     corrected: Mapping[str, int] = field(default_factory=dict)
     """Stored messages that had to be corrected, by what was wrong with them."""
     stamps: StampReport | None = None
-    """What is unusual about the stamps of its publishers now."""
+    """Unusual stamps of its publishers at present."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +106,13 @@ class TopicStatus(Totals):
     enabled: bool = True
     publishers: int = 0
     matched: int = 0
-    """Publishers that a subscription is connected with."""
+    """Publishers that the subscription is matched with."""
     may_be_silent: bool = False
     unavailable: str = ''
     """Why it cannot be subscribed to here; empty if it can."""
     rate_hz: float = 0.0
     age_s: float | None = None
-    """Since its last message."""
+    """Seconds since its last message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class QueueStatus:
     messages: int = 0
     bytes: int = 0
     finished: int = 0
-    """Batches that were taken from it and are done."""
+    """Batches that were taken from it and are finished."""
     max_messages: int = 0
     max_bytes: int = 0
 
@@ -150,7 +150,7 @@ class SpoolStatus:
     unkept: int = 0
     """Objects of this session that could not be kept, because no kept object may be evicted."""
     max_bytes: int | None = None
-    """A setting of the node, as the next two."""
+    """A setting of the node, like the next two."""
     min_free_bytes: int | None = None
     remember_days: float | None = None
 
@@ -168,29 +168,29 @@ class DeliveryStatus:
     """Objects that the store confirmed, including those that it had already."""
     in_flight: int = 0
     deferred: int = 0
-    """Objects that failed and wait for their next try."""
+    """Objects that failed and wait for their next attempt."""
     retries: int = 0
-    """Failed tries of objects that stay pending."""
+    """Failed attempts of objects that stay pending."""
     quarantined: int = 0
     blocked_buckets: Mapping[str, str] = field(default_factory=dict)
     """Bucket -> why nothing is sent to it."""
     max_mbps: float = 0.0
-    """The limit that is set, megabits per second; 0 for none. It applies to S3 servers; a folder is not behind a radio."""
+    """The configured limit, megabits per second; 0 for none. It applies to S3 servers, not to a folder."""
     waits_for: Mapping[str, str] = field(default_factory=dict)
     """Rules that are not satisfied, such as ``upload.when``, and why."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoreStatus(DeliveryStatus):
-    """Delivery and where to."""
+    """Delivery and its target."""
 
     target: str = ''
     """The store, as it describes itself."""
     mbps: float = 0.0
     left_s: int | None = None
-    """How long the objects in the spool take at this pace."""
+    """How long uploading the spool takes at this throughput."""
     stuck: Mapping[str, str] = field(default_factory=dict)
-    """Rules that cannot be satisfied, because nobody publishes their topics: what to do."""
+    """Rules that can never be satisfied, because their topics have no publisher: what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +201,9 @@ class RequestStatus:
     bytes: int = 0
     """Requested and not yet released."""
     mbps: float | None = None
-    """The pace of the link; None before it is known."""
+    """Throughput of the link; None before it is known."""
     left_s: int | None = None
-    """How long these bytes take at this pace."""
+    """How long these bytes take at this throughput."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +299,7 @@ class EventStatus:
     last: Trigger = Trigger()
     topics: Mapping[str, Totals] = field(default_factory=dict)
     left_out: int = 0
-    """As of ``BagStatus``."""
+    """As in ``BagStatus``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +319,7 @@ class NodeStatus:
     not_logged: Mapping[str, str] = field(default_factory=dict)
     """Topics that were found and are not logged, and why."""
     stalls: Mapping[str, str] = field(default_factory=dict)
-    """Topics and threads that make no progress, ``encode`` and ``delivery``: what is wrong."""
+    """Topics and threads (``encode`` and ``delivery``) that make no progress: what is wrong."""
     middleware: MiddlewareStatus = MiddlewareStatus()
     mission: MissionStatus = MissionStatus()
     bag: BagStatus = BagStatus()

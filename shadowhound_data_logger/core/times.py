@@ -1,7 +1,7 @@
-"""Times as people write them, on the command line and in the library: one grammar for all of them.
+"""Times as users write them, on the command line and in the library: one grammar for all.
 
-A date or an ISO 8601 time (UTC where it names no zone), a word such as ``yesterday``, an age such as ``2h``; within a bag
-seconds since its start as well, or before its end.
+A date or an ISO 8601 time (UTC if it names no zone), a word such as ``yesterday``, or an age such as ``2h``; within a bag
+also seconds since its start or before its end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TIMES_IN_BAG: Final = (
     'a UTC time such as 2025-10-18T12:00:05.5, seconds since the start such as 12.5, or -30 for 30 s before the end'
 )
 EPOCH_S: Final = 1_000_000_000
-"""In a bag a number from here on is not a duration but seconds since 1970, as ``ros2 bag info`` prints them."""
+"""Within a bag a number from here on is not a duration but seconds since 1970, as printed by ``ros2 bag info``."""
 MAX_AGE_S: Final = 10**11
 _NUMBER: Final = re.compile(r'[+-]?\d{1,19}(\.\d{1,9})?', re.ASCII)
 _ISO: Final = re.compile(

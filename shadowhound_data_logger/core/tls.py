@@ -1,4 +1,4 @@
-"""Why a server's certificate is not trusted, in words for the operator: who signed it, until when, and for which name."""
+"""Explains to the operator why a server's certificate is not trusted: its issuer, its validity, or its name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _NOT_YET, _EXPIRED, _HOST, _ADDRESS = 9, 10, 62, 64
 """X509_V_ERR_CERT_NOT_YET_VALID, _CERT_HAS_EXPIRED, _HOSTNAME_MISMATCH, _IP_ADDRESS_MISMATCH of OpenSSL's x509_vfy.h."""
 _OTHER_NAME: Final = (
     'the certificate of {server} is for another name',
-    'put a name that is in it (subjectAltName) into {address}, or make one on Tower that has this name',
+    'use a name that is in it (subjectAltName) in {address}, or create one on Tower with this name',
 )
 _REASONS: Final = {
     _NOT_YET: ('the certificate of {server} is not valid yet', 'set the clock of this machine: `timedatectl`'),
@@ -20,11 +20,11 @@ _REASONS: Final = {
     _ADDRESS: _OTHER_NAME,
 }
 _RUSTLS: Final = {'Expired': _EXPIRED, 'NotValidYet': _NOT_YET, 'NotValidForName': _HOST}
-"""What rustls calls these, some with ``Context`` behind it (https://docs.rs/rustls/latest/rustls/enum.CertificateError.html)."""
-_TOLD: Final = re.compile(r'InvalidCertificate\(\s*(\w+?)(?:Context)?\b')
+"""What rustls calls these, some followed by ``Context`` (https://docs.rs/rustls/latest/rustls/enum.CertificateError.html)."""
+_RUSTLS_ERROR: Final = re.compile(r'InvalidCertificate\(\s*(\w+?)(?:Context)?\b')
 _AUTHORITY: Final = (
-    'the certificate of {server} is that of an authority, which rustls does not accept from a server',
-    'make one on Tower that the authority signs',
+    'the certificate of {server} is a CA certificate, which rustls does not accept from a server',
+    'create one on Tower that the authority signs',
 )
 _UNKNOWN: Final = (
     'the certificate of {server} is not trusted',
@@ -32,10 +32,10 @@ _UNKNOWN: Final = (
 )
 
 
-def distrust(error: BaseException, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
-    """What is wrong with the server's certificate and what to do; None for an error that is about something else.
+def certificate_problem(error: BaseException, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
+    """What is wrong with the server's certificate and what to do; None if the error has another cause.
 
-    ``bundle`` and ``address`` are the variables that name the authorities to trust and the server.
+    ``bundle`` and ``address`` are the variables that name the trusted authorities and the server.
     """
     for cause in causes(error):
         if type(cause).__name__ == 'CertificateError':  # urllib3's own, before 2.0: it compares names itself
@@ -44,27 +44,27 @@ def distrust(error: BaseException, server: str, *, bundle: str, address: str) ->
             found = _REASONS.get(getattr(cause, 'verify_code', 0), _UNKNOWN)
         else:
             continue
-        return _worded(found, server, bundle, address)
+        return _format(found, server, bundle, address)
     return None
 
 
-def distrust_told(text: str, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
-    """The same of a library that has only words for it, those of rustls: ``InvalidCertificate(UnknownIssuer)``."""
-    found = _TOLD.search(text)
+def rustls_certificate_problem(text: str, server: str, *, bundle: str, address: str) -> tuple[str, str] | None:
+    """The same for an error of rustls, which is only a text: ``InvalidCertificate(UnknownIssuer)``."""
+    found = _RUSTLS_ERROR.search(text)
     if found is None:
         return None
     if 'CaUsedAsEndEntity' in text:
-        return _worded(_AUTHORITY, server, bundle, address)
-    return _worded(_REASONS.get(_RUSTLS.get(found[1], 0), _UNKNOWN), server, bundle, address)
+        return _format(_AUTHORITY, server, bundle, address)
+    return _format(_REASONS.get(_RUSTLS.get(found[1], 0), _UNKNOWN), server, bundle, address)
 
 
-def _worded(found: tuple[str, str], server: str, bundle: str, address: str) -> tuple[str, str]:
+def _format(found: tuple[str, str], server: str, bundle: str, address: str) -> tuple[str, str]:
     what, remedy = (text.format(server=server, bundle=bundle, address=address) for text in found)
     return what, remedy
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """What led to the error, the first cause last; urllib3 hides some in ``args`` and botocore in ``kwargs``."""
+    """The chain of causes of an error, the root cause last; urllib3 hides some in ``args`` and botocore in ``kwargs``."""
     seen: list[BaseException | None] = [None]
     waiting: list[Any] = [error]
     while waiting:

@@ -1,4 +1,4 @@
-"""How a topic is logged that no sensor names, by its message type (``capture.topics``)."""
+"""How to log a topic that no sensor names, by its message type (``capture.topics``)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shadowhound_data_logger.core.keys import is_name
 from shadowhound_data_logger.core.options import ARCHIVES, COMPRESSED_IMAGE, GROUPS, IMAGE, POINT_CLOUD, SensorSettings
 
 UNITREE_PACKAGES: Final = ('go2_interfaces', 'unitree_go', 'unitree_hg')
-"""Whoever publishes types of these is a Unitree robot, for which the default sensors were made."""
+"""Only Unitree robots publish types of these packages; the default sensors were made for them."""
 _BATCHED: Final[Mapping[str, Any]] = {'rate_hz': 0.0, 'batch_s': 1.0, 'priority': 4}
 _SLOW: Final[Mapping[str, Any]] = {'rate_hz': 0.0, 'batch_s': 10.0, 'priority': 3}
 _ON_CHANGE: Final[Mapping[str, Any]] = {'rate_hz': 0.0, 'on_change': True, 'priority': 2}
@@ -47,14 +47,15 @@ RULES: Final[Mapping[str, Mapping[str, Any]]] = {
     **{f'geometry_msgs/msg/{name}': _BATCHED for name in _GEOMETRY.split()},
     **{f'std_msgs/msg/{name}': _BATCHED for name in _STD.split()},
 }
-"""Message type -> settings of its sensor. Pictures and clouds once a second, numbers batched by the second, all else is not
-logged. What is published latched is logged when it changes, whatever its type."""
+"""Message type -> settings of its sensor. Images and clouds once per second, numbers in batches of a second; other types are
+not logged. Latched topics are logged on change, whatever their type.
+"""
 _LATCHED: Final = frozenset({COMPRESSED_IMAGE, IMAGE, POINT_CLOUD})
-"""Types whose rule holds for latched publishers as well."""
+"""Types whose rule also applies to latched publishers."""
 
 
 NOT_LOGGED: Final = frozenset({'/parameter_events', '/rosout', '/clock'})
-"""Topics of ROS itself: the node's own log is on one of them."""
+"""Topics of ROS itself, such as the node's own log."""
 
 
 def is_of_unitree(type_name: str) -> bool:
@@ -63,7 +64,7 @@ def is_of_unitree(type_name: str) -> bool:
 
 
 def not_logged(topic: str, type_name: str, graph: Mapping[str, Collection[str]]) -> str:
-    """Why no sensor is made for a topic, by the types of all topics; empty if one is."""
+    """Why no sensor is created for a topic, given the types of all topics; empty if one is."""
     if type_name not in RULES:
         return f'there is no rule for {type_name}; name a sensor for it in the settings'
     if type_name == IMAGE and COMPRESSED_IMAGE in graph.get(f'{topic}/compressed', ()):
@@ -72,7 +73,7 @@ def not_logged(topic: str, type_name: str, graph: Mapping[str, Collection[str]])
 
 
 def sensor_for(topic: str, type_name: str, taken: Collection[str], *, is_latched: bool) -> SensorSettings | None:
-    """The sensor of a topic (full name), with a name that is not among those ``taken``; None for a type without a rule."""
+    """The sensor of a topic (full name), with a name that is not in ``taken``; None for a type without a rule."""
     rule = RULES.get(type_name)
     if rule is None:
         return None

@@ -1,7 +1,7 @@
-"""Checks names and files that a robot wrote: nothing in them is trusted before it was checked.
+"""Checks names and files that a robot wrote.
 
-Whoever has a robot's keys can put anything below its prefix. So a key becomes a path, a text is printed, and a file takes
-memory only as far as this module allows. What it refuses is a NameRefused or a ValueError that says why; the caller adds whose.
+A client with a robot's keys can write anything below its prefix. A key becomes a path, a text is printed, and a file uses memory
+only as far as this module allows. It raises NameRefused or a ValueError with the reason; the caller adds the name.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import MAX_KEY_BYTES, UNSEEN
 
 MAX_FILE_NAME_BYTES: Final = 255
-"""Of Linux' file systems."""
-MOST_DOCUMENT_BYTES: Final = 16 << 20
-"""Of JSON that is read whole: a manifest of a day in slices of a minute has 2 MB. Python needs up to 24 times as much for it."""
-MOST_JSON_DEPTH: Final = 64
-"""Of JSON. Whoever reads a document may go into it by recursion, which Python ends at a depth of 1,000 or less."""
-MOST_SUMMARY_BYTES: Final = 1 << 20
-"""Of a mission's ``summary.json``."""
+"""The limit of Linux file systems."""
+MAX_DOCUMENT_BYTES: Final = 16 << 20
+"""JSON that is read in one piece: the manifest of a day in slices of a minute has 2 MB. Python needs up to 24 times as much."""
+MAX_JSON_DEPTH: Final = 64
+"""JSON: readers may recurse into a document, and Python stops at a depth of 1,000 or less."""
+MAX_SUMMARY_BYTES: Final = 1 << 20
+"""A mission's ``summary.json``."""
 MAX_YAML_BYTES: Final = 4 << 20
-"""Of a ``metadata.yaml``: that of some 15,000 slices."""
+"""A ``metadata.yaml`` of some 15,000 slices."""
 MAX_YAML_NODES: Final = 250_000
 """Each takes 50 us."""
 MAX_YAML_DEPTH: Final = 32
-MOST_OBJECT_BYTES: Final = 64 << 20
-"""Of an object that is decoded in memory: an archive is closed after 16 MiB of messages."""
+MAX_OBJECT_BYTES: Final = 64 << 20
+"""An object that is decoded in memory: an archive is closed after 16 MiB of messages."""
 MAX_CHUNK_BYTES: Final = 128 << 20
-"""Of a bag's chunk, packed and unpacked: rosbag2 makes them of 768 KB, or as large as their largest message."""
+"""A chunk of a bag, compressed or not: rosbag2 writes 768 KB, or the size of the largest message."""
 PIECE_BYTES: Final = 4096
-"""Of damaged content: so much is lost where it cannot be unpacked."""
-MOST_PIXELS: Final = 1 << 25
-"""Of a picture: 8K."""
-MOST_MEMBERS: Final = 20_000
-"""Files in an archive, two a message: it is closed after 10,000 of them."""
-_TOO_DEEP: Final = f'it is deeper than {MOST_JSON_DEPTH} lists and objects in one another'
+"""Damaged content: this much is lost where it cannot be decompressed."""
+MAX_PIXELS: Final = 1 << 25
+"""An image: 8K."""
+MAX_MEMBERS: Final = 20_000
+"""Files in an archive, two per message: it is closed after 10,000 of them."""
+_TOO_DEEP: Final = f'its lists and objects are nested deeper than {MAX_JSON_DEPTH}'
 _FORMULA: Final = frozenset('=+-@＝＋－＠')
 _NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
@@ -52,18 +52,18 @@ _NUMBER: Final = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?', re.ASCII)
 
 
 def path_below(folder: Path, key: str) -> Path:
-    """Where the file of a key lies below a folder. Raises NameRefused for a key that is not a path below it."""
+    """The path of a key's file below a folder. Raises NameRefused for a key that is not a path below it."""
     if not is_path(key):
         raise NameRefused(f'the key {key[:200]!r} is not a path below a folder', name=key)
     return folder / key
 
 
 def is_path(key: str) -> bool:
-    """Whether a key can be a file below any folder: parts with names of their own, no control characters, not too long."""
+    """Whether a key can be a file below any folder: non-empty parts, no ``..``, no control characters, not too long."""
     parts = key.split('/')
     try:
         sizes = [len(part.encode()) for part in parts]
-    except UnicodeEncodeError:  # half a surrogate pair
+    except UnicodeEncodeError:  # an unpaired surrogate
         return False
     if '' in parts or '.' in parts or '..' in parts or sum(sizes) + len(parts) > MAX_KEY_BYTES + 1:
         return False
@@ -74,35 +74,35 @@ def is_path(key: str) -> bool:
 
 
 def visible(text: str) -> str:
-    """The text on one line and without power over a terminal: a control character becomes its escape, as in ``repr``."""
+    """The text on one line, safe for a terminal: control characters are escaped as in ``repr``."""
     if text.isprintable():
         return text
     return ''.join(_escape(letter) if unicodedata.category(letter) in UNSEEN else letter for letter in text)
 
 
 def csv_encoding(head: bytes) -> str:
-    """The encoding of a CSV file that starts with these bytes: UTF-8, or what Excel writes, with a byte order mark of either."""
+    """The encoding of a CSV file that starts with these bytes: UTF-8, or what Excel writes, each with a byte order mark."""
     return 'utf-16' if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else 'utf-8-sig'
 
 
 def csv_rows(body: bytes) -> csv.DictReader[str]:
-    """The rows of a CSV file with a line of names; more cells than names are under ``''``. Raises ValueError, csv.Error."""
+    """The rows of a CSV file with a header; extra cells are under ``''``. Raises ValueError, csv.Error."""
     text = body.decode(csv_encoding(body))
-    check_commas(text.partition('\n')[0])
+    check_separator(text.partition('\n')[0])
     rows = csv.DictReader(StringIO(text, newline=''), strict=True, restkey='')
     rows.fieldnames = [name.strip() for name in rows.fieldnames or ()]
     return rows
 
 
-def check_commas(names: str) -> None:
-    """Raises ValueError for the line of names of a CSV file with another separator, as spreadsheets of some languages write."""
+def check_separator(names: str) -> None:
+    """Raises ValueError if the header of a CSV file has another separator, as spreadsheets write in some languages."""
     for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if mark in names and ',' not in names:
             raise ValueError(f'its columns are separated by {name}: save it with commas')
 
 
 def csv_cell(value: object) -> object:
-    """A value for a CSV file: numbers as they are, text on one line, and no text that a spreadsheet takes for a formula."""
+    """A value for a CSV file: numbers unchanged, text on one line, and no text that a spreadsheet takes for a formula."""
     if value is None or isinstance(value, (bool, int, float)):
         return value
     text = visible(str(value))
@@ -116,31 +116,31 @@ def _escape(letter: str) -> str:
 # -- documents -----------------------------------------------------------------------------------------------------------------
 
 
-def from_json(content: bytes, most: int = MOST_DOCUMENT_BYTES) -> Any:
+def from_json(content: bytes, max_bytes: int = MAX_DOCUMENT_BYTES) -> Any:
     """Raises ValueError, also for a document that is too large or too deep."""
-    check_size(len(content), most)
+    check_size(len(content), max_bytes)
     try:
-        return shallow(json.loads(content))
+        return limit_depth(json.loads(content))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
 
-def from_strict_json(content: bytes, most: int) -> Any:
-    """As ``from_json``, for what has to have one meaning: raises ValueError also for a name twice in one object, and for
-    what is not a finite number.
-    """
-    check_size(len(content), most)
+def from_strict_json(content: bytes, max_bytes: int) -> Any:
+    """Like ``from_json``, but raises ValueError also for a duplicate name in an object and for a number that is not finite."""
+    check_size(len(content), max_bytes)
     try:
-        return shallow(json.loads(content, object_pairs_hook=_named_once, parse_constant=_no_number, parse_float=_finite))
+        return limit_depth(
+            json.loads(content, object_pairs_hook=_unique_names, parse_constant=_reject_constant, parse_float=_finite)
+        )
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 
 
-def shallow(document: Any) -> Any:
-    """The same value of JSON. Raises ValueError for one whose lists and objects lie in one another more than 64 times."""
+def limit_depth(document: Any) -> Any:
+    """The JSON value unchanged. Raises ValueError if its lists and objects are nested more than 64 deep."""
     level, depth = [document], 0
     while level:
-        if depth >= MOST_JSON_DEPTH:
+        if depth >= MAX_JSON_DEPTH:
             raise ValueError(_TOO_DEEP)
         depth += 1
         level = [
@@ -150,31 +150,31 @@ def shallow(document: Any) -> Any:
     return document
 
 
-def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError('it has a name twice in one object')
+        raise ValueError('an object has a name twice')
     return found
 
 
-def _no_number(word: str) -> Any:
-    raise ValueError(f'{word} is no number of JSON')
+def _reject_constant(word: str) -> Any:
+    raise ValueError(f'{word} is not a JSON number')
 
 
 def _finite(text: str) -> float:
     found = float(text)
-    return found if math.isfinite(found) else _no_number(text)
+    return found if math.isfinite(found) else _reject_constant(text)
 
 
 def from_yaml(content: str) -> Any:
-    """Mappings, sequences and scalars, without aliases: a few bytes of those can stand for any size. Raises ValueError."""
+    """Mappings, sequences and scalars, without aliases: a few bytes of those can expand to any size. Raises ValueError."""
     from ruamel.yaml import YAML  # noqa: PLC0415 - 0.1 s that most need not
     from ruamel.yaml.composer import Composer  # noqa: PLC0415
     from ruamel.yaml.error import YAMLError  # noqa: PLC0415
     from ruamel.yaml.events import AliasEvent  # noqa: PLC0415
 
     class Plain(Composer):
-        """Counts what it makes."""
+        """Counts the nodes it composes."""
 
         nodes = depth = 0
 
@@ -190,7 +190,7 @@ def from_yaml(content: str) -> Any:
             return made
 
     check_size(len(content), MAX_YAML_BYTES)
-    yaml = YAML(typ='safe', pure=True)  # the parser in C neither counts nor ends at a depth
+    yaml = YAML(typ='safe', pure=True)  # the parser in C neither counts nor stops at a depth
     yaml.Composer = Plain
     try:
         return yaml.load(content)
@@ -198,35 +198,35 @@ def from_yaml(content: str) -> Any:
         raise ValueError(' '.join(str(error).split())) from error
 
 
-def check_size(size: int, most: int) -> None:
-    """Raises ValueError for what is larger."""
-    if size > most:
-        raise ValueError(f'it has {size:,} bytes; more than {most:,} are not read')
+def check_size(size: int, max_bytes: int) -> None:
+    """Raises ValueError for a size above the limit."""
+    if size > max_bytes:
+        raise ValueError(f'it has {size:,} bytes; more than {max_bytes:,} are not read')
 
 
 # -- content -------------------------------------------------------------------------------------------------------------------
 
 
-def unpacked(compression: str, content: bytes, size: int | None = None) -> bytes:
-    """What was packed by ``zstd`` or ``lz4``: of this size (None: of any that is allowed), and not a byte more in memory.
+def decompress(compression: str, content: bytes, size: int | None = None) -> bytes:
+    """Decompress ``zstd`` or ``lz4`` content of this size (None: any allowed size), without using more memory than that.
 
-    It ends at the size: a frame that holds more is wrong, and its rest is never unpacked. Raises ValueError.
+    It stops at the size: a frame with more is invalid, and its rest is never decompressed. Raises ValueError.
     """
-    most = MAX_CHUNK_BYTES if size is None else size
-    check_size(most, MAX_CHUNK_BYTES)
+    max_bytes = MAX_CHUNK_BYTES if size is None else size
+    check_size(max_bytes, MAX_CHUNK_BYTES)
     if compression not in {'zstd', 'lz4'}:
         raise ValueError(f'it is compressed with {compression!r}, which is not supported')
     try:
-        found, is_whole = _zstd(content, most) if compression == 'zstd' else _lz4(content, most)
+        found, is_whole = _zstd(content, max_bytes) if compression == 'zstd' else _lz4(content, max_bytes)
     except (RuntimeError, EOFError) as error:  # lz4 raises the former
         raise ValueError(str(error)) from error
-    if not is_whole or len(found) > most or size not in {None, len(found)}:
-        raise ValueError(f'it does not unpack to {"at most " * (size is None)}{most:,} bytes, as it should')
+    if not is_whole or len(found) > max_bytes or size not in {None, len(found)}:
+        raise ValueError(f'it does not decompress to {"at max_bytes " * (size is None)}{max_bytes:,} bytes, as it should')
     return found
 
 
-def partly_unpacked(compression: str, content: bytes, size: int) -> bytearray:
-    """What can still be unpacked of content that is torn or damaged: its beginning, of at most this size. Raises ValueError."""
+def decompress_damaged(compression: str, content: bytes, size: int) -> bytearray:
+    """Decompress as much as possible of truncated or damaged content: its start, at most this size. Raises ValueError."""
     check_size(size, MAX_CHUNK_BYTES)
     if compression == 'zstd':
         from shadowhound_data_logger.core.zstd import ZstdDecompressor, ZstdError  # noqa: PLC0415 - for bags alone
@@ -244,7 +244,7 @@ def partly_unpacked(compression: str, content: bytes, size: int) -> bytearray:
         for at in range(0, len(content), PIECE_BYTES):
             piece = content[at : at + PIECE_BYTES]
             while len(found) < size and not reader.eof:
-                more = reader.decompress(piece, min(size - len(found), MOST_SUMMARY_BYTES))
+                more = reader.decompress(piece, min(size - len(found), MAX_SUMMARY_BYTES))
                 found += more
                 piece = b''
                 if reader.needs_input or not more:
@@ -276,15 +276,15 @@ def _lz4(content: bytes, size: int) -> tuple[bytes, bool]:
 
 
 def open_image(content: bytes | Path) -> Any:
-    """A picture of Pillow's, not decoded yet: JPEG, PNG or TIFF, of at most ``MOST_PIXELS``. Raises OSError or ValueError."""
+    """A Pillow image, not decoded yet: JPEG, PNG or TIFF, of at most ``MAX_PIXELS``. Raises OSError or ValueError."""
     from PIL import Image  # noqa: PLC0415 - 0.1 s, and most readers see none
 
     source = content if isinstance(content, Path) else BytesIO(content)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter('ignore')  # of what is refused below
+            warnings.simplefilter('ignore')  # of images that are rejected below
             opened = Image.open(source, formats=('JPEG', 'PNG', 'TIFF'))
-    except (Image.DecompressionBombError, SyntaxError) as error:  # which are nobody's ValueError
+    except (Image.DecompressionBombError, SyntaxError) as error:  # which are not all ValueErrors
         raise ValueError(str(error)) from None
     try:
         check_pixels(opened.width, opened.height)
@@ -295,6 +295,6 @@ def open_image(content: bytes | Path) -> Any:
 
 
 def check_pixels(width: int, height: int) -> None:
-    """Raises ValueError for more than ``MOST_PIXELS``."""
-    if width * height > MOST_PIXELS:
+    """Raises ValueError for more than ``MAX_PIXELS``."""
+    if width * height > MAX_PIXELS:
         raise ValueError(f'it claims {width:,} x {height:,} pixels')

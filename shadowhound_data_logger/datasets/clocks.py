@@ -1,7 +1,7 @@
 """The offset of another machine's clock from the robot's, and its uncertainty: from events that both machines timed.
 
 Such an event is a pair of times: ``sensor_msgs/TimeReference`` (``header.stamp`` by the robot's clock, ``time_ref`` by the
-other), or a line of a file. Between pairs the other clock runs evenly, up to ``MOST_DRIFT`` away from the robot's.
+other), or a line of a file. Between pairs the other clock runs evenly, up to ``MAX_DRIFT`` away from the robot's.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from shadowhound_data_logger.core.untrusted import csv_rows
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MOST_DRIFT: Final = 200e-6
+MAX_DRIFT: Final = 200e-6
 """Of two quartz clocks: each is within 100 ppm of its rate, most are within 30."""
 NEAR_NS: Final = 600 * SECOND
 """Pairs farther from an episode are not used."""
-LEAST_SPAN_NS: Final = 5 * SECOND
+MIN_SPAN_NS: Final = 5 * SECOND
 """The shortest span of pairs from which a drift is computed: over less, 0.1 ms of noise would be 20 ppm."""
-LEAST_PAIRS: Final = 5
+MIN_PAIRS: Final = 5
 SHARE: Final = 95
 """Percent of the pairs within the uncertainty."""
 COLUMNS: Final = ('robot_ns', 'arm_ns')
@@ -61,7 +61,7 @@ class ClockOffset:
 def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffset:
     """Of an episode; ``pairs`` is (n, 2), the robot's time and the other's of each event. Raises LakeError if it cannot be known.
 
-    The uncertainty is how far 95 % of the pairs are from the line through them, and ``MOST_DRIFT`` for the time from the
+    The uncertainty is how far 95 % of the pairs are from the line through them, and ``MAX_DRIFT`` for the time from the
     nearest pair to the end of the episode; where the pairs are too few or too near to each other for a line, from all of them.
     What both directions of a network delay alike is in it; a delay of one direction alone cannot be seen in pairs.
     """
@@ -75,10 +75,10 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
     middle = int(np.median(ahead))
     rest = (ahead - middle).astype(np.float64)
     drift = offset = 0.0
-    is_line = len(near) >= LEAST_PAIRS and times[-1] - times[0] >= LEAST_SPAN_NS
+    is_line = len(near) >= MIN_PAIRS and times[-1] - times[0] >= MIN_SPAN_NS
     if is_line:
         drift, offset = np.polyfit(times, rest, 1)
-        if abs(drift) > MOST_DRIFT:
+        if abs(drift) > MAX_DRIFT:
             raise LakeError(
                 f"the arm's clock is not known: it would run {drift * 1e6:.0f} ppm too fast, or it was set during that time"
             )
@@ -87,7 +87,7 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
         beyond = max(0, int(near[0, 0]) - begin_ns, end_ns - int(near[-1, 0]))
     else:  # no line: the clock may have drifted since the farthest of them
         beyond = max(abs(int(near[0, 0]) - end_ns), abs(begin_ns - int(near[-1, 0])))
-    return ClockOffset(at, middle + round(float(offset)), float(drift), round(spread + MOST_DRIFT * beyond), len(near))
+    return ClockOffset(at, middle + round(float(offset)), float(drift), round(spread + MAX_DRIFT * beyond), len(near))
 
 
 def pairs_of(path: Path) -> NDArray[np.int64]:

@@ -28,7 +28,7 @@ import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, iso, utc
 from shadowhound_data_logger.core.errors import ForeignObject, LakeError, SettingError
 from shadowhound_data_logger.core.keys import dated
@@ -320,7 +320,7 @@ class _StoredEpisodes:
         key = self._key(each, sensor, number)
         held = self._store.head(schema.BUCKET, key) if key in self._keys else None
         if held is not None:
-            if held.metadata.get(words.IMPORTED_FROM) != each.identity:
+            if held.metadata.get(meta.IMPORTED_FROM) != each.identity:
                 raise LakeError(f'{schema.BUCKET}/{key} is not of {each.name}', remedy='import it as another --arm')
             found.present += 1
             return schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
@@ -334,9 +334,9 @@ class _StoredEpisodes:
         named = ARM_TOPICS[sensor]
         sha256 = hashlib.sha256(body).hexdigest()
         metadata = {
-            words.ROBOT: self._arm, words.SENSOR: named, words.TOPIC: f'/{self._arm}/{named}', words.TYPE: each.type,
-            words.SHA256: sha256, words.T_START_NS: str(stamps[0]), words.T_END_NS: str(stamps[-1]),
-            words.COUNT: str(len(stamps)), words.IMPORTED_FROM: each.identity,
+            meta.ROBOT: self._arm, meta.SENSOR: named, meta.TOPIC: f'/{self._arm}/{named}', meta.TYPE: each.type,
+            meta.SHA256: sha256, meta.T_START_NS: str(stamps[0]), meta.T_END_NS: str(stamps[-1]),
+            meta.COUNT: str(len(stamps)), meta.IMPORTED_FROM: each.identity,
         }  # fmt: skip
         with tempfile.TemporaryDirectory(prefix='shadowhound-import-') as folder:
             path = Path(folder, 'body.json')

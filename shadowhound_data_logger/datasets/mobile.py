@@ -48,7 +48,7 @@ TIMESTAMPS, DETECTIONS = 'synchronized/timestamps.csv', 'synchronized/detections
 ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 FRAMES: Final = 'odom', 'base_link'
 """Of the Go2's driver."""
-MOST_DETECTIONS: Final = 64 << 20
+MAX_DETECTIONS: Final = 64 << 20
 """Bytes of an object with detections."""
 
 
@@ -164,7 +164,7 @@ def _detections(plan: EpisodePlan, place: Place) -> Iterator[dict[str, Any]]:
     for track in plan.detections:
         for number in track.within(plan.mission.begin_ns, plan.mission.end_ns):
             wanted = track.object(int(number))
-            for record in decode.records(place.read(wanted.bucket, wanted.key, MOST_DETECTIONS)):
+            for record in decode.records(place.read(wanted.bucket, wanted.key, MAX_DETECTIONS)):
                 stamp = int(record['stamp_ns']) + int(track.offset_ns[number])
                 if plan.mission.begin_ns <= stamp <= plan.mission.end_ns:
                     yield {

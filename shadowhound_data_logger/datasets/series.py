@@ -23,7 +23,7 @@ from shadowhound_data_logger.bags import naming
 from shadowhound_data_logger.bags.contents import McapFile
 from shadowhound_data_logger.bags.manifest import Manifest, SliceEntry
 from shadowhound_data_logger.bags.remote import find_bags, read_manifest
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.errors import BagDamaged, LakeError, Rejected
 from shadowhound_data_logger.core.model import Batch, ObjectInfo, Sample
@@ -48,13 +48,13 @@ if TYPE_CHECKING:
 
 KEEP_BYTES: Final = 16 << 20
 THREADS: Final = 8
-LEAST_SPAN_NS: Final = 2 * SECOND
+MIN_SPAN_NS: Final = 2 * SECOND
 """Of a slice from which a rate is computed."""
 AS_MUCH: Final = 0.5
 """A recording competes with the one that covers most of a mission if it covers so much of what that one does."""
 NEARLY_ALL: Final = 0.9
 """An event's bag is an excerpt, unless it has so much of a mission."""
-LEAST_ADDED_NS: Final = SECOND
+MIN_ADDED_NS: Final = SECOND
 """Another mission's bag, or one of none, is read for more than this: our recorder needs that long to notice a mission."""
 HOLE: Final = 10
 """So many periods without an object are not covered."""
@@ -341,7 +341,7 @@ class Recordings:
                 counts = [each.messages * each.share(self._counted) for each in parts]
                 # A slice's span is that of all its topics: of a short one it says little about one of them.
                 rates = [(each.bag, each.messages / each.whole.length * 1e9) for each in parts
-                         if each.share(self._counted) and each.whole.length >= LEAST_SPAN_NS]  # fmt: skip
+                         if each.share(self._counted) and each.whole.length >= MIN_SPAN_NS]  # fmt: skip
                 rate = max((rate for bag, rate in rates if bag is rates[0][0]), default=0.0)
                 covered = sum(each.covered(self._counted) for each in parts) / max(self._counted.length, 1)
                 yield RecordedSensor(sensor, topic, kind, BAGS, round(sum(counts)), rate, min(1.0, covered))
@@ -372,7 +372,7 @@ class Recordings:
             added = sum(each.covered(self._counted) for each in mine)
             first = found[0].bag.mission if found else bag.mission
             is_first = not found or (first is not None and _is_of_mission(bag, first.mission_id, first.run_id))
-            if added > LEAST_ADDED_NS or (is_first and any(each.share(self._counted) for each in mine)):
+            if added > MIN_ADDED_NS or (is_first and any(each.share(self._counted) for each in mine)):
                 found += [each for each in mine if each.times]
         return found
 
@@ -580,7 +580,7 @@ def pictures_of(
                 raise LakeError(f'the source {bucket}/{key} is not what it was')
             extension = decode.extension_of(key)
             if extension in decode.ARCHIVES:
-                offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
+                offset = int(held.metadata.get(meta.CLOCK_OFFSET_NS, 0))
                 members = decode.members(body, extension)
                 found |= {(key, each.stamp_ns + offset): each.body for each in members if each.stamp_ns + offset in stamps}
             else:
@@ -592,7 +592,7 @@ def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[
                        work: Path) -> dict[tuple[str, int], bytes]:  # fmt: skip
     found: dict[tuple[str, int], bytes] = {}
     known: dict[Channel, MessageTypes] = {}
-    offset = int(held.metadata.get(words.CLOCK_OFFSET_NS, 0))
+    offset = int(held.metadata.get(meta.CLOCK_OFFSET_NS, 0))
     wanted = MessageFilter(0, 1 << 64, lambda channel: channel.topic == topic and not channel.repeated)
     for message in McapFile(StoredFile(store, held.bucket, held.key, held.size)).messages(wanted):
         if message.channel not in known:

@@ -14,7 +14,7 @@ from typing import Final, TypeVar
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.untrusted import from_json, path_below
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, Lerobot
 from shadowhound_data_logger.lake.training import INFO
@@ -28,7 +28,7 @@ FOLDER: Final = 'datasets/'
 """The prefix of datasets in a bucket."""
 THREADS: Final = 4
 TRIES: Final = 6
-MOST_DIGEST_BYTES: Final = 1 << 28
+MAX_DIGEST_BYTES: Final = 1 << 28
 _Answer = TypeVar('_Answer')
 _URL: Final = re.compile(r's3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])/([^/].*?)/*')
 
@@ -156,7 +156,7 @@ def catch_up(place: DatasetPlace, folder: Path, store: ObjectStore, say: Callabl
         return False
     last = ''
     if DIGESTS in there:
-        last = _digests(_ask(lambda: store.get(place.bucket, place.prefix + DIGESTS, MOST_DIGEST_BYTES)))[-1]
+        last = _digests(_ask(lambda: store.get(place.bucket, place.prefix + DIGESTS, MAX_DIGEST_BYTES)))[-1]
     if (folder / INFO).is_file() and last in {'', *_digests((folder / DIGESTS).read_bytes())}:
         return True
     if INFO not in there:
@@ -205,4 +205,4 @@ def _put(store: ObjectStore, place: DatasetPlace, name: str, path: Path) -> int:
 
 
 def _ask(ask: Callable[[], _Answer]) -> _Answer:
-    return steadily(ask, tries=TRIES)
+    return with_retries(ask, tries=TRIES)

@@ -38,7 +38,7 @@ FRAMES: Final = 5
 """Frames of each camera in each episode, by default."""
 ALIKE: Final = 0.8
 """Least similarity (SSIM) of a frame of a video to its source; AV1 at crf 30 keeps more than 0.9 of what cameras see."""
-MOST_TABLE_BYTES: Final = 1 << 30
+MAX_TABLE_BYTES: Final = 1 << 30
 
 
 @dataclass(slots=True)
@@ -189,8 +189,8 @@ def use_in_folder(folder: Path, key: str) -> DatasetUse | None:
 def use_in_store(source: Bucket, place: DatasetPlace, key: str) -> DatasetUse | None:
     """Raises StoreError, LakeError."""
     try:
-        body = source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES)
-        digests = from_json(source.get(place.prefix + DIGESTS, MOST_TABLE_BYTES))
+        body = source.get(place.prefix + SOURCE_TABLE, MAX_TABLE_BYTES)
+        digests = from_json(source.get(place.prefix + DIGESTS, MAX_TABLE_BYTES))
         return _use(str(place), pq.read_table(io.BytesIO(body)), digests, key)
     except (ValueError, pa.ArrowException) as error:
         raise LakeError(f'{place} is not a dataset of this program: {error}') from error
@@ -223,7 +223,7 @@ def sources_in_folder(folder: Path) -> set[tuple[str, str]]:
 def sources_in_store(source: Bucket, place: DatasetPlace) -> set[tuple[str, str]]:
     """The same for a dataset in a store. Raises StoreError, LakeError."""
     try:
-        return _named(pq.read_table(io.BytesIO(source.get(place.prefix + SOURCE_TABLE, MOST_TABLE_BYTES))))
+        return _named(pq.read_table(io.BytesIO(source.get(place.prefix + SOURCE_TABLE, MAX_TABLE_BYTES))))
     except (ObjectRefused, ValueError, pa.ArrowException, LookupError) as error:
         raise LakeError(f'the dataset {place} cannot be read: {error}', remedy='repair it, or delete it') from error
 

@@ -1,1 +1,1 @@
-"""Why it does not work, and what to do: checks of one machine, each with a deadline, none of which can stop the others."""
+"""Diagnoses one machine: checks with a finding, its cause and a remedy. Each has a deadline, and none can stop the others."""

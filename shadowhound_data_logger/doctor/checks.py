@@ -1,7 +1,7 @@
-"""All checks, in the order in which a person would ask: the guide's checklist, from the shell to the store.
+"""All checks, in the order of the guide's checklist: from the shell to the store.
 
 As a program, ``python -m shadowhound_data_logger.doctor.checks NAME``, it is the process of one check: context on standard input,
-results out.
+results on standard output.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ CHECKS: Final = (
     Check(name='mlflow', run=mlflow.check, deadline_s=8.0, after=('network.mlflow',)),
     Check(name='tower', run=network.check_tower, roles=TOWER),
     Check(name='ros.environment', run=ros_environment.check, roles=THOR),
-    Check(name='ros', run=ros.check, roles=THOR, deadline_s=11.5, apart=True),
+    Check(name='ros', run=ros.check, roles=THOR, deadline_s=11.5, isolated=True),
     Check(name='sockets', run=sockets.check, roles=THOR),
-    Check(name='disk', run=disk.check, roles=THOR, deadline_s=8.0, apart=True),
+    Check(name='disk', run=disk.check, roles=THOR, deadline_s=8.0, isolated=True),
     Check(name='spool', run=spool.check, roles=THOR, deadline_s=6.0, after=('s3',)),
     Check(name='missions', run=missions.check, roles=THOR),
     Check(name='policies', run=policies.check, roles=THOR),
@@ -53,7 +53,7 @@ CHECKS: Final = (
 
 
 def main() -> None:
-    """One line of JSON for each result. What libraries print on standard output goes to standard error."""
+    """Print one line of JSON per result. Output of libraries is redirected to standard error."""
     answers = os.fdopen(os.dup(1), 'w', encoding='utf-8')
     os.dup2(2, 1)
     context = from_child(sys.stdin.buffer.read())

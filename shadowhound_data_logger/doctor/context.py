@@ -1,4 +1,4 @@
-"""The context of a run: role, environment and settings, as far as they can be read. Refused settings do not stop the doctor."""
+"""The context of a run: role, environment and settings, as far as they can be read. Invalid settings do not stop the doctor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shadowhound_data_logger.spool.local_robot import local_robot, local_robots
 
 S3_PORT: Final = 9000
 MLFLOW_PORT: Final = 5001
-"""Of a Tower as the integration guide sets it up."""
+"""The ports of a Tower as in the integration guide."""
 
 
 def make(
@@ -32,7 +32,7 @@ def make(
     rates_hz: Mapping[str, float] | None = None,
     root: Path = Path('/'),
 ) -> Context:
-    """Raises ParametersUnreadable. What Settings refuses is left out, one after the other, and told in ``refused``."""
+    """Raises ParametersUnreadable. Settings that are invalid are dropped one by one and listed in ``refused``."""
     node = f'/{namespace.strip("/")}/{NODE}' if namespace.strip('/') else None
     given = dict(parameters if parameters is not None else read_parameters(parameter_file, node) if parameter_file else {})
     known, left, refused = dict(environ), dict(given), []
@@ -40,7 +40,7 @@ def make(
         spool = home(environ) / 'spool'
         try:
             robot = local_robot(environ, spool)
-        except SettingError as error:  # the first of several is examined
+        except SettingError as error:  # only the first of several is examined
             refused.append(error)
             robot = local_robots(environ, spool)[0]
         known |= {'SHADOWHOUND_ROBOT': robot} if robot else {}
@@ -55,7 +55,7 @@ def make(
                 del known[name]
             elif name in left:
                 del left[name]
-            else:  # the robot's name, or a default that it makes too long; else what other parameters say
+            else:  # the robot's name, or a default that it makes too long; otherwise other parameters
                 left, namespace = left if name == 'robot' else {}, '/'
                 known.pop('SHADOWHOUND_ROBOT', None)
     return Context(
@@ -72,7 +72,7 @@ def make(
 
 
 def guess(environ: Mapping[str, str], spool: Path, root: Path) -> Role:
-    """A spool is Thor's, servers that listen here are Tower's; else who has ROS is Thor, and the rest is Spark."""
+    """A machine with a spool is Thor, one whose S3 or MLflow port is open is Tower; otherwise Thor if it has ROS, else Spark."""
     has_ros = bool(environ.get('ROS_DISTRO')) or find_spec('rclpy') is not None
     if has_ros and (spool / 'index.db').exists():
         return Role.THOR
@@ -95,7 +95,7 @@ def _serves(environ: Mapping[str, str], root: Path) -> bool:
 
 
 def to_child(context: Context) -> bytes:
-    """For ``from_child``; variables go through the child's own environment, so that no secret is anywhere else."""
+    """For ``from_child``; variables are passed in the child's environment, so that no secret is stored elsewhere."""
     given = {
         'role': context.role.value,
         'parameters': dict(context.parameters),
@@ -120,5 +120,5 @@ def from_child(sent: bytes) -> Context:
 
 
 def home_of(context: Context) -> Path:
-    """Of the user, for files such as ``~/.aws/credentials``."""
+    """The user's home, for files such as ``~/.aws/credentials``."""
     return Path(context.environ.get('HOME') or '~').expanduser()

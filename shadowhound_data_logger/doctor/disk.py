@@ -1,4 +1,4 @@
-"""The disk under the spool: free space, permission to write, and how long a commit takes. In a child process."""
+"""The disk under the spool: free space, write permission, and duration of a commit. Runs in a child process."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from shadowhound_data_logger.doctor.model import Context, Result, error, info, m
 NAME: Final = 'disk'
 SMALL_BYTES, LARGE_BYTES = 1 << 20, 8 << 20
 WITHIN_S: Final = 2.0
-"""The large one is written where the small one says that it takes no longer, and the syncs end then: a slow disk is a finding."""
+"""The large write is skipped if the small one predicts that it takes longer, and the syncs stop then: a slow disk is a finding.
+"""
 SYNCS: Final = 8
 SLOW_SYNC_S: Final = 0.25
-"""A group commit has three; the spool wants one in 0.1 s, and can do with less often."""
+"""A group commit has three syncs; the spool commits every 0.1 s, or less often if it must."""
 SLOW_MBYTES: Final = 20.0
-"""The full rate of a Go2 is 5 MB/s, and the disk has more to do."""
+"""The full rate of a Go2 is 5 MB/s, and the disk has other work."""
 FEW_INODES: Final = 10_000
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
-    folder = _existing(context.settings.spool_path)
-    room = list(_room(folder, context))
+    """Check free space, permissions, and the speed of syncs and writes."""
+    folder = _nearest_existing(context.settings.spool_path)
+    room = list(_free_space(folder, context))
     yield from room
     probe = folder / f'.doctor-{os.getpid()}'
     try:
@@ -41,12 +42,12 @@ def check(context: Context) -> Iterator[Result]:
             probe.unlink()
 
 
-def _existing(path: Path) -> Path:
-    """The folder, or the nearest above it that is there: the doctor makes none."""
+def _nearest_existing(path: Path) -> Path:
+    """The folder, or its nearest existing parent: the doctor creates none."""
     return next(each for each in (path, *path.parents) if each.is_dir())
 
 
-def _room(folder: Path, context: Context) -> Iterator[Result]:
+def _free_space(folder: Path, context: Context) -> Iterator[Result]:
     disk, settings = os.statvfs(folder), context.settings.spool
     free = disk.f_bavail * disk.f_frsize
     seen = f'{free / 1e9:.1f} GB free under {folder}'
@@ -55,7 +56,7 @@ def _room(folder: Path, context: Context) -> Iterator[Result]:
         yield error(
             'disk.readonly',
             f'the file system of {folder} is mounted read-only',
-            'the kernel does that after an error of the disk, or it was mounted so',
+            'the kernel does that after a disk error, or it was mounted read-only',
             f'sudo dmesg | tail -30 ; sudo mount -o remount,rw {_mount_point(folder)}',
         )
     elif free < settings.min_free_bytes:
@@ -76,8 +77,8 @@ def _room(folder: Path, context: Context) -> Iterator[Result]:
     if disk.f_files > 0 and disk.f_favail < FEW_INODES:
         yield warning(
             'disk.inodes',
-            f'{disk.f_favail:,} files can still be made under {folder}',
-            'the spool has a file an object',
+            f'{disk.f_favail:,} files can still be created under {folder}',
+            'the spool has one file per object',
             f'df -i {folder}',
             inodes=disk.f_favail,
         )
@@ -88,7 +89,7 @@ def _mount_point(folder: Path) -> Path:
 
 
 def _speed(probe: Path) -> Iterator[Result]:
-    """Small syncs first, then a large write."""
+    """Small syncs first, then one large write."""
     with open(probe, 'xb', buffering=0) as file:  # noqa: PTH123 - as the spool does it
         took: list[float] = []
         while len(took) < SYNCS and sum(took) < WITHIN_S:
@@ -104,7 +105,7 @@ def _speed(probe: Path) -> Iterator[Result]:
     yield measured(
         'disk.sync',
         f'a sync takes {1000 * middle_s:.1f} ms',
-        'an SD card, a dying or a busy disk: commits come late, and more is lost in a power cut',
+        'an SD card, or a failing or busy disk: commits are late, and a power cut loses more',
         'iostat -x 1 5 ; an NVMe disk: export SHADOWHOUND_HOME=/data/shadowhound',
         is_fine=middle_s <= SLOW_SYNC_S,
         sync_s=round(middle_s, 4),
@@ -112,7 +113,7 @@ def _speed(probe: Path) -> Iterator[Result]:
     yield measured(
         'disk.speed',
         f'{mbytes:.0f} MB/s can be written',
-        'an SD card, or a disk that others keep busy',
+        'an SD card, or a disk that other programs keep busy',
         'iostat -x 1 5',
         is_fine=mbytes >= SLOW_MBYTES,
         write_mbytes=round(mbytes, 1),
@@ -120,7 +121,7 @@ def _speed(probe: Path) -> Iterator[Result]:
 
 
 def _write(file: FileIO, size: int) -> float:
-    """Seconds until so many bytes are on the disk."""
+    """Seconds until this many bytes are on the disk."""
     began_s = time.perf_counter()
     left = size
     while left > 0:
@@ -131,12 +132,14 @@ def _write(file: FileIO, size: int) -> float:
 
 def _unwritable(folder: Path, problem: OSError) -> Result:
     if problem.errno in FULL:
-        return error('disk.space', f'no space left under {folder}', 'the disk is full, or a quota is used up', f'df -h {folder}')
+        return error(
+            'disk.space', f'no space left under {folder}', 'the disk is full, or a quota is exhausted', f'df -h {folder}'
+        )
     if problem.errno == errno.EROFS:
         return error(
             'disk.readonly',
             f'the file system of {folder} is read-only',
-            'an error of the disk, or it was mounted so',
+            'a disk error, or it was mounted read-only',
             f'sudo mount -o remount,rw {_mount_point(folder)}',
         )
     return error(

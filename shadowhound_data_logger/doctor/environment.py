@@ -1,4 +1,4 @@
-"""What the shell says: which servers and keys, which settings are refused, and whether the running node was told the same."""
+"""The variables of the shell: servers, keys, invalid settings, and whether the running node has the same."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from shadowhound_data_logger.core.mlflow_rest import LOGIN, login
 from shadowhound_data_logger.doctor import services
 from shadowhound_data_logger.doctor.context import home_of
 from shadowhound_data_logger.doctor.machine import variables
-from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, warning
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, from_error, info, ok, warning
 from shadowhound_data_logger.doctor.ros_environment import DEFAULTS
 from shadowhound_data_logger.spool import status
 
 KEYS: Final = ('AWS_ACCESS_KEY_ID', 'AWS_SECRET_ACCESS_KEY')
 SHARED: Final = (*ENDPOINTS, *KEYS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL', 'ROS_DOMAIN_ID')
-"""Where the node and this shell should agree; AWS's keys among them are compared, never shown."""
+"""Variables that should be the same for the node and this shell; AWS keys among them are compared, never shown."""
 PLACEHOLDERS: Final = ('<', 'TOWER_IP', 'from Tower', '...')
-"""What is in the variables of somebody who pasted the guide as it is."""
+"""Placeholders of the guide, left in a variable by copying a command."""
 OF_THE_NODE: Final = 'set -a; . /etc/shadowhound/logger.env; set +a'
-"""Gives a shell the variables of the node's service."""
+"""Loads the variables of the node's service into a shell."""
 _BARE: Final = re.compile(r'[\w.-]+:\d{2,5}/?')
-"""A host and its port, which are not a URL."""
+"""A host and a port without a scheme."""
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check variables, key pair, MLflow, proxies and the running node."""
     for problem in context.refused:
-        yield of_error('environment.settings', problem, 'the node would not start with it')
+        yield from_error('environment.settings', problem, 'the node does not start with it')
     if context.parameter_file and not context.parameters:
         yield warning(
             'environment.parameters',
             f'{context.parameter_file} sets nothing for the node',
-            'its section is for another node, or misspelt: the defaults hold, and ROS says nothing',
+            'its section is for another node, or misspelt: ROS uses the defaults without a warning',
             "begin the section with '/**:'  # launch_configs/go2.yaml shows how",
         )
     yield from _store(context)
@@ -54,9 +54,9 @@ def _store(context: Context) -> Iterator[Result]:
     if pasted:
         yield error(
             'environment.placeholder',
-            f'{" and ".join(pasted)} still has a placeholder of the manual',
-            'it was pasted and not filled in',
-            f'export {pasted[0]}=...  # with what Tower gave you',
+            f'{" and ".join(pasted)} still has a placeholder from the manual',
+            'the command was pasted and not completed',
+            f'export {pasted[0]}=...  # with the values from Tower',
         )
     if not endpoint:
         if any(problem.data['name'] in ENDPOINTS for problem in context.refused):
@@ -68,7 +68,7 @@ def _store(context: Context) -> Iterator[Result]:
 
 
 def _no_endpoint(context: Context) -> Result:
-    """It may be set for the node alone, whose status file says where it delivers: then the network is not checked, but works."""
+    """It may be set for the node only; the node's status file then shows the target, and network checks are skipped."""
     servers = [target for target in status.targets(context.settings.spool_path) if '://' in target]
     if servers:
         return warning(
@@ -80,13 +80,13 @@ def _no_endpoint(context: Context) -> Result:
     return warning(
         'environment.endpoint',
         'AWS_ENDPOINT_URL is not set',
-        f'without it nothing leaves this machine: data is stored in {context.settings.store.directory}',
+        f'without it nothing is uploaded: data is stored in {context.settings.store.directory}',
         'export AWS_ENDPOINT_URL=http://TOWER_IP:9000',
     )
 
 
 def _credentials(context: Context) -> Result:
-    """Where the key pair comes from, in botocore's order; which one it is, is not shown."""
+    """Where the key pair comes from, in botocore's order; the key itself is not shown."""
     environ, name = context.environ, 'environment.credentials'
     missing = [each for each in KEYS if not environ.get(each)]
     if len(missing) == 1:
@@ -99,10 +99,10 @@ def _credentials(context: Context) -> Result:
             return error(
                 name,
                 f'{spaced[0]} has a space or line break at its end',
-                'it was pasted with more than it is',
+                'it was pasted with extra characters',
                 f'export {spaced[0]}=...',
             )
-        return ok(name, 'the key pair is in the environment (a node that runs has to be started again after a change)')
+        return ok(name, 'the key pair is in the environment (restart the node after a change)')
     file = Path(environ.get('AWS_SHARED_CREDENTIALS_FILE') or home_of(context) / '.aws/credentials').expanduser()
     profile = environ.get('AWS_PROFILE') or 'default'
     if profile in _profiles(file):
@@ -131,13 +131,13 @@ def _tracking(context: Context) -> Iterator[Result]:
         yield warning(
             'environment.tracking',
             'MLFLOW_TRACKING_URI is not set, though there is a Tower',
-            f'missions are logged to {context.settings.home / "mlflow.db"}, where nobody on Tower sees them',
+            f'missions are logged to {context.settings.home / "mlflow.db"}, where Tower cannot see them',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )
     elif uri.startswith('http') and services.mlflow(context) is None:
         yield error(
             'environment.tracking',
-            f'MLFLOW_TRACKING_URI is {services.shown(uri)}, which is not an address',
+            f'MLFLOW_TRACKING_URI is {services.without_login(uri)}, which is not an address',
             'its host or port is invalid',
             'export MLFLOW_TRACKING_URI=http://TOWER_IP:5001',
         )
@@ -149,7 +149,7 @@ def _tracking(context: Context) -> Iterator[Result]:
             f'export MLFLOW_TRACKING_URI=http://{uri}',
         )
     elif uri:
-        yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {services.shown(uri)}')
+        yield ok('environment.tracking', f'MLFLOW_TRACKING_URI is {services.without_login(uri)}')
     missing = [name for name, value in zip(LOGIN, login(environ, home_of(context)), strict=True) if not value]
     if uri.startswith('http') and len(missing) == 1:
         yield error(
@@ -163,26 +163,26 @@ def _tracking(context: Context) -> Iterator[Result]:
         try:
             endpoint_url(s3, 'MLFLOW_S3_ENDPOINT_URL')
         except SettingError as problem:
-            yield of_error('environment.artifacts', problem, 'no artifact could be sent to it')
+            yield from_error('environment.artifacts', problem, 'no artifact can be uploaded to it')
             return
     if uri.startswith('http') and endpoint and not s3:
         yield info(
             'environment.artifacts',
             'MLFLOW_S3_ENDPOINT_URL is not set',
-            'our own programs take AWS_ENDPOINT_URL for it; older MLflow clients ask Amazon instead',
+            'this package uses AWS_ENDPOINT_URL instead; older MLflow clients use Amazon',
             'export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',
         )
     elif s3 and endpoint and s3.rstrip('/') != endpoint.rstrip('/'):
         yield warning(
             'environment.artifacts',
-            f'MLFLOW_S3_ENDPOINT_URL is {services.shown(s3)}, AWS_ENDPOINT_URL {endpoint}',
-            'artifacts go to another server than the data',
+            f'MLFLOW_S3_ENDPOINT_URL is {services.without_login(s3)}, AWS_ENDPOINT_URL {endpoint}',
+            'artifacts are uploaded to another server than the data',
             'export MLFLOW_S3_ENDPOINT_URL=$AWS_ENDPOINT_URL',
         )
 
 
 def _proxies(context: Context) -> Iterator[Result]:
-    """A proxy for the internet knows no Tower."""
+    """Report proxies that Tower's requests would use."""
     environ = context.environ
     spared = {host.strip().lstrip('.') for name in ('NO_PROXY', 'no_proxy') for host in environ.get(name, '').split(',')}
     for service in filter(None, (services.s3(context), services.mlflow(context))):
@@ -192,19 +192,19 @@ def _proxies(context: Context) -> Iterator[Result]:
             yield warning(
                 'environment.proxy',
                 f'{names[0]} is set, and {host} is not in NO_PROXY',
-                'requests for Tower go to the proxy',
+                'requests to Tower are sent to the proxy',
                 f'export NO_PROXY=$NO_PROXY,{host}',
             )
             return
 
 
 def _node(context: Context) -> Iterator[Result]:
-    """The node that runs may have been started with other variables, or with keys that were changed since."""
+    """Compare the running node: it may have been started with other variables, or with keys that were changed since."""
     found = status.read(context.settings.spool_path, context.settings.robot, SystemClock.of_this_machine())
     if not found.running:
         return
     theirs = variables(context.root, found.node.pid)
-    # Without an endpoint here, 'environment.endpoint' has said so, and the keys with it.
+    # Without an endpoint, 'environment.endpoint' has already reported that, including the keys.
     compared = [name for name in SHARED if context.settings.store.endpoint_url or not name.startswith('AWS_')]
     other = [name for name in compared if theirs and _value(theirs, name) != _value(context.environ, name)]
     if other:
@@ -219,5 +219,5 @@ def _node(context: Context) -> Iterator[Result]:
 
 
 def _value(environ: Mapping[str, str], name: str) -> str:
-    """What a variable comes to: one that is not set says something as well."""
+    """The effective value of a variable: one that is not set has a meaning too."""
     return environ.get(name) or DEFAULTS.get(name, '')

@@ -1,4 +1,4 @@
-"""What the kernel tells of this machine: processes and their variables, sockets, locks. All from ``/proc``, see proc(5)."""
+"""The kernel's view of this machine: processes and their variables, sockets, locks. All from ``/proc``, see proc(5)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ LISTEN: Final = '0A'
 """State of a TCP socket, ``TCP_LISTEN`` of include/net/tcp_states.h."""
 DISCOVERY_PORTS: Final = (7400, 7410)
 DOMAIN_GAIN: Final = 250
-"""Plus 250 * domain: where every participant that uses multicast listens, and the first one that does not, as Cyclone DDS with
-ROS_LOCALHOST_ONLY (DDSI-RTPS 2.2, 9.6.1.1)."""
+"""Plus 250 * domain: the port of every participant with multicast, and of the first one without (DDSI-RTPS 2.2, 9.6.1.1)."""
 MAX_DOMAIN: Final = 232
 
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A process of this machine; ``environ`` is empty where it is another user's."""
+    """A process of this machine; ``environ`` is empty if it belongs to another user."""
 
     pid: int
     command: str
@@ -28,7 +27,7 @@ class Process:
 
 
 def processes(root: Path, *names: str) -> list[Process]:
-    """Those in whose program or script one of the names occurs."""
+    """Processes whose program or script contains one of the names."""
     found = []
     for folder in (root / 'proc').glob('[0-9]*'):
         try:
@@ -36,13 +35,13 @@ def processes(root: Path, *names: str) -> list[Process]:
             if int(folder.name) != os.getpid() and any(name in word for word in words[:3] for name in names):
                 command = ' '.join(words).strip()
                 found.append(Process(int(folder.name), command, folder.stat().st_uid, variables(root, int(folder.name))))
-        except OSError:  # it has ended meanwhile
+        except OSError:  # it has ended since
             continue
     return sorted(found, key=lambda process: process.pid)
 
 
 def variables(root: Path, pid: int) -> dict[str, str]:
-    """With which a process was started; empty where that may not be read."""
+    """The variables that a process was started with; empty if they may not be read."""
     try:
         text = (root / 'proc' / str(pid) / 'environ').read_bytes().decode(errors='replace')
     except OSError:
@@ -51,7 +50,7 @@ def variables(root: Path, pid: int) -> dict[str, str]:
 
 
 def command(root: Path, pid: int) -> str:
-    """The command line of a process, as ``ps`` shows it."""
+    """The command line of a process, as in ``ps``."""
     try:
         text = (root / 'proc' / str(pid) / 'cmdline').read_bytes().decode(errors='replace')
     except OSError:
@@ -60,7 +59,7 @@ def command(root: Path, pid: int) -> str:
 
 
 def listening(root: Path) -> set[tuple[bool, int]]:
-    """(whether only this machine itself can reach it, port) of each TCP socket that accepts connections."""
+    """(whether it is bound to loopback, port) of each listening TCP socket."""
     found = set()
     for name in ('tcp', 'tcp6'):
         for address, state in _sockets(root, name):
@@ -71,14 +70,14 @@ def listening(root: Path) -> set[tuple[bool, int]]:
 
 
 def domains(root: Path) -> list[int]:
-    """ROS domains in which somebody takes part on this machine."""
+    """ROS domains with a participant on this machine."""
     ports = {int(address.rpartition(':')[2], 16) for name in ('udp', 'udp6') for address, _ in _sockets(root, name)}
     numbers = ((port - base) / DOMAIN_GAIN for port in ports for base in DISCOVERY_PORTS)
     return sorted({int(number) for number in numbers if number.is_integer() and 0 <= number <= MAX_DOMAIN})
 
 
 def lock_holder(root: Path, path: Path) -> int | None:
-    """The process that holds a flock on this file; None where nobody does. Takes no lock itself, so it disturbs nobody."""
+    """The process that holds a flock on this file; None if there is none. It does not take the lock, so it disturbs nothing."""
     try:
         status = path.stat()
         lines = (root / 'proc/locks').read_text(encoding='ascii').splitlines()
@@ -93,7 +92,7 @@ def lock_holder(root: Path, path: Path) -> int | None:
 
 
 def number(path: Path) -> int | None:
-    """A file of the kernel that holds one number."""
+    """The value of a kernel file that contains one number."""
     try:
         return int(path.read_text(encoding='ascii'))
     except (OSError, ValueError):
@@ -101,7 +100,7 @@ def number(path: Path) -> int | None:
 
 
 def _sockets(root: Path, name: str) -> Iterator[tuple[str, str]]:
-    """(local address, state) as ``/proc/net/tcp`` writes them."""
+    """(local address, state) in the format of ``/proc/net/tcp``."""
     try:
         lines = (root / 'proc/net' / name).read_text(encoding='ascii').splitlines()[1:]
     except OSError:
@@ -113,7 +112,7 @@ def _sockets(root: Path, name: str) -> Iterator[tuple[str, str]]:
 
 
 def _is_loopback(host: str) -> bool:
-    """Of an address in hex, each 32-bit word in the byte order of the machine."""
+    """Whether a hexadecimal address is loopback; each 32-bit word has the machine's byte order."""
     if len(host) == 8:
         return host.endswith('7F')
     return host == '00000000000000000000000001000000' or (host[16:24] == 'FFFF0000' and host.endswith('7F'))

@@ -1,4 +1,4 @@
-"""Missions of this machine: whether the agent logs any, and whether what it logged reached MLflow."""
+"""Missions of this machine: whether the agent logs any, and whether they reached MLflow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NAME: Final = 'missions'
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check that missions are readable, logged and delivered."""
     try:
         found = overviews(context.settings.home)
     except OSError as problem:
@@ -34,7 +34,7 @@ def check(context: Context) -> Iterator[Result]:
         yield warning(
             'missions.sent',
             f'{len(stuck)} of {len(found)} missions are not sent; the last one: {each.last_error}',
-            'MLflow or the store does not take it',
+            'MLflow or the store does not accept them',
             each.remedy or 'shadowhound-data doctor --only mlflow',
         )
     for each in refused[-1:]:
@@ -46,4 +46,4 @@ def check(context: Context) -> Iterator[Result]:
         )
     if not stuck and not refused:
         waiting = sum(not each.complete for each in found)
-        yield ok(NAME, f'{len(found)} missions, {waiting} of them still on their way')
+        yield ok(NAME, f'{len(found)} missions, {waiting} of them not delivered yet')

@@ -1,7 +1,7 @@
-"""MLflow: whether it answers, asks for a password, takes runs, and whether artifacts reach the store that they are meant for.
+"""MLflow: whether it answers, requires a password, accepts runs, and whether artifacts reach their store.
 
-What it leaves behind: one tag and one artifact of 64 bytes, in the experiment of the robot's missions; on Spark, which only reads
-that, and before there is one, in an experiment of its own (``_doctor``, and the user's name).
+It leaves behind one tag and one artifact of 64 bytes in the experiment of the robot's missions; on Spark, which only reads
+that experiment, and before it exists, in a separate one (``_doctor`` and the user's name).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from shadowhound_data_logger.core.errors import StoreError, TrackingError, Track
 from shadowhound_data_logger.core.mlflow_rest import MlflowRest
 from shadowhound_data_logger.doctor import s3_put, services
 from shadowhound_data_logger.doctor.context import home_of
-from shadowhound_data_logger.doctor.model import Context, Result, Role, error, info, of_error, ok, skipped, warning
+from shadowhound_data_logger.doctor.model import Context, Result, Role, error, from_error, info, ok, skipped, warning
 
 NAME: Final = 'mlflow'
 PROBE: Final = '_doctor'
@@ -29,10 +29,10 @@ S3_OF_SERVER: Final = (
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the server, its login, the missions' experiment and its artifacts."""
     service = services.mlflow(context)
     if service is None:
-        uri = services.shown(context.environ.get('MLFLOW_TRACKING_URI', ''))
+        uri = services.without_login(context.environ.get('MLFLOW_TRACKING_URI', ''))
         yield info(NAME, f'no MLflow server is set: missions are logged to {uri or context.settings.home / "mlflow.db"}')
         return
     if failed := context.failed('network.mlflow'):
@@ -44,7 +44,7 @@ def check(context: Context) -> Iterator[Result]:
         if rest.is_open():
             yield warning(
                 'mlflow.open',
-                f'{service.url} asks nobody for a password',
+                f'{service.url} requires no password',
                 'anyone who can reach that port can read, change and delete missions, and administer the server',
                 'on Tower: make tower-secrets, and start MLflow as tower/compose.yaml does (docs/tower.md)',
             )
@@ -61,14 +61,14 @@ def check(context: Context) -> Iterator[Result]:
         yield from _artifacts(rest, missions, str(found['artifact_location']), context)
     except TrackingError as problem:
         yield _failed(problem, service.variable, context.settings.robot)
-    except OSError as problem:  # a file of certificates; network.mlflow.tls has more to say
-        yield error('mlflow.tls', f'no certificate of {service.url} can be judged: {problem}', '', 'see network.mlflow.tls')
+    except OSError as problem:  # a certificate file; network.mlflow.tls has details
+        yield error('mlflow.tls', f'the certificate of {service.url} cannot be verified: {problem}', '', 'see network.mlflow.tls')
 
 
 def _health(rest: MlflowRest, url: str) -> Iterator[Result]:
     said = rest.get('/health')
     if said != 'OK':
-        raise TrackingUnavailable(f'{url} does not answer like an MLflow server: /health says {said[:40]!r}', code='')
+        raise TrackingUnavailable(f'{url} does not answer like an MLflow server: /health returns {said[:40]!r}', code='')
     version = rest.get('/version')
     yield ok('mlflow.health', f'MLflow {version} answers', version=version)
 
@@ -78,14 +78,14 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
     cause, remedy = 'the server hangs, or waits for its database', f'{LOGS} ; docker compose restart mlflow'
     if 'Host header' in text:
         cause, remedy = (
-            'MLflow takes requests for its own names only',
+            'MLflow only accepts requests for its own host names',
             'on Tower: mlflow server --allowed-hosts TOWER_IP:5001,...',
         )
     elif status == 401 and not text.startswith('<'):
         return error(
             'mlflow.login',
             str(problem),
-            'it wants a user and a password, or another one: they may have been changed',
+            'it requires a user and password, or different ones: they may have been changed',
             'export MLFLOW_TRACKING_USERNAME=... MLFLOW_TRACKING_PASSWORD=...  # of tower/secrets/NAME.env on Tower, or '
             'its NAME.credentials as ~/.mlflow/credentials',
         )
@@ -93,8 +93,9 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
         return error(
             'mlflow.login',
             str(problem),
-            f'this user may not: MLFLOW_TRACKING_USERNAME is that of another machine, or Tower does not know {robot} as a robot',
-            f'on Tower: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and bring {robot}.env here',
+            'this user has no permission: MLFLOW_TRACKING_USERNAME is that of another machine, or Tower does not know '
+            f'{robot} as a robot',
+            f'on Tower: make tower-secrets TOWER_ARGS="--robot {robot}", start MLflow again, and copy {robot}.env here',
         )
     elif 400 <= status < 500 or 'like an MLflow server' in str(problem):
         cause, remedy = 'something else listens on this port', f'export {variable}=http://TOWER_IP:5001'
@@ -104,24 +105,24 @@ def _failed(problem: TrackingError, variable: str, robot: str) -> Result:
 
 
 def _own(rest: MlflowRest, name: str) -> dict[str, Any]:
-    """An experiment of the doctor's own, made or brought back where need be."""
+    """The doctor's own experiment, created or restored if needed."""
     found = rest.experiment(name)
     if found is None:
         try:
             rest.create(name)
         except TrackingRefused as problem:
-            if problem.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # another doctor's
+            if problem.data['code'] != 'RESOURCE_ALREADY_EXISTS':  # created by another doctor
                 raise
         found = rest.experiment(name)
     if found is None:
-        raise TrackingUnavailable(f'the experiment {name} was created and is not there', code='')
+        raise TrackingUnavailable(f'the experiment {name} was created but does not exist', code='')
     if found.get('lifecycle_stage') == 'deleted':
         rest.restore(found['experiment_id'])
     return found
 
 
 def _missions(name: str, found: Mapping[str, Any] | None) -> Iterator[Result]:
-    """The experiment of the missions, if there is one: where artifacts go is fixed when it is created."""
+    """The experiment of the missions, if it exists: its artifact location is fixed when it is created."""
     if found is None:
         yield info('mlflow.missions', f'there is no experiment {name} yet: no mission has been logged')
         return
@@ -130,7 +131,7 @@ def _missions(name: str, found: Mapping[str, Any] | None) -> Iterator[Result]:
         yield error(
             'mlflow.missions',
             f'the experiment {name} is deleted',
-            'missions wait until it is back',
+            'missions wait until it is restored',
             f'on Tower: mlflow experiments restore -x {found["experiment_id"]}',
         )
     elif not _is_folder(where):
@@ -153,7 +154,7 @@ def _local(who: str, location: str) -> Result:
 
 
 def _artifacts(rest: MlflowRest, name: str, location: str, context: Context) -> Iterator[Result]:
-    """One artifact to where this server's clients send them, and back."""
+    """Upload one artifact the way this server's clients do, and read it back."""
     scheme = urlsplit(location).scheme
     if scheme == 'mlflow-artifacts':
         yield _proxied(rest, urlsplit(location).path.strip('/'))
@@ -162,43 +163,41 @@ def _artifacts(rest: MlflowRest, name: str, location: str, context: Context) -> 
     elif _is_folder(location):
         yield _local(f'the experiment {name}', location)
     else:
-        yield info('mlflow.artifacts', f'artifacts go to {location}, which is not asked')
+        yield info('mlflow.artifacts', f'artifacts are stored in {location}, which is not checked')
 
 
 def _proxied(rest: MlflowRest, folder: str) -> Result:
     url = rest.artifact_url(f'{folder}/_doctor/probe.txt')
     try:
-        rest.ask('PUT', url, s3_put.BODY)
-        body = rest.ask('GET', url)
+        rest.send('PUT', url, s3_put.BODY)
+        body = rest.send('GET', url)
     except TrackingRefused as problem:
         return error(
             'mlflow.artifacts',
-            f'MLflow takes no artifact: {problem}',
+            f'MLflow does not accept artifacts: {problem}',
             S3_OF_SERVER,
             f'{LOGS} ; docker exec mlflow env | grep -E "AWS_|MLFLOW_S3" | cut -d= -f1  # only the names',
         )
     except TrackingUnavailable as problem:
         return error(
             'mlflow.artifacts',
-            f'MLflow takes no artifact: {problem}',
+            f'MLflow does not accept artifacts: {problem}',
             'it waits for its artifact store, which does not answer',
             f'{LOGS} ; curl -i $AWS_ENDPOINT_URL',
         )
     if body != s3_put.BODY:
-        return error(
-            'mlflow.artifacts', 'an artifact does not come back as it was written', 'its store damages what it holds', LOGS
-        )
-    return ok('mlflow.artifacts', 'an artifact went through MLflow to its store and came back')
+        return error('mlflow.artifacts', 'an artifact reads back differently', 'its store damages content', LOGS)
+    return ok('mlflow.artifacts', 'an artifact was written through MLflow to its store and read back')
 
 
 def _direct(location: str, context: Context) -> Iterator[Result]:
-    """The client itself writes to S3."""
+    """Check an artifact store that the client writes to directly."""
     url, endpoint = urlsplit(location), context.environ.get('MLFLOW_S3_ENDPOINT_URL') or context.settings.store.endpoint_url
     if not endpoint:
         yield error(
             'mlflow.artifacts',
-            f'artifacts go to {location}, and MLFLOW_S3_ENDPOINT_URL does not say where that is',
-            'MLflow then asks Amazon',
+            f'artifacts are stored in {location}, and MLFLOW_S3_ENDPOINT_URL does not name its server',
+            'MLflow then uses Amazon',
             'export MLFLOW_S3_ENDPOINT_URL=http://TOWER_IP:9000',
         )
         return
@@ -211,7 +210,7 @@ def _direct(location: str, context: Context) -> Iterator[Result]:
             b''.join(requests.content(url.netloc, key))
     except StoreError as problem:
         whose = 'this robot' if context.role is Role.THOR else 'this machine'
-        result = of_error('mlflow.artifacts', problem, f'artifacts of missions go from {whose} to {location} itself')
+        result = from_error('mlflow.artifacts', problem, f'{whose} writes the artifacts of missions directly to {location}')
         yield replace(result, remedy=result.remedy or f'aws --endpoint-url {endpoint} s3 ls s3://{url.netloc}/')
         return
     yield ok('mlflow.artifacts', f'an artifact was written to {location} and read back')

@@ -1,6 +1,6 @@
-"""The way to Tower: its name, its ports, whether its certificate can be trusted, and on Tower itself who can reach its servers.
+"""The network path to Tower: its name, its ports, its certificate, and on Tower itself which clients can reach its servers.
 
-Nothing is sent but the TLS greeting.
+It sends nothing but the TLS handshake.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ CA_FILES: Final = {
     's3': ('AWS_CA_BUNDLE', 'REQUESTS_CA_BUNDLE'),
     'mlflow': ('MLFLOW_TRACKING_SERVER_CERT_PATH', 'REQUESTS_CA_BUNDLE', 'CURL_CA_BUNDLE'),
 }
-"""Who names the file of trusted authorities, for botocore and for MLflow's client."""
+"""Variables that name the file of trusted authorities, for botocore and for MLflow's client."""
 
 SENT: Final = {
     's3': 'the data (the secret key is not sent)',
     'mlflow': 'the password, which each request carries, and the data',
 }
-"""What goes over the network as it is where nothing is encrypted."""
+"""What is readable on the network without encryption."""
 
 
 def check_s3(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the network path to the S3 server."""
     yield from _check(services.s3(context), 'network.s3', context)
 
 
 def check_mlflow(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the network path to MLflow."""
     yield from _check(services.mlflow(context), 'network.mlflow', context)
 
 
@@ -52,27 +52,27 @@ def _check(service: TowerService | None, check: str, context: Context) -> Iterat
         yield error(
             f'{check}.dns',
             f'the name {service.host} cannot be resolved ({problem})',
-            'no DNS server knows it, or none can be reached: no WiFi, or another one than Tower is in',
+            'no DNS server resolves it, or none can be reached: no WiFi, or not the network of Tower',
             f'getent hosts {service.host}; or use the IP address of Tower: '
             f'export {service.variable}=http{"s" * service.tls}://TOWER_IP:{service.port}',
         )
         return
     yield ok(f'{check}.dns', f'{service.host} is {" and ".join(addresses)}')
     began_s = time.monotonic()
-    address, refusal = _reach(addresses, service.port)
+    address, refusal = _connect(addresses, service.port)
     if refusal is not None:
         yield _unreachable(service, address, f'{check}.tcp', refusal)
         return
     took_ms = 1000 * (time.monotonic() - began_s)
     yield ok(f'{check}.tcp', f'{service.title} at {service.host}:{service.port} accepts connections ({took_ms:.1f} ms)')
     if service.tls:
-        yield _greet(service, address, f'{check}.tls', context)
+        yield _handshake(service, address, f'{check}.tls', context)
     elif not service.is_local:
         yield info(
             f'{check}.tls',
             f'{service.url} is not encrypted',
-            f'{SENT[service.name]} can be read by everybody in this network',
-            'on a network that is not yours: https',
+            f'{SENT[service.name]} can be read by every machine in this network',
+            'use https on a network that you do not control',
         )
 
 
@@ -82,8 +82,8 @@ def _resolve(service: TowerService) -> list[str]:
     return list(dict.fromkeys(str(each[4][0]) for each in found))
 
 
-def _reach(addresses: Sequence[str], port: int) -> tuple[str, OSError | None]:
-    """The first that takes a connection, as clients try them: a server may listen at one alone. Else the first, and why not."""
+def _connect(addresses: Sequence[str], port: int) -> tuple[str, OSError | None]:
+    """The first address that accepts a connection (a server may listen on only one), otherwise the first and its error."""
     problems: list[OSError] = []
     for address in addresses:
         try:
@@ -100,22 +100,22 @@ def _unreachable(service: TowerService, address: str, check: str, problem: OSErr
     if isinstance(problem, ConnectionRefusedError):
         others = [port for port in service.usual_ports if port != service.port and _answers(address, port)]
         remedy = f'on Tower: sudo ss -ltnp | grep :{service.port} ; docker compose ps'
-        cause = f'the machine is on, but {service.title} does not run there, or listens on another port or to Tower itself only'
+        cause = f'the machine is on, but {service.title} does not run there, or listens on another port or only on localhost'
         if others:
             cause += f'; something answers on port {others[0]}'
-            remedy = f'export {service.variable}={service.at(others[0])}  # if that is {service.title}; else {remedy}'
+            remedy = f'export {service.variable}={service.at(others[0])}  # if that is {service.title}; otherwise {remedy}'
         return error(check, f'{where} refuses the connection', cause, remedy)
     if isinstance(problem, TimeoutError):
         return error(
             check,
             f'{where} does not answer within {CONNECT_S:g} s',
-            'Tower is off, or a firewall drops what is sent to this port, or the WiFi is gone',
+            'Tower is off, a firewall drops packets to this port, or the WiFi is disconnected',
             f'ping -c 3 {service.host} ; on Tower: sudo ufw status | grep {service.port} || sudo ufw allow {service.port}/tcp',
         )
     return error(
         check,
         f'{where} cannot be reached: {problem.strerror or problem}',
-        'this machine has no way to that network: WiFi off, or another one',
+        'this machine has no route to that network: WiFi off, or another network',
         f'ip route get {address} ; nmcli device status',
     )
 
@@ -129,12 +129,12 @@ def _answers(address: str, port: int) -> bool:
 
 
 def bundle(service: TowerService, context: Context) -> tuple[str, str]:
-    """Variable and path of the authorities that the client of this service trusts; empty for those of the system."""
+    """Variable and path of the authorities that this service's client trusts; empty for those of the system."""
     return next(((name, path) for name in CA_FILES[service.name] if (path := context.environ.get(name))), ('', ''))
 
 
-def _greet(service: TowerService, address: str, check: str, context: Context) -> Result:
-    """A TLS handshake, as the client of this service will do it."""
+def _handshake(service: TowerService, address: str, check: str, context: Context) -> Result:
+    """A TLS handshake, as this service's client will do it."""
     variable, trusted = bundle(service, context)
     try:
         trust = ssl.create_default_context(cafile=trusted or None)
@@ -142,7 +142,7 @@ def _greet(service: TowerService, address: str, check: str, context: Context) ->
         return error(
             check,
             f'{variable}={trusted} cannot be read: {problem}',
-            'no certificate can be judged without it',
+            'no certificate can be verified without it',
             f'ls -l {trusted}',
         )
     try:
@@ -183,13 +183,13 @@ def _untrusted(service: TowerService, check: str, problem: ssl.SSLCertVerificati
     return error(
         f'{check}.unknown',
         f'the certificate of {service.url} is not trusted ({problem.verify_message})',
-        f'the authority that signed it is not in {trusted}' if trusted else 'an authority of its own has signed it',
+        f'the authority that signed it is not in {trusted}' if trusted else 'a private authority has signed it',
         f'copy the certificate of that authority here and: export {names[0]}=/etc/shadowhound/ca.pem',
     )
 
 
 def check_tower(context: Context) -> Iterator[Result]:
-    """On Tower: whether others can reach what listens here."""
+    """On Tower: whether other machines can reach the servers."""
     there = listening(context.root)
     for service in filter(None, (services.s3(context), services.mlflow(context))):
         only = {is_loopback for is_loopback, port in there if port == service.port}
@@ -206,6 +206,6 @@ def check_tower(context: Context) -> Iterator[Result]:
         elif only:
             yield ok(
                 'tower.listen',
-                f'{service.title} listens on port {service.port} for others as well',
+                f'{service.title} listens on port {service.port} for other machines as well',
                 firewall=f'sudo ufw status | grep {service.port}',
             )

@@ -1,4 +1,4 @@
-"""Policies of this robot: whether what signers say is fresh, so that new versions are taken and stolen keys are replaced."""
+"""Policies of this robot: whether the signed metadata is fresh, so that new versions are accepted and stolen keys replaced."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ NAME: Final = 'policies'
 
 
 def check(context: Context) -> Iterator[Result]:
-    """Asks neither the store nor the registry: what was verified last is on the disk."""
+    """Uses the last verified metadata on the disk, not the store or the registry."""
     folder = PolicyFolder(context.settings.home)
     if not follows_signers(folder.path):
         yield ok(NAME, 'no policies are followed here')
     elif why := why_stale(folder.path, time.time_ns()):
         yield warning(
             'policies.stale',
-            f'no new version is taken: {why}',
-            'nobody signs any more, somebody keeps it from this robot, policy run does not run, or a clock is wrong',
+            f'no new version is accepted: {why}',
+            'signing has stopped, new metadata does not reach this robot, policy run is not running, or a clock is wrong',
             'shadowhound-data policy sync ; shadowhound-data doctor --only clock',
         )
     else:
-        yield ok(NAME, f'the signed lists are fresh; active is {folder.current() or "no policy"}')
+        yield ok(NAME, f'the signed metadata is fresh; active is {folder.current() or "no policy"}')
     if (active := folder.current()) and (tried := folder.state.read().verified.get(active)) != SANDBOX:
         yield warning(
             'policies.isolation',
-            f'{active} was tried in {tried or "an unknown isolation"}, not in a sandbox',
+            f'{active} was tested in {tried or "an unknown isolation"}, not in a sandbox',
             'bubblewrap is missing or may not create namespaces here, and policy run was started with --isolation limits',
             'sudo apt install bubblewrap ; shadowhound-data policy sync --isolation sandbox',
         )

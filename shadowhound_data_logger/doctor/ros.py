@@ -1,4 +1,4 @@
-"""The robot's topics: who publishes them and how, at the expected rate or not, and decodable here or not. In a child process."""
+"""The robot's topics: publishers, QoS, rates and types. Runs in a child process."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from shadowhound_data_logger.node.intake.middleware import Middleware
 from shadowhound_data_logger.ros.endpoints import alternatives, logged_type
 
 if TYPE_CHECKING:
-    from shadowhound_data_logger.doctor.ros_watch import Heard
+    from shadowhound_data_logger.doctor.ros_watch import WatchedTopic
 
 
 class Stream(NamedTuple):
-    """A topic as it should be."""
+    """The expected properties of a topic."""
 
     rate_hz: float
     reliable: bool | None = None
-    """None where either will do."""
+    """None if either is fine."""
     optional: bool = False
-    """Whether many robots do without."""
+    """Whether many robots lack it."""
 
 
 STREAMS: Final = {
@@ -50,9 +50,9 @@ STREAMS: Final = {
     'lowstate': Stream(20.0, optional=True),
     'utlidar/voxel_map_compressed': Stream(10.0, optional=True),
 }
-"""By the topic's name in the settings."""
+"""By the sensor's name in the settings."""
 UNKNOWN: Final = Stream(0.0)
-"""Nothing is expected of it."""
+"""No expectations."""
 
 
 NAME: Final = 'ros'
@@ -60,22 +60,22 @@ WINDOW_S: Final = 2.5
 PEEK_S: Final = 1.2
 MAX_PEEKS: Final = 3
 MAX_SHOWN: Final = 8
-"""Topics that a result names."""
+"""Maximum topics named in a result."""
 MAX_NODES: Final = 3
 TOO_SLOW, TOO_LOSSY = 0.5, 0.1
-"""Below half of the expected rate; above a tenth that did not arrive."""
-ENOUGH: Final = 4
-"""Messages that have to be expected within the window for a rate to mean something."""
+"""Below half of the expected rate; more than a tenth lost."""
+MIN_EXPECTED: Final = 4
+"""Minimum number of expected messages in the window for a rate to be meaningful."""
 TYPES_REMEDY: Final = '. ~/ros2_ws/install/setup.bash  # or: colcon build --packages-select {package} && . install/setup.bash'
 TF: Final = '/tf'
 STALE_S: Final = 5.0
-"""Age of a transform that is still one of now: localization is late, and clocks of two machines differ."""
+"""Maximum age of a current transform: localization is late, and the clocks of two machines differ."""
 DRIVER: Final = 'go2_interfaces'
-"""Expected while nothing is published at all: the driver may start later."""
+"""Used while nothing is published at all: the driver may start later."""
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the topics of all sensors."""
     if find_spec('rclpy') is None:
         yield error(
             'ros.sourced',
@@ -86,7 +86,7 @@ def check(context: Context) -> Iterator[Result]:
         return
     listener = _listener(context)
     if listener is not None:
-        listener.enter(os.environ)  # before ROS is loaded, as the node does
+        listener.enter(os.environ)  # before ROS is loaded, as in the node
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy: a second, and not installed everywhere
 
     sensors = [sensor for sensor in context.settings.sensors if sensor.enabled]
@@ -105,19 +105,19 @@ def check(context: Context) -> Iterator[Result]:
     yield from _clock(waiting)
     yield from _types(sensors, packages if heard else packages | {DRIVER})
     if not heard:
-        yield from _nobody(context, names, listener, others)
+        yield from _no_publishers(context, names, listener, others)
         return
     if TF in heard:
         yield from _transforms(heard[TF])
     is_complete = context.settings.capture.topics == NAMED or any(map(is_of_unitree, (f'{name}/' for name in packages)))
     for sensor in sensors:
         topics = [heard[resolved[topic]] for topic in sensor.topics]
-        if is_complete or any(one.publishers for one in topics):  # the default sensors are those of a Unitree
+        if is_complete or any(one.publishers for one in topics):  # the default sensors are for a Unitree
             yield from _sensor(sensor, topics, context.rates_hz)
 
 
 def _clock(waiting: Sequence[str]) -> Iterator[Result]:
-    """Nodes that take their time from a simulator that does not run."""
+    """Report nodes that take their time from a simulator that is not running."""
     if waiting:
         shown = [printable(name) for name in waiting[:MAX_SHOWN]]
         yield warning(
@@ -128,12 +128,12 @@ def _clock(waiting: Sequence[str]) -> Iterator[Result]:
         )
 
 
-def _transforms(one: Heard) -> Iterator[Result]:
-    """Frames that do not move any more."""
+def _transforms(one: WatchedTopic) -> Iterator[Result]:
+    """Report frames that do not update."""
     if one.unavailable:
         return
     if not one.received:
-        text = f'{TF} has a publisher, and no transform came in {WINDOW_S:g} s'
+        text = f'{TF} has a publisher, but no transform arrived in {WINDOW_S:g} s'
     elif (age_s := _age_s(one.newest)) > STALE_S:
         text = f'the newest transform on {TF} is {age_s:.0f} s old'
     else:
@@ -142,13 +142,13 @@ def _transforms(one: Heard) -> Iterator[Result]:
     yield warning(
         'ros.tf',
         text,
-        'the place of the robot is unknown, or that of some time ago',
+        'the pose of the robot is unknown or outdated',
         f'ros2 topic hz {TF} ; ros2 run tf2_ros tf2_monitor',
     )
 
 
 def _age_s(cdr: bytes) -> float:
-    """Of the newest transform of a message; 0 where it has none."""
+    """Age of the newest transform in a message; 0 if it has none."""
     try:
         stamps = [each.header.stamp for each in MessageTypes().deserialize(TRANSFORMS, cdr).transforms]
     except Rejected:
@@ -157,23 +157,23 @@ def _age_s(cdr: bytes) -> float:
 
 
 def _listener(context: Context) -> Middleware | None:
-    """How the node listens, where that is through another RMW than the robot's."""
+    """How the node listens, if it uses another RMW than the robot."""
     try:
         found = middleware(context)
-    except SettingError:  # said by ros.listener
+    except SettingError:  # reported by ros.listener
         return None
     return found if found.is_foreign else None
 
 
 def _profiled(listener: Middleware | None, domain: int | None = None) -> AbstractContextManager[None]:
-    """While a participant is made, in the domain of the environment or another one."""
+    """The middleware's environment while a participant is created, in the environment's domain or another one."""
     if listener is None:
         return nullcontext()
     return (listener if domain is None else replace(listener, domain=domain)).profiled(os.environ)
 
 
 def _types(sensors: Sequence[SensorSettings], packages: Collection[str]) -> Iterator[Result]:
-    """Of the types that the settings expect; of those of a Unitree robot only if they are of one of these packages."""
+    """Check the types that the settings expect; Unitree types only if they are in one of these packages."""
     from shadowhound_data_logger.ros.reader import unavailable  # noqa: PLC0415 - rclpy
 
     missing: dict[str, dict[str, str]] = {}
@@ -194,7 +194,7 @@ def _types(sensors: Sequence[SensorSettings], packages: Collection[str]) -> Iter
 
 
 def _types_remedy(package: str) -> str:
-    """Of a message package that is missing."""
+    """The remedy for a missing message package."""
     from shadowhound_data_logger.ros.reader import SHIPPED  # noqa: PLC0415 - rclpy
 
     remedy = TYPES_REMEDY.format(package=package)
@@ -203,7 +203,9 @@ def _types_remedy(package: str) -> str:
     return f'sudo apt install ros-{os.environ.get("ROS_DISTRO", "$ROS_DISTRO")}-{package.replace("_", "-")}  # or {remedy}'
 
 
-def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None, published: Sequence[str]) -> Iterator[Result]:
+def _no_publishers(
+    context: Context, topics: Sequence[str], listener: Middleware | None, published: Sequence[str]
+) -> Iterator[Result]:
     """None of the topics has a publisher: another namespace, another robot, another domain, or no driver.
 
     ``published`` are the topics that have publishers in this domain.
@@ -222,62 +224,62 @@ def _nobody(context: Context, topics: Sequence[str], listener: Middleware | None
         if there := _peek(domain, topics, listener):
             yield error(
                 'ros.domain',
-                f'nobody publishes in domain {ours}, but {len(there)} of the topics are in domain {domain} ({there[0]}, ...)',
+                f'nothing is published in domain {ours}, but {len(there)} of the topics are in domain {domain} ({there[0]}, ...)',
                 "this shell has another ROS_DOMAIN_ID than the robot's driver",
                 f'export ROS_DOMAIN_ID={domain}  # here and for the node',
             )
             return
     if published:
         remedy = 'shadowhound-data init --to robot.yaml  # settings for the topics that are published'
-        yield error('ros.topics', what, 'this is another robot than the settings are for', remedy)
+        yield error('ros.topics', what, 'the settings are for another robot', remedy)
         return
     yield error(
         'ros.topics',
-        f'nobody publishes any of {", ".join(topics[:4])}, ... in domain {ours}',
-        "the robot's driver does not run, has lost the robot, or is in another domain or network",
-        'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py ; echo $ROS_DOMAIN_ID  # the same everywhere?',
+        f'there is no publisher of {", ".join(topics[:4])}, ... in domain {ours}',
+        "the robot's driver is not running, is not connected to the robot, or is in another domain or network",
+        'ps aux | grep go2_driver ; ros2 launch go2_robot_sdk robot.launch.py ; echo $ROS_DOMAIN_ID  # equal everywhere?',
     )
 
 
 def _namespaces(context: Context, topics: Sequence[str], published: Sequence[str]) -> list[str]:
-    """Where topics of these names are published, first the namespace with the most of them."""
+    """Namespaces in which topics of these names are published, the one with the most topics first."""
     names = {topic.removeprefix(context.namespace.rstrip('/')) for topic in topics}
     found = Counter(other.removesuffix(name) or '/' for other in published for name in names if other.endswith(name))
     return sorted(found, key=lambda name: (-found[name], name))
 
 
 def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> list[str]:
-    """Which of the topics are published in another domain."""
+    """The topics that are published in another domain."""
     from shadowhound_data_logger.doctor import ros_watch  # noqa: PLC0415 - rclpy
 
     with _profiled(listener, domain), ros_watch.node(domain) as node:
         return [topic for topic, publishers in ros_watch.discover(node, topics, PEEK_S).items() if publishers]
 
 
-def _sensor(sensor: SensorSettings, heard: Sequence[Heard], rates_hz: Mapping[str, float]) -> Iterator[Result]:
-    """A sensor is there when one of its topics is; each that is there is judged."""
+def _sensor(sensor: SensorSettings, heard: Sequence[WatchedTopic], rates_hz: Mapping[str, float]) -> Iterator[Result]:
+    """A sensor is present if one of its topics is; each topic that is present is checked."""
     present = [(topic, one) for topic, one in zip(sensor.topics, heard, strict=True) if one.publishers]
     if not present:
         names = ' nor '.join(one.topic for one in heard)
         stream = STREAMS.get(sensor.topics[0], UNKNOWN)
         if stream.optional:
-            yield info('ros.topic', f'nobody publishes {names}', 'many robots have none')
+            yield info('ros.topic', f'{names} has no publisher', 'many robots have none')
         else:
             yield warning(
                 'ros.topic',
-                f'nobody publishes {names}',
-                f'nothing of {sensor.name} is logged',
-                f'ros2 topic list | grep {heard[0].topic} ; is this part of the driver started? else {sensor.name}.enabled: '
+                f'{names} has no publisher',
+                f'{sensor.name} is not logged',
+                f'ros2 topic list | grep {heard[0].topic} ; is this part of the driver running? If not: {sensor.name}.enabled: '
                 'false in the parameter file',
             )
         return
     for topic, one in present:
         stream = STREAMS.get(topic, UNKNOWN)
         expected = rates_hz.get(one.topic, rates_hz.get(topic, stream.rate_hz or sensor.rate_hz))
-        yield from _judge(one, sensor, stream, expected)
+        yield from _check_topic(one, sensor, stream, expected)
 
 
-def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: float) -> Iterator[Result]:
+def _check_topic(one: WatchedTopic, sensor: SensorSettings, stream: Stream, expected_hz: float) -> Iterator[Result]:
     others = sorted({publisher.type for publisher in one.publishers} - {one.type})
     if others:
         yield _other_types(one, sensor, others)
@@ -295,64 +297,64 @@ def _judge(one: Heard, sensor: SensorSettings, stream: Stream, expected_hz: floa
     yield _rate(one, sensor, expected_hz)
 
 
-def _other_types(one: Heard, sensor: SensorSettings, others: Sequence[str]) -> Result:
+def _other_types(one: WatchedTopic, sensor: SensorSettings, others: Sequence[str]) -> Result:
     by = sorted({publisher.node for publisher in one.publishers if publisher.type in others} - {''})
     whose = ', '.join(by[:MAX_NODES]) or 'a program that is not a ROS node'
     own = f'{sensor.name}.types: [{others[0]}]'
     return error(
         'ros.type',
-        f'{one.topic} is published as {" and as ".join(others)} by {whose}; {sensor.name} logs {one.type} alone',
-        'messages of another type are never logged as those of this sensor: they are counted as rejected (wrong_type) where '
+        f'{one.topic} is published as {" and as ".join(others)} by {whose}; {sensor.name} logs only {one.type}',
+        'messages of another type are never logged for this sensor: they are counted as rejected (wrong_type) if '
         'their type is installed, otherwise their number is not known',
-        f'ros2 topic info -v {one.topic}  # and stop that publisher; or, where it is the robot: {own}',
+        f'ros2 topic info -v {one.topic}  # and stop that publisher; or, if it is the robot: {own}',
     )
 
 
-def _qos(one: Heard, stream: Stream) -> Iterator[Result]:
-    if one.deaf:
+def _qos(one: WatchedTopic, stream: Stream) -> Iterator[Result]:
+    if one.incompatible:
         yield warning(
             'ros.qos',
-            f'{", ".join(one.deaf)} subscribes to {one.topic} and receives nothing',
-            'it asks for RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS does not report this',
+            f'{", ".join(one.incompatible)} subscribes to {one.topic} and receives nothing',
+            'it requests RELIABLE or TRANSIENT_LOCAL, and the publisher offers less; ROS does not report this',
             'subscribe with rclpy.qos.qos_profile_sensor_data there; the logger itself follows the publisher',
         )
     if stream.reliable and not all(publisher.reliable for publisher in one.publishers if publisher.type == one.type):
         yield warning(
             'ros.qos',
-            f'{one.topic} is published BEST_EFFORT, and RELIABLE is expected',
-            'what the network loses of it is not sent again',
+            f'{one.topic} is published BEST_EFFORT, but RELIABLE is expected',
+            'messages lost in the network are not sent again',
             f'ros2 topic info -v {one.topic}  # and set its publisher to RELIABLE',
         )
 
 
-def _rate(one: Heard, sensor: SensorSettings, expected_hz: float) -> Result:
+def _rate(one: WatchedTopic, sensor: SensorSettings, expected_hz: float) -> Result:
     figures: dict[str, Any] = {'topic': one.topic, 'rate_hz': round(one.rate_hz, 2), 'received': one.received, 'sent': one.sent}
     due = expected_hz * one.window_s
     if sensor.on_change and not one.received:
         return info('ros.rate', f'{one.topic}: nothing in {one.window_s:.1f} s; it is kept on change only', **figures)
-    if not one.received and due >= ENOUGH:
+    if not one.received and due >= MIN_EXPECTED:
         return error(
             'ros.loss',
-            f'{one.topic} has a publisher, and nothing arrives',
+            f'{one.topic} has a publisher, but no message arrives',
             'large messages are lost between driver and logger (see sockets), the two run as different users, or a firewall '
-            'takes what is not discovery; or the robot is not connected and the driver has nothing to say',
+            'drops everything but discovery; or the robot is not connected and the driver has nothing to publish',
             f'ros2 topic hz {one.topic} ; shadowhound-data doctor --only sockets',
             **figures,
         )
-    if one.sent and due >= ENOUGH and one.received < (1 - TOO_LOSSY) * one.sent:
+    if one.sent and due >= MIN_EXPECTED and one.received < (1 - TOO_LOSSY) * one.sent:
         return warning(
             'ros.loss',
             f'{one.topic}: {one.received} of {one.sent} messages arrived',
-            "they do not fit into the shared memory or into the kernel's socket buffers",
+            "they do not fit into shared memory or the kernel's socket buffers",
             'shadowhound-data doctor --only sockets  # what to set, for the driver and here',
             **figures,
         )
-    if due >= ENOUGH and one.rate_hz < TOO_SLOW * expected_hz:
+    if due >= MIN_EXPECTED and one.rate_hz < TOO_SLOW * expected_hz:
         return warning(
             'ros.rate',
-            f'{one.topic} comes at {one.rate_hz:.1f} Hz, {expected_hz:g} Hz are expected',
+            f'{one.topic} arrives at {one.rate_hz:.1f} Hz, {expected_hz:g} Hz are expected',
             'the driver is slower than expected, the connection to the robot is weak, or this machine is busy',
-            f'ros2 topic hz {one.topic} ; where that is right: doctor --rate {one.topic}={max(one.rate_hz, 0.1):.0f}',
+            f'ros2 topic hz {one.topic} ; if that is correct: doctor --rate {one.topic}={max(one.rate_hz, 0.1):.0f}',
             **figures,
         )
-    return ok('ros.rate', f'{one.topic} comes at {one.rate_hz:.1f} Hz', **figures)
+    return ok('ros.rate', f'{one.topic} arrives at {one.rate_hz:.1f} Hz', **figures)

@@ -1,6 +1,6 @@
-"""What a node of our own finds and receives of topics. The only module of the doctor that loads rclpy.
+"""A node that observes topics. The only module of the doctor that loads rclpy.
 
-It subscribes as the logger does, takes what comes without decoding it, and publishes nothing.
+It subscribes as the logger does, takes messages without decoding them, and publishes nothing.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from shadowhound_data_logger.ros.shared_memory import dead_ports_avoided
 
 NODE: Final = 'shadowhound_doctor'
 DISCOVER_S: Final = 3.0
-"""Longest time to find publishers; Fast DDS announces every 3 seconds by default."""
+"""Maximum time to find publishers; Fast DDS announces every 3 seconds by default."""
 SETTLE_S: Final = 0.4
-"""After the last one was found, and for a subscription to be matched."""
+"""Wait after the last publisher was found, and for a subscription to be matched."""
 POLL_S: Final = 0.02
 
 
 @dataclass(slots=True)
-class Heard:
-    """One topic."""
+class WatchedTopic:
+    """A topic and its messages."""
 
     topic: str
     publishers: list[Endpoint]
-    """Of all types."""
+    """Publishers of all types."""
     type: str = ''
-    """The one that is logged; empty where there is none."""
-    deaf: list[str] = field(default_factory=list)
-    """Subscribers that ask for more than its publishers offer: they receive nothing, and nobody tells them."""
+    """The type that is logged; empty if none is."""
+    incompatible: list[str] = field(default_factory=list)
+    """Subscribers that request more than its publishers offer: they receive nothing, without a warning."""
     unavailable: str = ''
-    """Why nobody can listen to its type here."""
+    """Why its type cannot be received here."""
     received: int = 0
     size: int = 0
-    """Bytes of the received messages, as serialized."""
+    """Serialized size of the received messages."""
     newest: bytes = b''
-    """A message; it can be one that came before the time in which messages are counted."""
+    """The newest message; it may have arrived before counting started."""
     sent: int | None = None
-    """By the numbers of the messages; None where they have none."""
+    """Messages sent, by their sequence numbers; None if they have none."""
     window_s: float = 0.0
     _spans: dict[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -62,13 +62,13 @@ class Heard:
 
     @property
     def rate_hz(self) -> float:
-        """As it was sent, as far as that is known."""
+        """The publishing rate, if known; otherwise the rate received."""
         return max(self.received, self.sent or 0) / self.window_s if self.window_s else 0.0
 
 
 @contextmanager
 def node(domain: int | None = None, namespace: str = '/') -> Iterator[Node]:
-    """In the domain of this process's environment, or another one."""
+    """A node in the domain of this process's environment, or another one."""
     context = rclpy.Context()
     rclpy.init(args=[], context=context, domain_id=domain)
     with dead_ports_avoided(context.get_domain_id()):
@@ -80,13 +80,13 @@ def node(domain: int | None = None, namespace: str = '/') -> Iterator[Node]:
         rclpy.try_shutdown(context=context)
 
 
-def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) -> dict[str, list[Endpoint]]:
-    """The publishers of each topic; returns once all have one and it has been quiet for a moment."""
+def discover(ros_node: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) -> dict[str, list[Endpoint]]:
+    """The publishers of each topic; returns once all have one and the graph has been quiet for a moment."""
     end = time.monotonic() + patience_s
     found: dict[str, list[Endpoint]] = {}
     quiet_since = time.monotonic()
     while (now := time.monotonic()) < end:
-        seen = {topic: endpoints(of, topic) for topic in topics}
+        seen = {topic: endpoints(ros_node, topic) for topic in topics}
         if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
             found, quiet_since = seen, now
         if all(found.values()) and now - quiet_since > SETTLE_S:
@@ -95,27 +95,27 @@ def discover(of: Node, topics: Sequence[str], patience_s: float = DISCOVER_S) ->
     return found
 
 
-def published(of: Node, within: str = '/') -> dict[str, list[Endpoint]]:
+def published(ros_node: Node, within: str = '/') -> dict[str, list[Endpoint]]:
     """Each topic with publishers whose name starts with a namespace, once the graph has been quiet for a moment.
 
-    Names that are invalid in ROS are skipped: any participant chooses them, and they would end up in commands and files.
+    Names that are invalid in ROS are skipped: any participant can choose them, and they would end up in commands and files.
     """
     end = time.monotonic() + DISCOVER_S
     found: dict[str, list[Endpoint]] = {}
     quiet_since = time.monotonic()
     while (now := time.monotonic()) < end or (now - quiet_since < SETTLE_S and now < end + DISCOVER_S):
-        named = [name for name, _ in of.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
-        seen = {name: endpoints(of, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
+        named = [name for name, _ in ros_node.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
+        seen = {name: endpoints(ros_node, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
         if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
             found, quiet_since = seen, now
         time.sleep(POLL_S)
     return {topic: publishers for topic, publishers in found.items() if publishers}
 
 
-def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[Heard]:
-    """Count what comes on each topic that has publishers; ``types`` are those that the settings name for topics."""
-    heard = [Heard(topic, publishers, logged_type(publishers, types.get(topic))) for topic, publishers in found.items()]
-    readers = [(one, reader) for one in heard for reader in _readers(of, one)]
+def listen(ros_node: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[WatchedTopic]:
+    """Count the messages of each topic that has publishers; ``types`` are those in the settings, by topic."""
+    heard = [WatchedTopic(topic, publishers, logged_type(publishers, types.get(topic))) for topic, publishers in found.items()]
+    readers = [(one, reader) for one in heard for reader in _readers(ros_node, one)]
     try:
         settled = time.monotonic() + SETTLE_S
         while time.monotonic() < settled:
@@ -128,39 +128,39 @@ def listen(of: Node, found: dict[str, list[Endpoint]], window_s: float, types: M
         _drain(readers, count=True)
         for one in heard:
             one.window_s = time.monotonic() - began
-            one.deaf = _deaf(of, one.topic)
+            one.incompatible = _incompatible_subscribers(ros_node, one.topic)
     finally:
         for _, reader in readers:
             reader.close()
     return heard
 
 
-def publishers_of(of: Node, topic: str) -> list[Endpoint]:
-    """As the graph knows them now."""
-    return endpoints(of, topic)
+def publishers_of(ros_node: Node, topic: str) -> list[Endpoint]:
+    """The publishers currently in the graph."""
+    return endpoints(ros_node, topic)
 
 
-def waiting_for_clock(of: Node) -> list[str]:
-    """Full names of the nodes that use sim time while nothing publishes it."""
-    if of.count_publishers('/clock'):
+def waiting_for_clock(ros_node: Node) -> list[str]:
+    """Full names of the nodes that use sim time while /clock has no publisher."""
+    if ros_node.count_publishers('/clock'):
         return []
-    return sorted({_name(each) for each in of.get_subscriptions_info_by_topic('/clock')})
+    return sorted({_name(each) for each in ros_node.get_subscriptions_info_by_topic('/clock')})
 
 
-def _readers(of: Node, one: Heard) -> list[Reader]:
-    """As the logger would listen; where two kinds of publishers need two subscriptions, the first is enough to count."""
+def _readers(ros_node: Node, one: WatchedTopic) -> list[Reader]:
+    """Subscribe as the logger does; if two kinds of publishers need two subscriptions, the first is enough for counting."""
     publishers = [each for each in one.publishers if each.type == one.type]
     if not publishers:
         return []
     try:
         wanted = plans(one.topic, one.type, publishers, HistoryDepth(one.type).depth)
-        return [Reader(of, wanted[-1], PolledGroup())]
+        return [Reader(ros_node, wanted[-1], PolledGroup())]
     except (TypeUnavailable, SubscriptionRefused) as error:
         one.unavailable = str(error)
         return []
 
 
-def _drain(readers: Sequence[tuple[Heard, Reader]], *, count: bool) -> None:
+def _drain(readers: Sequence[tuple[WatchedTopic, Reader]], *, count: bool) -> None:
     for one, reader in readers:
         for taken in reader.drain():
             one.newest = taken.cdr
@@ -168,18 +168,18 @@ def _drain(readers: Sequence[tuple[Heard, Reader]], *, count: bool) -> None:
                 one.note(taken.cdr, taken.publisher, taken.number)
 
 
-def _deaf(of: Node, topic: str) -> list[str]:
-    offers = of.get_publishers_info_by_topic(topic)
+def _incompatible_subscribers(ros_node: Node, topic: str) -> list[str]:
+    offers = ros_node.get_publishers_info_by_topic(topic)
     return sorted(
         {
             _name(asked)
-            for asked in of.get_subscriptions_info_by_topic(topic)
-            if offers and asked.node_name != NODE and all(_is_deaf(offer, asked) for offer in offers)
+            for asked in ros_node.get_subscriptions_info_by_topic(topic)
+            if offers and asked.node_name != NODE and all(_is_incompatible(offer, asked) for offer in offers)
         }
     )
 
 
-def _is_deaf(offer: Any, asked: Any) -> bool:
+def _is_incompatible(offer: Any, asked: Any) -> bool:
     return bool(qos_check_compatible(offer.qos_profile, asked.qos_profile)[0] == QoSCompatibility.ERROR)
 
 

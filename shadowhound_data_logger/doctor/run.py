@@ -1,6 +1,6 @@
-"""Runs checks side by side, and repairs what ``--fix`` may: modes of files with keys, missing buckets, orphaned shared memory.
+"""Runs checks concurrently, and does the repairs of ``--fix``: modes of files with keys, missing buckets, stale shared memory.
 
-It ends in time; what hangs, crashes or is not reached is in the answer as well.
+It always ends in time; checks that hang, crash or do not start are in the results as well.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from shadowhound_data_logger.ros.port_guard import settle
 from shadowhound_data_logger.ros.shared_memory import orphans
 
 TIMEOUT_S: Final = 12.0
-"""With the start of Python, a run on a dead network ends within 15 s."""
+"""Including Python's startup, a run on a dead network ends within 15 s."""
 CHILD: Final = 'shadowhound_data_logger.doctor.checks'
 _Message = tuple[str, 'Result | None']
-"""Name of a check and a result of it; None is its end."""
+"""A check's name and one of its results; None marks its end."""
 
 
 @dataclass(slots=True)
 class Running:
     """A check that is running.
 
-    Its thread adopts the children that it starts, and the runner kills them when it gives the check up.
+    Its thread registers the children that it starts; the runner kills them when it abandons the check.
     """
 
     check: Check
@@ -46,7 +46,7 @@ class Running:
 
     def adopt(self, child: subprocess.Popen[bytes]) -> None:
         self.children.append(child)
-        if self.given_up:  # meanwhile; else ``give_up`` will see it
+        if self.given_up:  # otherwise ``give_up`` will see it
             child.kill()
 
     def give_up(self) -> None:
@@ -67,14 +67,14 @@ class Examination:
         context: Context,
         *,
         timeout_s: float = TIMEOUT_S,
-        tell: Callable[[Check], None] = lambda _: None,
+        on_end: Callable[[Check], None] = lambda _: None,
     ) -> None:
-        """``tell`` hears of each check that has ended. With a longer time for all of it, each check has more as well."""
+        """``on_end`` is called for each check that ended. With a longer ``timeout_s``, each check has more time as well."""
         self._waiting = list(checks)
         self._context = context
         self._timeout_s = timeout_s
         self._patience = max(1.0, timeout_s / TIMEOUT_S)
-        self._tell = tell
+        self._on_end = on_end
         self._order = [check.name for check in checks]
         self._running: dict[str, Running] = {}
         self._found: dict[str, list[Result]] = {check.name: [] for check in checks}
@@ -87,7 +87,7 @@ class Examination:
         while self._running or self._waiting:
             self._start_ready(end_s)
             if self._running:
-                self._listen(min(running.until_s for running in self._running.values()))
+                self._collect(min(running.until_s for running in self._running.values()))
                 self._give_up(time.monotonic())
         return [result for name in self._order for result in self._found[name]]
 
@@ -99,7 +99,7 @@ class Examination:
             if time.monotonic() >= end_s:
                 self._found[check.name].append(Result(check.name, Severity.SKIPPED, 'not run: no time was left'))
                 self._ended.add(check.name)
-                self._tell(check)
+                self._on_end(check)
                 continue
             until_s = min(time.monotonic() + self._patience * check.deadline_s, end_s)
             running = self._running[check.name] = Running(check, until_s)
@@ -107,7 +107,7 @@ class Examination:
             context = replace(self._context, earlier=earlier)
             threading.Thread(target=_work, args=(running, context, self._heard.put), name=check.name, daemon=True).start()
 
-    def _listen(self, until_s: float) -> None:
+    def _collect(self, until_s: float) -> None:
         try:
             name, result = self._heard.get(timeout=max(0.0, until_s - time.monotonic()))
         except queue.Empty:
@@ -124,20 +124,20 @@ class Examination:
             if now_s < running.until_s or not self._heard.empty():
                 continue
             running.give_up()
-            self._found[name].append(_late(running.check, min(self._patience * running.check.deadline_s, self._timeout_s)))
+            self._found[name].append(_timed_out(running.check, min(self._patience * running.check.deadline_s, self._timeout_s)))
             self._end(name)
 
     def _end(self, name: str) -> None:
         self._ended.add(name)
-        self._tell(self._running.pop(name).check)
+        self._on_end(self._running.pop(name).check)
 
 
-def _late(check: Check, limit_s: float) -> Result:
+def _timed_out(check: Check, limit_s: float) -> Result:
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     cause = (
-        'what it asks hangs'
+        'the service it checks hangs'
         if load < cores
-        else f'what it asks hangs, or this machine is too busy (load {load:.0f} on {cores} cores)'
+        else f'the service it checks hangs, or this machine is too busy (load {load:.0f} on {cores} cores)'
     )
     return error(
         f'{check.name}.deadline',
@@ -147,28 +147,28 @@ def _late(check: Check, limit_s: float) -> Result:
     )
 
 
-def _work(running: Running, context: Context, say: Callable[[_Message], None]) -> None:
-    """The thread of one check. The one catch-all of the doctor: a check that crashes is a finding and no end of the others."""
+def _work(running: Running, context: Context, send: Callable[[_Message], None]) -> None:
+    """The thread of one check, with the doctor's only catch-all: a crash is a finding and does not end the other checks."""
     check, began_s = running.check, time.monotonic()
     try:
-        for result in in_child(running, context) if check.apart else check.run(context):
+        for result in in_child(running, context) if check.isolated else check.run(context):
             now_s = time.monotonic()
-            say((check.name, replace(result, took_s=result.took_s or round(now_s - began_s, 3))))
+            send((check.name, replace(result, took_s=result.took_s or round(now_s - began_s, 3))))
             began_s = now_s
     except Exception as problem:  # noqa: BLE001
-        say((check.name, crashed(check, f'{type(problem).__name__}: {problem}')))
+        send((check.name, crashed(check, f'{type(problem).__name__}: {problem}')))
     finally:
-        say((check.name, None))
+        send((check.name, None))
 
 
 def crashed(check: Check, how: str) -> Result:
-    """The finding that a check itself is."""
-    remedy = f'shadowhound-data doctor --only {check.name} --json, and tell us what it says'
-    return error(f'{check.name}.crash', f'the check failed: {how}', 'a case that the doctor does not know', remedy)
+    """The finding that the check itself failed."""
+    remedy = f'shadowhound-data doctor --only {check.name} --json, and send us its output'
+    return error(f'{check.name}.crash', f'the check failed: {how}', 'a case that the doctor does not handle', remedy)
 
 
 def in_child(running: Running, context: Context) -> Iterator[Result]:
-    """The check in a process of its own."""
+    """Run the check in a separate process."""
     check = running.check
     with tempfile.TemporaryFile() as log:
         command = [sys.executable, '-m', CHILD, check.name]
@@ -183,12 +183,12 @@ def in_child(running: Running, context: Context) -> Iterator[Result]:
                 yield Result.from_dict(json.loads(line))
         if child.returncode:
             log.seek(0)
-            last = (log.read().decode(errors='replace').strip().splitlines() or ['it said nothing'])[-1]
+            last = (log.read().decode(errors='replace').strip().splitlines() or ['no output'])[-1]
             yield crashed(check, f'its process ended with {child.returncode}: {last}')
 
 
 def fix(results: Sequence[Result], context: Context) -> Iterator[tuple[Result, str]]:
-    """Yield each result that can be fixed, with what was done; where that failed, the text begins with ``not``."""
+    """Yield each result that can be fixed and what was done; on failure the text starts with ``not``."""
     done: set[tuple[str, ...]] = set()
     for result in results:
         if result.fix and result.fix not in done:
@@ -206,7 +206,7 @@ def _fixed(what: tuple[str, ...], context: Context) -> str:
             freed = orphans(Path(name), is_freed=True)
             return f'freed {sum(each.bytes for each in freed) / 1e6:.0f} MB in {name}'
         if kind == 'ports':
-            return f'settled {", ".join(settle(Path(name))) or "nothing"} in {name}'
+            return f'repaired {", ".join(settle(Path(name))) or "nothing"} in {name}'
         _create(name, context)
     except (OSError, DataLoggerError) as problem:
         return f'not done: {problem}'

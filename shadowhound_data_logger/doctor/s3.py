@@ -1,8 +1,8 @@
-"""The S3 server: what it is, whether it accepts our signature and our objects, and whether it keeps the two promises of a put.
+"""The S3 server: what it is, whether it accepts our signature and objects, and whether conditional puts work.
 
-What it leaves behind: ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 bytes that are always the
-same, because the robot's keys may delete nothing. On Tower some more are raced for and deleted. On Tower and Spark
-``_requests/_doctor/inbox.json`` is raced for.
+It leaves behind ``<robot>/_doctor/probe`` in each bucket that this machine writes to, 64 constant bytes, because the robot's
+keys cannot delete. On Tower it also races to create more objects and deletes them. On Tower and Spark it races to replace
+``_requests/_doctor/inbox.json``.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from shadowhound_data_logger.doctor.model import (
     Role,
     Severity,
     error,
+    from_error,
     info,
     measured,
-    of_error,
     ok,
     skipped,
     warning,
@@ -50,21 +50,21 @@ if TYPE_CHECKING:
 NAME: Final = 's3'
 TOWER_BUCKETS: Final = ('sensor-data', 'trajectories', 'lerobot', 'mlflow')
 SKEW_S: Final = 5.0
-"""From here on times of two machines cannot be compared."""
+"""From here on, times of two machines cannot be compared."""
 REFUSED_SKEW_S: Final = 900.0
 """RequestTimeTooSkewed of S3: 15 minutes."""
 SLOW_S: Final = 0.5
-"""A small request that takes longer than this keeps four upload threads below eight objects a second."""
+"""If a small request takes longer than this, four upload threads send fewer than eight objects per second."""
 LATENCY_TRIES: Final = 5
 LISTING_BYTES: Final = 1024
 RACED: Final = '_doctor'
-"""Has a mailbox, and is no robot."""
+"""Has a mailbox, and is not a robot."""
 RACERS, RACES = 4, 3
 MINIO: Final = "MinIO's open-source server was archived in April 2026: it keeps working, without fixes and security advisories"
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the server's identity, clock, signature, permissions, puts and latency."""
     service = services.s3(context)
     if service is None:
         yield info(NAME, f'not run: this shell names no S3 server; the store is {context.settings.store.directory}')
@@ -72,56 +72,56 @@ def check(context: Context) -> Iterator[Result]:
     if failed := context.failed('network.s3'):
         yield skipped(NAME, failed)
         return
-    for result in _greeting(service, context):
+    for result in _without_keys(service, context):
         yield result
         if result.check == 's3.answer' and result.is_finding:
             return
     try:
         with s3_put.single_requests(context.settings.store) as requests:
             requests.probe()
-            yield ok('s3.signature', 'the server takes our signature')
+            yield ok('s3.signature', 'the server accepts our signature')
             yield from _use(requests, context)
     except SettingError as problem:
-        yield of_error('s3.setting', problem)
+        yield from_error('s3.setting', problem)
     except CredentialsRejected as problem:
-        yield of_error('s3.signature', problem, 'the key pair is not one of this server: mistyped, or changed on Tower')
+        yield from_error('s3.signature', problem, 'the key pair is invalid on this server: mistyped, or changed on Tower')
     except StoreError as problem:
-        yield _away(problem)
+        yield _unusable(problem)
 
 
-def _away(problem: StoreError) -> Result:
-    """What stops all of it, in the middle of asking."""
+def _unusable(problem: StoreError) -> Result:
+    """The finding for an error that ends the check early."""
     if problem.data.get('code') in {'RequestTimeTooSkewed', 'RequestExpired'}:
-        return of_error('s3.clock', problem, 'the server refuses signatures that are more than 15 minutes off')
+        return from_error('s3.clock', problem, 'the server rejects signatures that are more than 15 minutes off')
     if problem.data.get('status', 0) >= 500:
-        return of_error(
+        return from_error(
             's3.answer', problem, 'the server fails (a full disk, storage that it cannot reach), or it is not an S3 server'
         )
     if 'like an S3 server' in str(problem):
-        return of_error('s3.answer', problem, 'another program answers on this port, or a proxy or login page on the way')
-    return of_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')
+        return from_error('s3.answer', problem, 'another program answers on this port, or a proxy or login page in between')
+    return from_error('s3.answer', problem, 'the connection is bad, or the server is overloaded')
 
 
-def _greeting(service: TowerService, context: Context) -> Iterator[Result]:
-    """What the server says to somebody without keys: its name, its time, and that it says no more."""
+def _without_keys(service: TowerService, context: Context) -> Iterator[Result]:
+    """What the server reveals without keys: its name and time, and nothing else."""
     trust = ssl.create_default_context(cafile=network.bundle(service, context)[1] or None) if service.tls else None
-    asked = Request(service.url, headers={'User-Agent': 'shadowhound-doctor'})  # noqa: S310 - http(s), see services
+    request = Request(service.url, headers={'User-Agent': 'shadowhound-doctor'})  # noqa: S310 - http(s), see services
     try:
-        with urlopen(asked, timeout=ANSWER_S, context=trust) as answer:  # noqa: S310
+        with urlopen(request, timeout=ANSWER_S, context=trust) as answer:  # noqa: S310
             headers, body = answer.headers, answer.read(LISTING_BYTES)
-    except HTTPError as problem:  # which is what a server answers to somebody without keys
+    except HTTPError as problem:  # the usual response to a request without keys
         headers, body = problem.headers, b''
         problem.close()
     except (URLError, OSError, http.client.HTTPException) as problem:
         yield _no_answer(service, getattr(problem, 'reason', problem))
         return
-    yield _named(headers.get('Server', ''), service)
+    yield _identity(headers.get('Server', ''), service)
     yield from _clock(headers.get('Date', ''))
     if b'ListAllMyBucketsResult' in body:
         yield warning(
             's3.open',
-            'the server lists its buckets to somebody without keys',
-            'it was started without credentials: anyone who can reach it may do anything',
+            'the server lists its buckets without keys',
+            'it was started without credentials: every client that can reach it has full access',
             'on Tower: make tower-secrets, and start it with them (docs/tower.md)',
         )
 
@@ -129,19 +129,19 @@ def _greeting(service: TowerService, context: Context) -> Iterator[Result]:
 def _no_answer(service: TowerService, reason: object) -> Result:
     remedy = 'on Tower: docker compose logs --tail 50 ; docker compose restart ; df -h'
     if isinstance(reason, TimeoutError):
-        seen = f'{service.url} accepts the connection and gives no answer within {ANSWER_S:g} s'
+        seen = f'{service.url} accepts the connection but does not answer within {ANSWER_S:g} s'
         return error('s3.answer', seen, 'the server hangs: a full or dead disk, or storage that it cannot reach', remedy)
     return error('s3.answer', f'{service.url} does not speak HTTP: {reason}', 'something else listens on this port', remedy)
 
 
-def _named(server: str, service: TowerService) -> Result:
+def _identity(server: str, service: TowerService) -> Result:
     if 'minio' in server.lower():
         return info('s3.server', f'{service.url} is {server}', MINIO, 'plan to move to SeaweedFS: docs/tower.md', server=server)
-    return ok('s3.server', f'{service.url} is {server or "a server that does not say what it is"}', server=server)
+    return ok('s3.server', f'{service.url} is {server or "a server that does not identify itself"}', server=server)
 
 
 def _clock(date: str) -> Iterator[Result]:
-    """By the Date header, which has whole seconds."""
+    """Compare clocks by the Date header, which has whole seconds."""
     try:
         skew_s = time.time() - parsedate_to_datetime(date).timestamp() - 0.5
     except (TypeError, ValueError):
@@ -150,7 +150,7 @@ def _clock(date: str) -> Iterator[Result]:
     seen = f'the clock of this machine is {abs(skew_s):.0f} s {which} that of Tower'
     remedy = 'on both machines: timedatectl ; sudo timedatectl set-ntp true  (docs/thor.md, Wrong clock)'
     if abs(skew_s) >= REFUSED_SKEW_S - 60.0:
-        yield error('s3.clock', seen, 'from 15 minutes on the server refuses every signature', remedy, skew_s=round(skew_s, 1))
+        yield error('s3.clock', seen, 'beyond 15 minutes the server rejects every signature', remedy, skew_s=round(skew_s, 1))
     elif abs(skew_s) > SKEW_S:
         yield warning('s3.clock', seen, 'times of robot and Tower cannot be compared', remedy, skew_s=round(skew_s, 1))
     else:
@@ -186,17 +186,17 @@ def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
 
 
 def _buckets(requests: S3Requests) -> Iterator[Result]:
-    """On Tower: those that the guide lists."""
+    """On Tower: check the buckets that the guide lists."""
     try:
         there = requests.buckets()
     except AccessDenied as problem:
-        yield of_error('s3.buckets', problem, "these are not Tower's own keys; --role thor asks what a robot's may do")
+        yield from_error('s3.buckets', problem, "these are not Tower's own keys; --role thor checks a robot's keys")
         return
     for name in TOWER_BUCKETS:
         if name not in there:
             yield s3_put.missing_bucket(name, requests.endpoint)
     if all(name in there for name in TOWER_BUCKETS):
-        yield ok('s3.buckets', f'the buckets {", ".join(TOWER_BUCKETS)} are there')
+        yield ok('s3.buckets', f'the buckets {", ".join(TOWER_BUCKETS)} exist')
 
 
 def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
@@ -209,7 +209,7 @@ def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
     return measured(
         's3.latency',
         f'a small request takes {1000 * middle_s:.1f} ms',
-        'a weak WiFi, or a server that is busy',
+        'a weak WiFi signal, or a busy server',
         'ping -c 10 TOWER_IP ; iw dev wlan0 link',
         is_fine=middle_s <= SLOW_S,
         latency_s=round(middle_s, 4),
@@ -217,44 +217,44 @@ def _latency(requests: S3Requests, bucket: str, robot: str) -> Result:
 
 
 def _delete(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
-    """Only Tower's own keys have to be able to."""
+    """Check deletion, which only Tower's own keys need."""
     name = f'{robot}/_doctor/{uuid.uuid4().hex}'
     requests.put(s3_put.probe(bucket, name), s3_put.BODY, conditional=True)
     try:
         requests.delete(bucket, name)
         gone = requests.head(bucket, name) is None
     except AccessDenied as problem:
-        yield of_error('s3.delete', problem, "these are not Tower's own keys")
+        yield from_error('s3.delete', problem, "these are not Tower's own keys")
         return
     if gone:
         yield ok('s3.delete', 'an object can be deleted')
     else:
         yield warning(
             's3.delete',
-            f'{bucket}/{name} was deleted and is still there',
+            f'{bucket}/{name} was deleted but still exists',
             'versions or a retention rule keep it',
             f'aws --endpoint-url {requests.endpoint} s3api get-bucket-versioning --bucket {bucket}',
         )
 
 
 def race_creates(requests: S3Requests, bucket: str, robot: str) -> Iterator[Result]:
-    """On Tower, whose keys may delete: whether of those who create one object at once one alone wins."""
+    """On Tower, whose keys may delete: check that of several clients creating one object at the same time only one succeeds."""
     names = [f'{robot}/_doctor/{uuid.uuid4().hex}' for _ in range(RACES)]
     try:
         winners = [_creators(requests, bucket, name) for name in names]
         for name in names:
             requests.delete(bucket, name)
     except AccessDenied as problem:
-        yield of_error('s3.race', problem, "these are not Tower's own keys")
+        yield from_error('s3.race', problem, "these are not Tower's own keys")
         return
     if winners == [1] * RACES:
-        yield ok('s3.race', f'of {RACERS} who create an object at once one wins')
+        yield ok('s3.race', f'of {RACERS} concurrent creators of an object one succeeds')
         return
     yield warning(
         's3.race',
-        f'of {RACERS} who created one object at once {winners} won',
-        'the server does not honor If-None-Match in one instant: of two who write one key, one is overwritten',
-        'give each robot a name of its own (SHADOWHOUND_ROBOT), and update the S3 server',
+        f'of {RACERS} concurrent creators of an object {winners} succeeded',
+        'the server does not apply If-None-Match to concurrent requests: one of two objects with the same key is overwritten',
+        'give each robot a unique name (SHADOWHOUND_ROBOT), and update the S3 server',
     )
 
 
@@ -270,7 +270,7 @@ def _creators(requests: S3Requests, bucket: str, name: str) -> int:
 
 
 def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
-    """On Spark: list, and read the first object there is."""
+    """On Spark: list, and read the first object."""
     bucket, prefix = s3_put.buckets(context.settings)[0], f'{context.settings.robot}/'
     try:
         first = next(requests.list(bucket, prefix), None)
@@ -280,7 +280,7 @@ def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
         began_s = time.perf_counter()
         body = b''.join(requests.content(bucket, first.key))
     except AccessDenied as problem:
-        yield of_error('s3.read', problem, 'a researcher needs to list and to get')
+        yield from_error('s3.read', problem, 'a researcher must be able to list and get')
         return
     mbps = 8e-6 * len(body) / max(time.perf_counter() - began_s, 1e-6)
     yield ok(
@@ -289,25 +289,28 @@ def _read(requests: S3Requests, context: Context) -> Iterator[Result]:
 
 
 def race_mailboxes(requests: S3Requests) -> Iterator[Result]:
-    """On Spark and Tower: whether of those who replace a mailbox at once one alone wins, and none where there is no mailbox."""
+    """On Spark and Tower: check that one of several concurrent replacements of a mailbox succeeds, and none if there is none."""
     check, remedy = 's3.mailbox', 'on Tower: run tower/make_secrets.py and tower/prepare.py again, and restart the server'
     try:
         item = s3_put.probe(MAILBOX_BUCKET, inbox_key(RACED))
         requests.put(item, s3_put.BODY, conditional=True)
         winners = [_winners(requests, number) for number in range(RACES)]
-        is_made = _is_made(requests, inbox_key(f'{RACED}_{uuid.uuid4().hex}'))
+        is_made = _is_created(requests, inbox_key(f'{RACED}_{uuid.uuid4().hex}'))
     except AccessDenied:
         yield info(
-            check, 'these keys may not ask a robot for what it keeps', 'this Tower was prepared by an earlier version', remedy
+            check,
+            'these keys may not request objects that a robot keeps',
+            'this Tower was prepared by an earlier version',
+            remedy,
         )
         return
     if winners != [1] * RACES:
-        seen = f'of {RACERS} who replaced one version of a mailbox at once {winners} won'
-        yield warning(check, seen, 'the server does not honor If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
+        seen = f'of {RACERS} concurrent replacements of a mailbox {winners} succeeded'
+        yield warning(check, seen, 'the server does not apply If-Match: requests get lost', 'use SeaweedFS 4, or a newer MinIO')
     elif is_made:
-        yield warning(check, 'If-Match made an object that was not there', 'an error of MinIO before 2025', 'update the server')
+        yield warning(check, 'If-Match created an object that did not exist', 'a bug of MinIO before 2025', 'update the server')
     else:
-        yield ok(check, f'of {RACERS} who replace a mailbox at once one wins')
+        yield ok(check, f'of {RACERS} concurrent replacements of a mailbox one succeeds')
 
 
 def _winners(requests: S3Requests, number: int) -> int:
@@ -318,7 +321,7 @@ def _winners(requests: S3Requests, number: int) -> int:
         return sum(pool.map(lambda body: requests.replace(MAILBOX_BUCKET, inbox_key(RACED), body, found[1]), bodies))
 
 
-def _is_made(requests: S3Requests, key: str) -> bool:
+def _is_created(requests: S3Requests, key: str) -> bool:
     try:
         return requests.replace(MAILBOX_BUCKET, key, b'{}', f'"{"0" * 32}"')
     except ObjectRefused:
@@ -333,7 +336,7 @@ def _nothing(requests: S3Requests, bucket: str, prefix: str) -> Iterator[Result]
     except ObjectRefused:
         yield warning(
             's3.read',
-            f'there is nothing under {bucket}/{prefix}',
+            f'no object exists under {bucket}/{prefix}',
             'no robot of this name has delivered anything yet, or not to this server',
-            'SHADOWHOUND_ROBOT names the robot; on it: shadowhound-data doctor',
+            'SHADOWHOUND_ROBOT names the robot; on it run: shadowhound-data doctor',
         )

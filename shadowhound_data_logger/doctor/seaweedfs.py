@@ -1,6 +1,6 @@
-"""SeaweedFS's own servers next to S3, which serve every client unless they have keys: whether one answers us without keys.
+"""SeaweedFS's internal servers next to S3, which serve every client unless they have keys: whether one answers without keys.
 
-Each gets one call that changes nothing. It needs ``grpcio`` (the extra ``tower``); without it the check is skipped.
+Each receives one call that changes nothing. It needs ``grpcio`` (the extra ``tower``); without it the check is skipped.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from shadowhound_data_logger.doctor.model import Context, Result, Role, info, ok
 
 NAME: Final = 'seaweedfs'
 GRPC: Final = 10_000
-"""A server of SeaweedFS has its gRPC port this far above that of HTTP."""
+"""The gRPC port of a SeaweedFS server is this far above its HTTP port."""
 S3_PORT: Final = 9000
-"""Of a Tower; ``make tower --offset`` moves all ports by the same."""
+"""Tower's port; ``make tower --offset`` shifts all ports by the same amount."""
 ANSWER_S: Final = 1.5
-"""For a connection, and for all of the answer: a firewall gives neither."""
+"""For a connection, and for the complete answer: a firewall sends neither."""
 LOOPBACK: Final = '127.0.0.1'
 
 
-class Question(NamedTuple):
+class Probe(NamedTuple):
     """A gRPC call to one of SeaweedFS's servers, without keys."""
 
     server: str
@@ -31,16 +31,16 @@ class Question(NamedTuple):
     method: str
 
 
-S3: Final = Question('S3', S3_PORT + GRPC, '/messaging_pb.SeaweedS3IamCache/ListPolicies')
+S3: Final = Probe('S3', S3_PORT + GRPC, '/messaging_pb.SeaweedS3IamCache/ListPolicies')
 OTHERS: Final = (
-    Question('filer', 18888, '/filer_pb.SeaweedFiler/GetFilerConfiguration'),
-    Question('master', 19333, '/master_pb.Seaweed/GetMasterConfiguration'),
-    Question('volume server', 18080, '/volume_server_pb.VolumeServer/VolumeServerStatus'),
+    Probe('filer', 18888, '/filer_pb.SeaweedFiler/GetFilerConfiguration'),
+    Probe('master', 19333, '/master_pb.Seaweed/GetMasterConfiguration'),
+    Probe('volume server', 18080, '/volume_server_pb.VolumeServer/VolumeServerStatus'),
 )
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check that no internal server answers without keys."""
     service = services.s3(context)
     if service is None:
         return
@@ -51,33 +51,33 @@ def check(context: Context) -> Iterator[Result]:
         yield info(NAME, "not checked: it needs grpcio (pip install 'shadowhound_data_logger[tower]')")
         return
     hosts = [service.host, *([LOOPBACK] if context.role is Role.TOWER and not service.is_local else [])]
-    asked = [(host, question) for host in hosts for question in questions(service.port)]
+    asked = [(host, probe) for host in hosts for probe in probes(service.port)]
     with ThreadPoolExecutor(len(asked)) as pool:
-        answered = pool.map(lambda one: answers_anybody(one[0], one[1].port, one[1].method), asked)
+        answered = pool.map(lambda one: answers_without_keys(one[0], one[1].port, one[1].method), asked)
         found = [one for one, is_open in zip(asked, answered, strict=True) if is_open]
     if found:
-        where = ', '.join(f'{host}:{question.port} ({question.server})' for host, question in found)
+        where = ', '.join(f'{host}:{probe.port} ({probe.server})' for host, probe in found)
         yield warning(
             'seaweedfs.open',
-            f'SeaweedFS serves everybody at {where}',
-            'it was started without the keys and the certificate of its own servers: anyone who can reach one of these can '
-            'become an administrator, and read or delete what is stored',
+            f'SeaweedFS serves every client at {where}',
+            'it was started without keys and a certificate for its internal servers: every client that can reach one '
+            'can become an administrator, and read or delete objects',
             'on Tower: make tower-secrets, and start the servers again (docs/tower.md)',
-            ports=[question.port for _, question in found],
+            ports=[probe.port for _, probe in found],
         )
     else:
-        yield ok(NAME, 'except S3, no port of SeaweedFS answers without a key')
+        yield ok(NAME, 'no port of SeaweedFS except S3 answers without a key')
 
 
-def questions(s3_port: int) -> list[Question]:
-    """For the servers behind an S3 port: at SeaweedFS's own ports, and where ``make tower --offset`` puts them."""
+def probes(s3_port: int) -> list[Probe]:
+    """The calls for the servers behind an S3 port: at SeaweedFS's own ports, and shifted as by ``make tower --offset``."""
     offsets = {0, max(0, s3_port - S3_PORT)}
     return [S3._replace(port=s3_port + GRPC)] + [
-        question._replace(port=question.port + offset) for offset in sorted(offsets) for question in OTHERS
+        probe._replace(port=probe.port + offset) for offset in sorted(offsets) for probe in OTHERS
     ]
 
 
-def answers_anybody(host: str, port: int, method: str) -> bool:
+def answers_without_keys(host: str, port: int, method: str) -> bool:
     """Whether a gRPC server answers a call without encryption, certificate and token. False if nothing listens."""
     import grpc  # noqa: PLC0415 - of the extra; a fifth of a second
 

@@ -1,4 +1,4 @@
-"""Who can read the secrets: modes of files with keys, keys in URLs and parameter files, and well-known keys."""
+"""Exposed secrets: modes of files with keys, keys in URLs and parameter files, and well-known keys."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from shadowhound_data_logger.doctor.model import Context, Result, info, ok, warn
 NAME: Final = 'secrets'
 OTHERS: Final = stat.S_IRGRP | stat.S_IROTH | stat.S_IWGRP | stat.S_IWOTH
 WELL_KNOWN: Final = frozenset({'minioadmin', 'minio', 'minio123', 'password', 'admin', 'any', 'some_secret_key'})
-"""Defaults of servers and of their manuals."""
+"""Default keys of servers and their manuals."""
 URLS: Final = (*ENDPOINTS, 'MLFLOW_TRACKING_URI', 'MLFLOW_S3_ENDPOINT_URL')
-MOST_BYTES: Final = 1 << 20
+MAX_BYTES: Final = 1 << 20
 _SECRET: Final = re.compile(
     r'(?im)^[^#\n]*(aws_secret_access_key|mlflow_tracking_password|secret_?key|postgres_password|weed_jwt_\w+)\b"?\s*[:=]\s*\S'
     r'|^-----BEGIN [A-Z ]*PRIVATE KEY'
@@ -26,7 +26,7 @@ _SECRET: Final = re.compile(
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check for secrets that other users can read."""
     before = [*_urls(context), *_known(context), *_files(context)]
     yield from before
     if not any(result.is_finding for result in before):
@@ -35,13 +35,13 @@ def check(context: Context) -> Iterator[Result]:
 
 def _urls(context: Context) -> Iterator[Result]:
     for name in URLS:
-        if services.shown(url := context.environ.get(name, '')) != url:
+        if services.without_login(url := context.environ.get(name, '')) != url:
             yield warning(
                 'secrets.url',
-                f'{name} holds a user and a password',
+                f'{name} contains a user and a password',
                 'URLs are logged, and shown by ps and /proc',
-                f'export {name}=http://...  # without them; AWS_ACCESS_KEY_ID, MLFLOW_TRACKING_USERNAME and _PASSWORD '
-                'take their place',
+                f'export {name}=http://...  # without them; use AWS_ACCESS_KEY_ID, MLFLOW_TRACKING_USERNAME '
+                'and _PASSWORD instead',
             )
 
 
@@ -50,9 +50,9 @@ def _known(context: Context) -> Iterator[Result]:
     if secret.lower() in WELL_KNOWN:
         yield warning(
             'secrets.default',
-            'AWS_SECRET_ACCESS_KEY is one that everybody knows',
+            'AWS_SECRET_ACCESS_KEY is a well-known default',
             'it is the default of a server',
-            'on Tower: make tower-secrets, and hand the new ones to Thor and Spark',
+            'on Tower: make tower-secrets, and copy the new keys to Thor and Spark',
         )
 
 
@@ -61,35 +61,35 @@ def _files(context: Context) -> Iterator[Result]:
         try:
             status = path.stat()
             mode = stat.S_IMODE(status.st_mode)
-            if not mode & OTHERS or not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
+            if not mode & OTHERS or not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
                 continue
             if not _SECRET.search(path.read_text(encoding='utf-8', errors='replace')):
                 continue
-        except OSError:  # none, or not ours to read
+        except OSError:  # missing, or not readable
             continue
         if mode & stat.S_IROTH or mode & stat.S_IWOTH:
             yield warning(
                 'secrets.mode',
-                f'{path} holds a key, and everybody on this machine can read it (mode {mode:04o})',
-                'it was made without a thought of its mode',
+                f'{path} contains a key, and every user of this machine can read it (mode {mode:04o})',
+                'it was created with the default mode',
                 f'chmod 600 {path}',
                 fix=('mode', str(path), '600'),
             )
         else:
             yield info(
-                'secrets.mode', f'{path} holds a key, and its group can read it (mode {mode:04o})', '', f'chmod 600 {path}'
+                'secrets.mode', f'{path} contains a key, and its group can read it (mode {mode:04o})', '', f'chmod 600 {path}'
             )
     if context.parameter_file and any('secret' in name.lower() for name in context.parameters):
         yield warning(
             'secrets.parameters',
-            f'{context.parameter_file} names a secret',
-            'ROS parameters can be read by everybody in the network',
-            'take it out; AWS_SECRET_ACCESS_KEY belongs into the environment',
+            f'{context.parameter_file} contains a secret',
+            'ROS parameters can be read by every machine in the network',
+            'remove it; AWS_SECRET_ACCESS_KEY belongs in the environment',
         )
 
 
 def _candidates(context: Context) -> list[Path]:
-    """Where keys usually are."""
+    """Files that usually contain keys."""
     home, environ = home_of(context), context.environ
     paths = [
         Path(environ.get('AWS_SHARED_CREDENTIALS_FILE') or home / '.aws/credentials').expanduser(),

@@ -1,4 +1,4 @@
-"""Where the two services of Tower are, as the environment names them."""
+"""The addresses of Tower's two services, from the environment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shadowhound_data_logger.doctor.model import Context
 
 CONNECT_S: Final = 3.0
 ANSWER_S: Final = 4.0
-"""A Tower that needs longer for an answer is not a Tower to work with; the sum of all waits has to fit into the run."""
+"""A Tower that needs longer for a response is unusable; the sum of all waits must fit into the run."""
 LOCAL: Final = frozenset({'localhost', '127.0.0.1', '::1'})
 
 
@@ -29,7 +29,7 @@ class TowerService:
     port: int
     tls: bool
     usual_ports: tuple[int, ...]
-    """Where such a server is often found."""
+    """Ports on which such a server often listens."""
 
     @property
     def is_local(self) -> bool:
@@ -42,17 +42,17 @@ class TowerService:
 
 
 def s3(context: Context) -> TowerService | None:
-    """The S3 server; None where data go to a folder."""
+    """The S3 server; None if data is stored in a folder."""
     return _service('s3', 'the S3 server', 'AWS_ENDPOINT_URL', context.settings.store.endpoint_url or '', (9000, 8333))
 
 
 def mlflow(context: Context) -> TowerService | None:
-    """The MLflow server; None where there is none."""
+    """The MLflow server; None if there is none."""
     return _service('mlflow', 'MLflow', 'MLFLOW_TRACKING_URI', context.environ.get('MLFLOW_TRACKING_URI', ''), (5001, 5000))
 
 
-def shown(url: str) -> str:
-    """A URL, which may be none, without user and password."""
+def without_login(url: str) -> str:
+    """A URL, which may be invalid, without user and password."""
     return re.sub('//.*@', '//', url)
 
 
@@ -64,4 +64,4 @@ def _service(name: str, title: str, variable: str, given: str, usual: tuple[int,
         port = url.port or (443 if url.scheme == 'https' else 80)
     except ValueError:
         return None
-    return TowerService(name, title, variable, shown(given).rstrip('/'), url.hostname, port, url.scheme == 'https', usual)
+    return TowerService(name, title, variable, without_login(given).rstrip('/'), url.hostname, port, url.scheme == 'https', usual)

@@ -1,4 +1,4 @@
-"""The node and its spool: whether it runs, what waits and for how long, whether the accounts close, who holds what."""
+"""The node and its spool: whether it runs, what waits and for how long, whether the accounts balance, and who holds the lock."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from shadowhound_data_logger.spool.index import Index
 
 NAME: Final = 'spool'
 OLD_S: Final = 600.0
-"""A backlog this old is more than a walk behind a wall."""
+"""A backlog this old means more than a short loss of WiFi."""
 LONG_S: Final = 3600.0
-"""A backlog that takes longer than this to deliver is one."""
-TWICE_S: Final = 0.3
-"""A mission agent without a node takes the right to deliver for moments; what holds it longer is looked at."""
+"""A backlog that takes longer than this to deliver is a finding."""
+RECHECK_S: Final = 0.3
+"""A mission agent without a node holds the drain lock for moments; a longer hold is reported."""
 START: Final = 'ros2 run shadowhound_data_logger sensor_logger_node  # or: sudo systemctl start shadowhound-data-logger'
 REBUILD: Final = 'start the node: it rebuilds the index from the files, which are all there'
 STORE: Final = 'shadowhound-data doctor --only s3 --only network'
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check the node, its index, the ledger, the backlog, quarantine and the drain lock."""
     folder, robot = context.settings.spool_path, context.settings.robot
     report = status.read(folder, robot, SystemClock.of_this_machine())
     yield from _node(report, folder)
@@ -47,11 +47,11 @@ def check(context: Context) -> Iterator[Result]:
         yield error(
             'spool.index',
             f'the index {path} is damaged or cannot be read: {problem}',
-            'a failing disk, a power cut with a write cache that lies, or another user',
+            'a failing disk, a power cut with an unsafe write cache, or another user',
             REBUILD,
         )
         return
-    yield ok('spool.index', 'the index is whole')
+    yield ok('spool.index', 'the index is intact')
     yield _ledger(accounts, path)
     yield _backlog(usage, context, runs=report.running)
     yield from _quarantine(quarantined)
@@ -59,7 +59,7 @@ def check(context: Context) -> Iterator[Result]:
 
 
 def _index(path: Path) -> tuple[SpoolStatus, dict[str, int]]:
-    """What lies there, and objects in quarantine by reason; raises sqlite3.Error for a damaged file."""
+    """The state of the spool, and objects in quarantine by reason; raises sqlite3.Error for a damaged file."""
     index = Index(path, read_only=True)
     try:
         index.open()
@@ -73,24 +73,24 @@ def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
     node = report.node
     if report.state == status.NOT_RUNNING:
         yield warning(
-            'node.running', f'the node of {report.robot} does not run here', f'by {status.file(folder, report.robot)}', START
+            'node.running', f'the node of {report.robot} is not running here', f'by {status.file(folder, report.robot)}', START
         )
         return
     if report.state == status.NOT_ANSWERING:
         yield error(
             'node.running',
             f'the node (process {node.pid}) has been silent for {report.age_s:.0f} s',
-            'it hangs: in a disk that does not answer, say',
+            'it hangs, for example on a disk that does not respond',
             f'kill -INT {node.pid} ; {START}',
         )
         return
-    yield ok('node.running', f'the node of {report.robot} runs (process {node.pid})')
+    yield ok('node.running', f'the node of {report.robot} is running (process {node.pid})')
     store = node.store
     if store.state not in status.FINE_STORE:
         yield warning(
             'node.delivery',
             f'delivery: {store.state.replace("_", " ")}',
-            store.last_error or 'the node does not say why',
+            store.last_error or 'the node reports no reason',
             STORE,
         )
     unheard = node.middleware.unheard or {}
@@ -100,15 +100,15 @@ def _node(report: status.NodeReport, folder: Path) -> Iterator[Result]:
     listed = tuple(row.text for row in unheard.values())
     for text in report.findings:
         if not text.startswith(('delivery:', 'front fails:', *listed)):
-            yield warning('node.status', text, 'said by the node itself', _status_remedy(text), lost=sum(missed.values()))
+            yield warning('node.status', text, 'reported by the node itself', _status_remedy(text), lost=sum(missed.values()))
 
 
 def _unheard(topics: Mapping[str, UnheardTopic]) -> Iterator[Result]:
     for row in topics.values():
         yield error(
             'node.unheard',
-            f'{row.text}, for {row.seconds} s now',
-            'the profile of the node looks at other interfaces or peers than programs of the robot do, or a firewall is between',
+            f'{row.text}, for {row.seconds} s',
+            'the profile of the node uses other interfaces or peers than programs of the robot, or a firewall is in between',
             f'{REMEDY[0].upper()}{REMEDY[1:]}',
             publishers=row.publishers,
             nodes=list(row.nodes),
@@ -116,18 +116,18 @@ def _unheard(topics: Mapping[str, UnheardTopic]) -> Iterator[Result]:
 
 
 def _front(node: NodeStatus) -> Iterator[Result]:
-    """What stands for a node that listens through another RMW than the robot's."""
+    """Check the front process of a node that listens through another RMW than the robot's."""
     middleware, front = node.middleware, node.workers.get('front')
     cause = (
         f'programs of the robot ({middleware.robot}) find no services, parameters and /diagnostics of the node, and '
         'publishers are not compared with those that the robot finds; messages are still logged'
     )
     if front is not None and front.failing:
-        remedy = 'journalctl -u shadowhound-data-logger | grep front  # what it said last; meanwhile: shadowhound-data node'
+        remedy = 'journalctl -u shadowhound-data-logger | grep front  # its last messages; until then: shadowhound-data node'
         yield error('node.front', f'the front fails, {front.failures:,} times so far: {front.last_error}', cause, remedy)
     elif front is None and middleware.rmw != middleware.robot:
         package = f'ros-$ROS_DISTRO-{middleware.robot.replace("_", "-")}'
-        seen = f'no front runs: {middleware.robot} is not installed here'
+        seen = f'the front is not running: {middleware.robot} is not installed here'
         yield warning('node.front', seen, cause, f'sudo apt install {package}  # or use: shadowhound-data node')
 
 
@@ -150,45 +150,45 @@ def _ledger(accounts: ledger.Ledger, index: Path) -> Result:
     if not wrong:
         return ok(
             'spool.ledger',
-            f'the ledger closes over {len(accounts["topics"])} topics and {accounts["objects"]["spooled"]:,} objects',
+            f'the ledger balances over {len(accounts["topics"])} topics and {accounts["objects"]["spooled"]:,} objects',
         )
     return error(
         'spool.ledger',
-        f'the ledger does not close: {wrong[0]}' + (f'; and {len(wrong) - 1} more' if wrong[1:] else ''),
-        'the index was written by something else, or this is a fault of ours',
+        f'the ledger does not balance: {wrong[0]}' + (f'; and {len(wrong) - 1} more' if wrong[1:] else ''),
+        'another program wrote to the index, or this is a bug in this package',
         f'shadowhound-data ledger --json > /tmp/ledger.json ; cp {index}* /tmp/  # and send us these files',
         imbalances=wrong,
     )
 
 
 def _backlog(usage: SpoolStatus, context: Context, *, runs: bool) -> Result:
-    """How much waits, and how long it takes at the rate that the check of the store has measured."""
+    """The backlog, and how long it takes at the rate measured by the check of the store."""
     count, size, oldest_s = usage.pending, usage.bytes, usage.oldest_age_s
     if not count:
-        return ok('spool.backlog', 'nothing waits for delivery', pending=0)
+        return ok('spool.backlog', 'no object waits for delivery', pending=0)
     figures: dict[str, Any] = {'pending': count, 'bytes': size, 'oldest_age_s': oldest_s}
     drain_s = _drain_s(count, size, context)
     seen = f'{count:,} objects ({size / 1e6:,.1f} MB) wait' + (f', the oldest for {oldest_s / 60:,.0f} min' if oldest_s else '')
     if drain_s is not None:
-        seen += f'; at the measured rate they are gone in {drain_s / 60:,.1f} min'
+        seen += f'; at the measured rate they are delivered in {drain_s / 60:,.1f} min'
         figures['drain_s'] = round(drain_s, 1)
     if (oldest_s or 0.0) < OLD_S and (drain_s or 0.0) < LONG_S:
         return ok('spool.backlog', seen, **figures)
     if not runs:
-        return warning('spool.backlog', seen, 'nothing is delivered while the node does not run', START, **figures)
+        return warning('spool.backlog', seen, 'nothing is delivered while the node is not running', START, **figures)
     if drain_s is None:
-        return warning('spool.backlog', seen, 'Tower is out of reach, or takes nothing', STORE, **figures)
+        return warning('spool.backlog', seen, 'Tower is unreachable, or accepts nothing', STORE, **figures)
     return warning(
         'spool.backlog',
         seen,
-        'Tower could not be reached for long, or more is logged than the network carries',
-        'bring the robot to a better network; log less: camera.rate_hz, lidar.rate_hz; upload.max_mbps 0',
+        'Tower was unreachable for long, or more is logged than the network can carry',
+        'move the robot to a better network; log less: camera.rate_hz, lidar.rate_hz; upload.max_mbps 0',
         **figures,
     )
 
 
 def _drain_s(count: int, size: int, context: Context) -> float | None:
-    """None where the store was not asked, or did not answer."""
+    """None if the store was not checked, or did not answer."""
     figures: dict[str, float] = {}
     for result in context.earlier.get('s3', ()):
         figures |= result.data
@@ -205,24 +205,24 @@ def _quarantine(reasons: Mapping[str, int]) -> Iterator[Result]:
         yield warning(
             'spool.quarantine',
             f'objects in quarantine: {text}',
-            'the store will never take them as they are; nothing is lost',
+            'the store will never accept them unchanged; nothing is lost',
             'shadowhound-data spool list --state quarantined  # and once the cause is gone: shadowhound-data spool retry',
         )
 
 
 def _lock(folder: Path, report: status.NodeReport, root: Path) -> Iterator[Result]:
-    """Who has the right to deliver."""
+    """Which process holds the drain lock."""
     path = folder / 'drain.lock'
     holder = lock_holder(root, path)
     if holder is None or holder == report.node.pid:
         return
-    time.sleep(TWICE_S)
+    time.sleep(RECHECK_S)
     if lock_holder(root, path) != holder:
         return
     who = command(root, holder) or 'a process that this user may not see'
     yield warning(
         'spool.lock',
-        f'process {holder} has the right to deliver: {who[:120]}',
-        'another node, a program that rescues the spool, or one that hangs; until it ends, no node delivers',
-        f'ps -fp {holder}  # and if it is not wanted: kill {holder}',
+        f'process {holder} holds the drain lock: {who[:120]}',
+        'another node, a program that rescues the spool, or one that hangs; until it exits, no node delivers',
+        f'ps -fp {holder}  # and if it is not needed: kill {holder}',
     )

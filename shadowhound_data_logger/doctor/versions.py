@@ -1,4 +1,4 @@
-"""What is installed: Pythons and libraries that are too old, and whether the running node has this version."""
+"""Installed versions: Python and libraries that are too old, and whether the running node has this version."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ PACKAGE: Final = 'shadowhound_data_logger'
 OLDEST_PYTHON: Final = (3, 10)
 DISTROS: Final = frozenset({'humble', 'jazzy', 'kilted'})
 NOT_TESTED: Final = frozenset({'lyrical'})
-"""Those that the package is made for besides."""
+"""Other distributions that the package supports."""
 _NEED: Final = re.compile(r'([A-Za-z0-9_.-]+)\s*>=\s*([0-9.]+)\s*$')
 
 
 def check(context: Context) -> Iterator[Result]:
-    """See the module."""
+    """Check Python, ROS, libraries and the running node."""
     python = platform.python_version()
     if sys.version_info[:2] < OLDEST_PYTHON:
         yield error(
@@ -39,7 +39,7 @@ def check(context: Context) -> Iterator[Result]:
 
 
 def _packages(python: str, distro: str) -> Iterator[Result]:
-    """Lower bounds that pip or colcon did not enforce: Debian's boto3 comes before a later one where PYTHONPATH says so."""
+    """Check lower bounds that pip or colcon did not enforce: PYTHONPATH may put Debian's boto3 before a newer one."""
     try:
         ours, needs = version(PACKAGE), requires(PACKAGE) or []
     except PackageNotFoundError:
@@ -49,18 +49,18 @@ def _packages(python: str, distro: str) -> Iterator[Result]:
     for need in needs:
         if not (found := _NEED.match(need)):  # an extra, or another kind of bound
             continue
-        name, least = found.groups()
+        name, minimum = found.groups()
         try:
             have = version(name)
         except PackageNotFoundError:
             have = ''
-        if _numbers(have) < _numbers(least):
-            old.append(f'{name}>={least}')
+        if _numbers(have) < _numbers(minimum):
+            old.append(f'{name}>={minimum}')
             yield error(
                 'versions.library',
                 f'{name} is {have or "not installed"}',
-                f'version {least} or later is needed',
-                f'python3 -m pip install --user "{name}>={least}"',
+                f'version {minimum} or later is needed',
+                f'python3 -m pip install --user "{name}>={minimum}"',
             )
     if not old:
         yield ok(
@@ -81,7 +81,7 @@ def _node(context: Context) -> Iterator[Result]:
     if found.running and found.node.version and found.node.version != ours:
         yield warning(
             'versions.node',
-            f'the node that runs is version {found.node.version}, installed is {ours}',
-            'it was not started again after an update',
+            f'the running node is version {found.node.version}, installed is {ours}',
+            'it was not restarted after an update',
             'sudo systemctl restart shadowhound-data-logger',
         )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.config import SensorSettings
 from shadowhound_data_logger.core.errors import NameRefused, Rejected
@@ -96,13 +96,13 @@ def _object(batch: Batch, sensor: SensorSettings, robot: str, payload: Payload, 
     start_ns = min(sample.stamp_ns for sample in payload.kept)
     end_ns = max(sample.stamp_ns for sample in payload.kept)
     metadata = {
-        words.ROBOT: robot,
-        words.SENSOR: sensor.name,
-        words.TOPIC: batch.topic,
-        words.TYPE: batch.type,
-        words.COUNT: str(len(payload.kept)),
-        words.T_START_NS: str(start_ns),
-        words.T_END_NS: str(end_ns),
+        meta.ROBOT: robot,
+        meta.SENSOR: sensor.name,
+        meta.TOPIC: batch.topic,
+        meta.TYPE: batch.type,
+        meta.COUNT: str(len(payload.kept)),
+        meta.T_START_NS: str(start_ns),
+        meta.T_END_NS: str(end_ns),
         **_other_times(payload.kept),
     }
     return DataObject(
@@ -129,11 +129,11 @@ def _other_times(samples: Sequence[Sample]) -> dict[str, str]:
     found: dict[str, str] = {}
     received = [sample.received_ns for sample in samples if sample.received_ns >= EARLIEST_SANE_NS]
     if len(received) == len(samples):
-        found |= {words.RECEIVED_START_NS: str(min(received)), words.RECEIVED_END_NS: str(max(received))}
+        found |= {meta.RECEIVED_START_NS: str(min(received)), meta.RECEIVED_END_NS: str(max(received))}
     if untrusted := [sample.untrusted_ns for sample in samples if sample.untrusted_ns]:
         found |= {
-            words.STAMP_START_NS: str(min(untrusted)), words.STAMP_END_NS: str(max(untrusted)),
-            words.BY_ARRIVAL: str(len(untrusted)),
+            meta.STAMP_START_NS: str(min(untrusted)), meta.STAMP_END_NS: str(max(untrusted)),
+            meta.BY_ARRIVAL: str(len(untrusted)),
         }  # fmt: skip
     return found
 

@@ -13,12 +13,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, TypeVar
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.config import home, store_settings
 from shadowhound_data_logger.core.errors import ForeignObject
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.formats.rows.parts import CONTENT_TYPE
 from shadowhound_data_logger.formats.rows.schema import BUCKET, SENSOR
 from shadowhound_data_logger.stores import open_reader
@@ -63,7 +63,7 @@ class Bucket:
         self._ask(lambda store: store.delete(self.name, key))
 
     def _ask(self, ask: Callable[[ObjectStore], _Answer]) -> _Answer:
-        return steadily(lambda: ask(_reader(self.settings)))
+        return with_retries(lambda: ask(_reader(self.settings)))
 
 
 def default_source(settings: StoreSettings | None = None) -> Bucket:
@@ -79,7 +79,7 @@ def put_part(store: ObjectStore, key: str, robot: str, body: bytes, rows: int) -
     with tempfile.TemporaryDirectory(prefix='shadowhound-lake-') as folder:
         path = Path(folder, 'part')
         path.write_bytes(body)
-        metadata = {words.ROBOT: robot, words.SENSOR: SENSOR, words.COUNT: str(rows)}
+        metadata = {meta.ROBOT: robot, meta.SENSOR: SENSOR, meta.COUNT: str(rows)}
         item = SpooledObject(
             id=0, bucket=BUCKET, key=key, path=path, size=len(body), sha256=hashlib.sha256(body).hexdigest(),
             content_type=CONTENT_TYPE, metadata=metadata, priority=5, created_ns=time.time_ns(),

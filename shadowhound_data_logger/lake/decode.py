@@ -20,7 +20,7 @@ import simplejpeg
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import LakeError
-from shadowhound_data_logger.core.untrusted import MOST_MEMBERS, check_pixels, check_size, open_image, shallow
+from shadowhound_data_logger.core.untrusted import MAX_MEMBERS, check_pixels, check_size, limit_depth, open_image
 from shadowhound_data_logger.formats.statistics import INFINITE
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def records(body: bytes) -> list[dict[str, Any]]:
     """The messages of a JSON object: the samples of a batch, or its one document as a list. Raises LakeError."""
     try:
         check_size(len(body), _MAX_JSON_BYTES)
-        document = shallow(orjson.loads(body))
+        document = limit_depth(orjson.loads(body))
         found = document.get('samples', [document])
         if not all(isinstance(each, dict) and _is_stamp(each['stamp_ns']) for each in found):
             raise ValueError('a sample has no stamp')
@@ -207,7 +207,7 @@ def _members(files: dict[str, bytes]) -> Iterator[ArchiveMember]:
     contents = {name.partition('.')[0]: name for name in files if not name.endswith('.json')}
     for name, body in files.items():
         if name.endswith('.json'):
-            info = shallow(orjson.loads(body))
+            info = limit_depth(orjson.loads(body))
             if not isinstance(info, dict) or not _is_stamp(info['stamp_ns']):
                 raise ValueError(f'{name} has no stamp')
             content = info.get('repeat_of') or contents[name[:-5]]
@@ -219,7 +219,7 @@ def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:
     with tarfile.open(fileobj=BytesIO(body), mode='r:') as packed:
         for number, entry in enumerate(packed):
             left -= entry.size if entry.isreg() else 0
-            if number >= MOST_MEMBERS or left < 0:
+            if number >= MAX_MEMBERS or left < 0:
                 raise ValueError('it claims more or larger files than it has bytes for')
             content = packed.extractfile(entry) if entry.isreg() else None
             if content is not None:
@@ -227,8 +227,8 @@ def _tar(body: bytes) -> Iterator[tuple[str, bytes]]:
 
 
 def _zip(body: bytes) -> Iterator[tuple[str, bytes]]:
-    if body.count(_ZIP_ENTRY) > MOST_MEMBERS:
-        raise ValueError(f'it has more than {MOST_MEMBERS:,} files')
+    if body.count(_ZIP_ENTRY) > MAX_MEMBERS:
+        raise ValueError(f'it has more than {MAX_MEMBERS:,} files')
     with zipfile.ZipFile(BytesIO(body)) as packed:
         entries = packed.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):

@@ -20,7 +20,7 @@ from typing import Final
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, LakeError, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.untrusted import is_path
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import FOLDER, UNWRITABLE, Fetched, Verified
@@ -194,7 +194,7 @@ class _Fetch:
         """An existing file with the object's content, left by a run that was killed or by another program."""
         if not path.is_file() or path.stat().st_size != request.size:
             return None
-        info = None if request.sha256 else steadily(lambda: self._store.head(request.bucket, request.key), pause=self._pause)
+        info = None if request.sha256 else with_retries(lambda: self._store.head(request.bucket, request.key), pause=self._pause)
         expected = request.sha256 or (info and info.sha256)
         seen = path.stat()
         if expected is None or fingerprint(path)[1] != expected:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import LakeError, PolicyRefused
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, check_size, from_json
 from shadowhound_data_logger.policies.content import check_content
 
 Vectors = NDArray[np.float32]
@@ -199,7 +199,7 @@ class OnnxPair:
         try:
             if 'preprocessor' in self._files:
                 path = self._files['preprocessor']
-                check_size(path.stat().st_size, MOST_DOCUMENT_BYTES)
+                check_size(path.stat().st_size, MAX_DOCUMENT_BYTES)
                 config = from_json(path.read_bytes())
             return _preparation(config, sides)
         except (ValueError, TypeError, KeyError, AttributeError, OSError) as error:

@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.keys import check_name, is_name
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, check_size, csv_rows, from_json, is_path
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.labels import LABEL, LABELS, MAX_TEXT, REMOVED
 from shadowhound_data_logger.formats.rows.schema import BUCKET, Row
@@ -182,7 +182,7 @@ def from_csv(body: bytes, robot: str, now_ns: int) -> list[Label]:
     Times are written as in ``query``; those of a row with a key may be empty: ``with_times`` adds them. Raises LakeError.
     """
     try:
-        check_size(len(body), MOST_DOCUMENT_BYTES)
+        check_size(len(body), MAX_DOCUMENT_BYTES)
         reader = csv_rows(body)
         _check_columns(reader.fieldnames or ())
         return [_of_csv({name: value or '' for name, value in row.items()}, robot, now_ns) for row in reader]

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from shadowhound_data_logger.core.clock import utc
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.progress import ProgressListener
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, is_path, open_image
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, is_path, open_image
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
@@ -163,7 +163,7 @@ def _opened(
 
     def body(row: Mapping[str, Any]) -> bytes | str:
         try:
-            got = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+            got = Bucket(source.settings, row['bucket']).get(row['key'], MAX_OBJECT_BYTES)
         except ObjectRefused as error:
             return 'missing' if error.data.get('reason') == 'missing' else 'too_large'
         return got if hashlib.sha256(got).hexdigest() == row['sha256'] else 'changed'

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, visible
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, visible
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.fetched import UNWRITABLE
 from shadowhound_data_logger.lake.gaps import DOWNSAMPLED, NOT_KNOWN, STORED, Coverage, named
@@ -55,7 +55,7 @@ def sheet(rows: Sequence[Mapping[str, Any]], open_bucket: Callable[[str], Bucket
         number, row = numbered
         path = Path(folder, str(number))
         try:
-            path.write_bytes(open_bucket(row['bucket']).get(row['key'], MOST_OBJECT_BYTES))
+            path.write_bytes(open_bucket(row['bucket']).get(row['key'], MAX_OBJECT_BYTES))
         except ObjectRefused:  # the catalog has deleted objects, too
             return None
         return LoggedFrame(row.get('t_start_ns') or 0, number, path)
@@ -99,10 +99,10 @@ def ground(
             axes.plot([], [], c=plots.AMBER, lw=1.6, ls='--', label='selected')
         charge = [float('nan') if row.get('battery_pct') is None else row['battery_pct'] for row in placed]
         is_known = any(value == value for value in charge)  # noqa: PLR0124 - not all are NaN
-        look = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
+        poll = {'c': charge, 'cmap': 'viridis', 'plotnonfinite': True} if is_known else {'c': plots.BLUE}
         xs, ys = [row['x'] for row in placed], [row['y'] for row in placed]
         size = max(8.0, min(DOTS, 6000 / len(placed)))
-        dots = axes.scatter(xs, ys, s=size, ec='white', lw=0.5, label='found', zorder=3, **look)
+        dots = axes.scatter(xs, ys, s=size, ec='white', lw=0.5, label='found', zorder=3, **poll)
         axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal')
         axes.set_title('\n'.join(textwrap.wrap(f'{title}: {len(placed):,}' if title else f'{len(placed):,} objects', LETTERS)))
         axes.margins(0.08)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from shadowhound_data_logger.core.errors import LakeError, NameRefused, ObjectRefused
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.core.retry import steadily
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, path_below
+from shadowhound_data_logger.core.retry import with_retries
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, path_below
 from shadowhound_data_logger.lake.track import Object
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -47,7 +47,7 @@ class Place:
         """Return an object's content. Raises StoreError, and ObjectRefused for more than ``limit`` bytes."""
         if self.folder is None:
             store = _of_this_process(self.settings)
-            return steadily(lambda: store.get(bucket, key, limit))
+            return with_retries(lambda: store.get(bucket, key, limit))
         where: dict[str, Any] = {'bucket': bucket, 'key': key}
         try:
             path = path_below(self.folder, key)
@@ -135,8 +135,8 @@ class Prefetch:
             self._held_bytes -= len(self._kept.popitem(last=False)[1])
 
     def _verified(self, wanted: Object) -> bytes:
-        if not 0 < wanted.size <= MOST_OBJECT_BYTES:
-            text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes, allowed are up to {MOST_OBJECT_BYTES:,}'
+        if not 0 < wanted.size <= MAX_OBJECT_BYTES:
+            text = f'{wanted.bucket}/{wanted.key} has {wanted.size:,} bytes, allowed are up to {MAX_OBJECT_BYTES:,}'
             raise LakeError(text, bucket=wanted.bucket, key=wanted.key)
 
         def once() -> bytes:

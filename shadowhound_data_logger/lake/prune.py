@@ -25,14 +25,14 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 
 from shadowhound_data_logger.bags.manifest import Manifest
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS
 from shadowhound_data_logger.core.errors import AccessDenied, BagDamaged, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.mailbox import KeptFilter
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES
 from shadowhound_data_logger.formats.rows import gaps as journal
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, FORMAT_VERSION, Row, place_of
@@ -146,11 +146,11 @@ class Protection:
             return EXPORT, dataset
         if (label := self._keys.get(name) or self._label_of(row)) is not None:
             return LABEL, label
-        metadata = {word: row[word] for word in (words.MISSION_ID, words.RUN_ID, words.MISSION_TYPE) if row[word] is not None}
+        metadata = {word: row[word] for word in (meta.MISSION_ID, meta.RUN_ID, meta.MISSION_TYPE) if row[word] is not None}
         metadata |= place_of(row)
         begin_ns, end_ns = row['t_start_ns'], _end_ns(row)
         for request, want in self._requests.get(row['robot'], ()):
-            if want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, end_ns, metadata):
+            if want.matches(row['key'], row['sensor'] or '', row['topic'], begin_ns, end_ns, metadata):
                 return REQUEST, request
         return None
 
@@ -437,7 +437,7 @@ def _read_manifest(source: Bucket, group: _Group) -> None:
     if group.sensor != BAGS:
         return
     try:
-        body = source.get(f'{group.prefix}manifest.json', MOST_DOCUMENT_BYTES)
+        body = source.get(f'{group.prefix}manifest.json', MAX_DOCUMENT_BYTES)
         group.manifest = Manifest.from_json(body)
     except (ObjectRefused, BagDamaged):
         group.why = NO_MANIFEST, group.prefix
@@ -506,7 +506,7 @@ def _finish_deletion(source: Bucket, store: ObjectStore, robot: str, findings: F
             for found in read(source, [] if f'{REPEATS}_' in file.entry.key.rpartition('/')[2] else [file], findings):
                 keys.update((row['bucket'], row['key']) for row in found.rows)
             tell(f'{robot}: deleting {len(keys):,} objects')
-            for _ in pool.map(lambda pair: steadily(lambda: store.delete(*pair)), sorted(keys)):
+            for _ in pool.map(lambda pair: with_retries(lambda: store.delete(*pair)), sorted(keys)):
                 done += 1
             put_part(store, file.entry.key + DELETED, robot, b'{}\n', len(keys))
     return done

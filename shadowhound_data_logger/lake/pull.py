@@ -28,7 +28,7 @@ from shadowhound_data_logger.core.mailbox import (
     DEFAULT_EXPIRY_NS,
     DEFAULT_PRIORITY,
     MAILBOX_BUCKET,
-    MOST_INBOX_BYTES,
+    MAX_INBOX_BYTES,
     KeptFilter,
     PullCancel,
     PullRequest,
@@ -43,7 +43,7 @@ from shadowhound_data_logger.core.mailbox import (
 )
 from shadowhound_data_logger.core.model import ON_ROBOT, SpooledObject
 from shadowhound_data_logger.core.options import UploadSettings
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.untrusted import from_json, visible
 from shadowhound_data_logger.formats.rows.schema import KEPT, OBJECTS, place_of
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
@@ -114,7 +114,7 @@ def matches(want: KeptFilter, row: Mapping[str, Any]) -> bool:
     metadata = {name: row[name] for name in ('mission_id', 'run_id', 'mission_type') if row[name] is not None}
     metadata |= place_of(row)
     begin_ns = row['t_start_ns'] or 0
-    return want.takes(row['key'], row['sensor'] or '', row['topic'], begin_ns, row['t_end_ns'] or begin_ns, metadata)
+    return want.matches(row['key'], row['sensor'] or '', row['topic'], begin_ns, row['t_end_ns'] or begin_ns, metadata)
 
 
 def put_request(store: ObjectStore, source: Bucket, robot: str, want: KeptFilter, *, by: str, priority: int = DEFAULT_PRIORITY,
@@ -176,7 +176,7 @@ def unanswered(source: Bucket, robot: str) -> list[PullRequest]:
 def _entries(source: Bucket, robot: str) -> list[Any]:
     """The entries of a robot's mailbox; empty if it does not exist."""
     try:
-        return decode_inbox(source.get(inbox_key(robot), MOST_INBOX_BYTES))
+        return decode_inbox(source.get(inbox_key(robot), MAX_INBOX_BYTES))
     except ObjectRefused as error:
         if error.data.get('reason') == 'missing':
             return []
@@ -328,12 +328,12 @@ def _request_id(entry: Mapping[str, Any]) -> str:
 def _read(store: ObjectStore, robot: str) -> tuple[list[Any], str]:
     """The entries of the mailbox, which is created if it does not exist, and its ETag."""
     try:
-        found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
+        found = with_retries(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MAX_INBOX_BYTES))
     except ObjectRefused as error:
         if error.data.get('reason') != 'missing':
             raise
         make(store, robot)
-        found = steadily(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MOST_INBOX_BYTES))
+        found = with_retries(lambda: store.changed(MAILBOX_BUCKET, inbox_key(robot), '', MAX_INBOX_BYTES))
     assert found is not None
     try:
         return decode_inbox(found[0]), found[1]
@@ -365,7 +365,7 @@ def _change(store: ObjectStore, robot: str, change: Callable[[list[Any]], list[A
             body = encode_inbox(changed)
         except RequestRefused as error:
             raise LakeError(str(error), remedy='wait until some requests are answered, or cancel one') from error
-        if steadily(lambda: store.replace(MAILBOX_BUCKET, inbox_key(robot), body, version)):  # noqa: B023 - called at once
+        if with_retries(lambda: store.replace(MAILBOX_BUCKET, inbox_key(robot), body, version)):  # noqa: B023 - called at once
             return
         time.sleep(random.uniform(0.0, PAUSE_S * 2.0 ** min(attempt, 4)))
     raise LakeError('other processes kept changing the mailbox', remedy='run the command again')

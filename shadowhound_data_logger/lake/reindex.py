@@ -15,7 +15,7 @@ from typing import Any, Final
 from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
 from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
@@ -96,7 +96,7 @@ def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Call
     def statistics(row: dict[str, Any]) -> list[Row]:
         of = {**row, 't_start': None if row['t_start'] is None else row['t_start_ns'] // 1000}
         try:
-            body = Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+            body = Bucket(source.settings, row['bucket']).get(row['key'], MAX_OBJECT_BYTES)
             return list(statistic_rows(of, values.statistics_of(row['key'], body)))
         except (LakeError, ObjectRefused) as error:
             findings.add(row['key'], str(error))

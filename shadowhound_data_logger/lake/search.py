@@ -31,7 +31,7 @@ from typing import Any, Final
 from shadowhound_data_logger.core.errors import ForeignObject, LakeError, ObjectRefused, SettingError
 from shadowhound_data_logger.core.model import SpooledObject
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
+from shadowhound_data_logger.core.untrusted import MAX_SUMMARY_BYTES, from_json
 from shadowhound_data_logger.formats.rows.schema import BUCKET
 from shadowhound_data_logger.lake import labels
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
@@ -340,7 +340,7 @@ def summary(source: Bucket, robot: str, run_id: str, findings: Findings) -> Mapp
     """The summary of a mission; None if it does not exist yet. An invalid one is skipped, and read again the next time."""
     key = f'{robot}/missions/{run_id}/summary.json'
     try:
-        content = from_json(source.get(key, MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+        content = from_json(source.get(key, MAX_SUMMARY_BYTES), MAX_SUMMARY_BYTES)
     except ObjectRefused as error:
         if error.data.get('reason') != 'missing':
             findings.add(key, str(error))

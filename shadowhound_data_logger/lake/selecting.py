@@ -14,7 +14,7 @@ from shadowhound_data_logger.core.clock import SECOND, utc
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.core.options import StoreSettings
 from shadowhound_data_logger.core.stamps import BY_STAMP
-from shadowhound_data_logger.core.untrusted import MOST_MEMBERS
+from shadowhound_data_logger.core.untrusted import MAX_MEMBERS
 from shadowhound_data_logger.formats.rows.schema import SENSOR
 from shadowhound_data_logger.lake import labels, query
 from shadowhound_data_logger.lake.bucket import Bucket, default_source
@@ -128,7 +128,7 @@ def _rows(batches: Iterable[pa.Table]) -> pa.Table:
 def _possible(rows: pa.Table, findings: Findings) -> pa.Table:
     """The rows without those that claim more messages than an object can have: they would dominate the dataset."""
     counts = pc.fill_null(rows['count'], 0)
-    is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MOST_MEMBERS))
+    is_possible = pc.and_(pc.greater_equal(counts, 0), pc.less_equal(counts, MAX_MEMBERS))
     for row in rows.filter(pc.invert(is_possible)).select(['key', 'count']).to_pylist():
         findings.add(row['key'], f'its row claims {row["count"]:,} messages', 1)
     return _kept(rows, is_possible)

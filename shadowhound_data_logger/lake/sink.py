@@ -36,7 +36,7 @@ import urllib3
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.durable_files import flock
 from shadowhound_data_logger.core.errors import LakeError, SettingError, SinkUnavailable
-from shadowhound_data_logger.core.retry import backoff, steadily
+from shadowhound_data_logger.core.retry import backoff, with_retries
 from shadowhound_data_logger.core.untrusted import from_json, visible
 from shadowhound_data_logger.formats.rows.gaps import GAPS, WITHDRAWN
 from shadowhound_data_logger.formats.rows.labels import LABELS, REMOVED
@@ -582,8 +582,8 @@ class Sink:
 
     def _patiently(self, ask: Callable[[], _Answer]) -> _Answer:
         """Try a request up to ``tries`` times. Raises the error of the last attempt."""
-        return steadily(ask, tries=self.tries, cap_s=CAP_S, pause=self.pause, away=SinkUnavailable,
-                        failed=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
+        return with_retries(ask, tries=self.tries, cap_s=CAP_S, pause=self.pause, unavailable=SinkUnavailable,
+                        on_failure=lambda error: self.tell(f'{error.what}; trying again'))  # fmt: skip
 
 
 def _rows(table: pa.RecordBatch) -> Iterator[dict[str, Any]]:

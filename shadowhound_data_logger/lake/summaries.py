@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
 from shadowhound_data_logger.core.errors import ObjectRefused
-from shadowhound_data_logger.core.untrusted import MOST_SUMMARY_BYTES, from_json
+from shadowhound_data_logger.core.untrusted import MAX_SUMMARY_BYTES, from_json
 from shadowhound_data_logger.formats.rows.schema import UNDATED
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket
 from shadowhound_data_logger.lake.tables import DATE, MISSION_ROWS, ROBOT, Tables, answer, engine
@@ -61,7 +61,7 @@ def uploaded(source: Bucket, runs: Collection[Run]) -> pa.Table:
 def _row(source: Bucket, robot: str, run_id: str) -> dict[str, Any] | None:
     """None for a mission without a summary, or whose summary is not JSON."""
     try:
-        summary = from_json(source.get(f'{robot}/missions/{run_id}/summary.json', MOST_SUMMARY_BYTES), MOST_SUMMARY_BYTES)
+        summary = from_json(source.get(f'{robot}/missions/{run_id}/summary.json', MAX_SUMMARY_BYTES), MAX_SUMMARY_BYTES)
     except (ObjectRefused, ValueError):
         return None
     if not isinstance(summary, dict):

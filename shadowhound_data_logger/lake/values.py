@@ -29,7 +29,7 @@ from shadowhound_data_logger.core.errors import DataLoggerError, LakeError, Obje
 from shadowhound_data_logger.core.expression import MAX_SHOWN, STORED, Comparison, Expression, Joined, comparisons
 from shadowhound_data_logger.core.expression import parse as parse_expression
 from shadowhound_data_logger.core.stamps import BY_STAMP
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES
 from shadowhound_data_logger.formats.image import jpeg_statistics
 from shadowhound_data_logger.formats.pointcloud import point_statistics
 from shadowhound_data_logger.formats.records import RECORDS_PER_PART
@@ -418,7 +418,7 @@ def _may_hold(lead: Comparison) -> str:
         return 'true'
     huge = repr(sys.float_info.max)
     ends = ' OR '.join(f'"{name}" IS NULL OR isnan("{name}") OR abs("{name}") > {huge}' for name in dict.fromkeys((low, high)))
-    counts = ' OR '.join(f'"{name}" NOT BETWEEN 0 AND {MOST_OBJECT_BYTES}' for name in ('count', 'nan_count'))
+    counts = ' OR '.join(f'"{name}" NOT BETWEEN 0 AND {MAX_OBJECT_BYTES}' for name in ('count', 'nan_count'))
     return f'({by_sign[lead.sign]} OR "min" > "max" OR {ends} OR {counts})'
 
 
@@ -531,7 +531,7 @@ def _contradictory(values: Mapping[str, NDArray[np.float64]]) -> Mask:
     low, high, count = values['min'], values['max'], values['count']
     found: Mask = (low > high) | np.isinf(low) | np.isinf(high)
     for name in ('count', 'nan_count'):
-        found |= ~((values[name] >= 0) & (values[name] <= MOST_OBJECT_BYTES))
+        found |= ~((values[name] >= 0) & (values[name] <= MAX_OBJECT_BYTES))
     for name in ('first', 'last', 'min', 'max'):
         if (value := values.get(name)) is not None:
             found |= (value < low) | (value > high) | (np.isnan(value) == (count > 0))
@@ -546,7 +546,7 @@ def _invalid_totals(table: pa.Table) -> Mask:
     found: Mask = np.zeros(len(table), bool)
     for name in ('count', 'nan_count'):
         values = _numbers(table, name)
-        found |= ~((values >= 0) & (values <= MOST_OBJECT_BYTES))
+        found |= ~((values >= 0) & (values <= MAX_OBJECT_BYTES))
     return found
 
 
@@ -568,7 +568,7 @@ def _opened(source: Bucket, rows: pa.Table, numbers: NDArray[np.intp], expressio
 
     def body(row: dict[str, Any]) -> bytes | DataLoggerError:
         try:
-            return Bucket(source.settings, row['bucket']).get(row['key'], MOST_OBJECT_BYTES)
+            return Bucket(source.settings, row['bucket']).get(row['key'], MAX_OBJECT_BYTES)
         except ObjectRefused as error:
             return error
 

@@ -47,7 +47,7 @@ MIN_TOKEN: Final = 16
 """Letters of a token that somebody wrote into the file."""
 MAX_ENDED: Final = 1000
 """Sign-ins of a role that were signed out and are remembered one by one, in 28 bytes each."""
-MOST_BYTES: Final = 100_000
+MAX_BYTES: Final = 100_000
 """Of the file with these."""
 
 
@@ -187,7 +187,7 @@ class _Ended:
         known, until, is_damaged = dict[str, int](), 0, False
         try:
             with self._path.open('rb') as file:
-                until, known = _ended_in(file.read(MOST_BYTES + 1))
+                until, known = _ended_in(file.read(MAX_BYTES + 1))
         except FileNotFoundError:
             pass
         except (OSError, ValueError) as error:
@@ -212,7 +212,7 @@ class _Ended:
 
 def _ended_in(content: bytes) -> tuple[int, dict[str, int]]:
     """Raises ValueError for what ``_Ended`` did not write."""
-    check_size(len(content), MOST_BYTES)
+    check_size(len(content), MAX_BYTES)
     digest, _, body = content.partition(b'\n')
     if sha256(body).hexdigest().encode() != digest:
         raise ValueError('its hash does not fit')

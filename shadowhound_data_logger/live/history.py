@@ -96,7 +96,7 @@ MESSAGE_BYTES: Final = 300
 """What a message takes besides its content."""
 AHEAD_NS: Final = 2 * SECOND
 """While moments follow one another, so much after the last one is read before it is asked for."""
-MOST_TEXT: Final = 160
+MAX_TEXT: Final = 160
 MAX_MARKS: Final = 500
 MAX_OFFSETS: Final = 8
 """Between stamp and arrival, in the messages about a moment."""
@@ -189,7 +189,7 @@ class PastReader:
         sensor = str(asked['sensor'])
         offered = offers(self._kept, robot, begin_ns, end_ns).get(sensor)
         if offered is None or not offered.objects:
-            raise PullRefused(f'{robot} keeps nothing of {visible(sensor)[:MOST_TEXT]} in this time')
+            raise PullRefused(f'{robot} keeps nothing of {visible(sensor)[:MAX_TEXT]} in this time')
         return {'id': self._kept.ask(robot, KeptFilter(sensor=sensor, since_ns=begin_ns, until_ns=end_ns), by)}
 
     # -- a time ----------------------------------------------------------------------------------------------------
@@ -805,7 +805,7 @@ def _space(value: Any) -> Any:
 
 def _checked(values: Mapping[Any, Any]) -> Mapping[str, float]:
     """Raises ValueError for names that are none: those of joints are in the message."""
-    if len(values) > MAX_COLUMNS or not all(isinstance(name, str) and len(name) <= MOST_TEXT for name in values):
+    if len(values) > MAX_COLUMNS or not all(isinstance(name, str) and len(name) <= MAX_TEXT for name in values):
         raise ValueError('too many figures, or their names are none')
     return {name: float(value) for name, value in values.items()}
 
@@ -815,7 +815,7 @@ def _where(one: PastObject) -> str:
     return f'{"the spool" if is_here else "the store"}: {one.bucket}/{one.key}'
 
 
-def _text(text: str, most: int = MOST_TEXT) -> str:
+def _text(text: str, most: int = MAX_TEXT) -> str:
     return visible(text[:most].encode(errors='replace').decode())
 
 

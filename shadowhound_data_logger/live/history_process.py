@@ -16,7 +16,7 @@ from shadowhound_data_logger.core.errors import DataLoggerError
 IDLE_S: Final = 60.0
 ANSWER_S: Final = 45.0
 """A question that takes longer ends the process."""
-MOST_WAITING: Final = 8
+MAX_WAITING: Final = 8
 """Questions; who asks more is told to wait."""
 MAX_ANSWER: Final = 96 << 20
 
@@ -48,7 +48,7 @@ class HistoryProcess:
 
     async def ask(self, asked: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
         """Head and body of the answer. Raises PastUnavailable."""
-        if self._waiting >= MOST_WAITING:
+        if self._waiting >= MAX_WAITING:
             raise PastUnavailable('too many ask for the past at once')
         self._waiting += 1
         try:

@@ -103,7 +103,7 @@ class SpoolKept:
             {'key': key, 'sensor': sensor, 'topic': topic, 'bytes': size, 't_start_ns': start_ns, 't_end_ns': last_ns,
              'received_start_ns': received_ns, 'received_end_ns': received_end_ns, 'where': ON_ROBOT}
             for _, key, _, _, sensor, topic, _, size, start_ns, last_ns, received_ns, received_end_ns, *_ in found
-            if want.takes(key, sensor, topic, start_ns, last_ns, {})
+            if want.matches(key, sensor, topic, start_ns, last_ns, {})
         ]  # fmt: skip
 
     def mbps(self, robot: str) -> float | None:

@@ -36,7 +36,7 @@ _SIDE: Final = {HALF: 2, SMALLEST: 4}
 _QUALITY: Final = {FULL: 75, HALF: 60, SMALLEST: 45}
 _EVERY: Final = {FULL: 1, HALF: 4, SMALLEST: 16}
 """Which points of a smaller cloud are kept."""
-MOST_POINTS: Final = 200_000
+MAX_POINTS: Final = 200_000
 """Of a cloud that is sent; of a larger one each second, third, ... is."""
 _COLORSPACES: Final = {
     'bgr8': 'BGR', 'rgb8': 'RGB', 'bgra8': 'BGRA', 'rgba8': 'RGBA', 'mono8': 'GRAY', '8UC1': 'GRAY', '8UC3': 'BGR',
@@ -53,7 +53,7 @@ _ENDS: Final = tuple(
 )
 """Where the colors of such an image may end, so that they rarely change."""
 _AXES: Final = ('x', 'y', 'z')
-MOST_NAMES, MAX_NAME = 64, 64
+MAX_NAMES, MAX_NAME = 64, 64
 """Figures in a row, and letters in the name of one."""
 _FAR: Final = 1e7
 """Metres: no point of a robot's lidar is further from where its frame begins."""
@@ -185,7 +185,7 @@ def _odometry_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
 
 
 def _joints(message: Any) -> dict[str, float]:
-    names = (name[:MAX_NAME] for name in message.name[:MOST_NAMES])
+    names = (name[:MAX_NAME] for name in message.name[:MAX_NAMES])
     return dict(zip(names, map(float, message.position), strict=False))
 
 
@@ -194,7 +194,7 @@ def _joints_table(cdrs: Sequence[bytes]) -> tuple[list[str], bytes] | None:
     for cdr in cdrs:
         begin = place = _after_text(cdr, _FRAME_ID)
         (count,) = _LENGTH.unpack_from(cdr, place)
-        if cdr[1] != _LITTLE or not 0 < count <= MOST_NAMES:
+        if cdr[1] != _LITTLE or not 0 < count <= MAX_NAMES:
             return None
         place += 4
         for _ in range(count):
@@ -402,7 +402,7 @@ def _color_table(end: float) -> NDArray[Any]:
 def clouds(topic: str, types: MessageTypes, at_ms: float, cdr: bytes, sizes: Sequence[int]) -> Iterator[LiveItem]:
     """A cloud's finite points in each size that is asked for: x, y, z as uint16, meters are ``low + value * step``."""
     cloud = types.deserialize(POINT_CLOUD, memoryview(cdr))
-    xyz = xyz_of(cloud, max(1, -(-cloud.width * cloud.height // MOST_POINTS)))
+    xyz = xyz_of(cloud, max(1, -(-cloud.width * cloud.height // MAX_POINTS)))
     if xyz is None:
         raise Rejected('size_mismatch', 'a cloud without x, y and z as float32, or with another number of bytes than it says')
     yield from points_items(topic, at_ms, xyz, cloud.header.frame_id, sizes)

@@ -31,7 +31,7 @@ from shadowhound_data_logger.core.errors import BagDamaged, LakeError, SpoolErro
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.options import UploadSettings
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, MOST_OBJECT_BYTES, is_path
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, MAX_OBJECT_BYTES, is_path
 from shadowhound_data_logger.formats.mcap.ranges import LocalFile, Ranged, StoredFile
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.formats.rows.gaps import GAP
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
     from shadowhound_data_logger.stores.base import ObjectStore
 
-MOST_ROWS: Final = 1_500_000
+MAX_ROWS: Final = 1_500_000
 """Of a day: a robot that stores every message of everything makes some 600,000."""
 MAX_DAYS_KEPT: Final = 3
 FRESH_S: Final = 10.0
@@ -243,7 +243,7 @@ class PastContents:
         if self._store is not None:
             self._store.close()
 
-    def get(self, one: PastObject, most: int = MOST_OBJECT_BYTES) -> bytes:
+    def get(self, one: PastObject, most: int = MAX_OBJECT_BYTES) -> bytes:
         """Raises StoreError, LakeError for a key that is none."""
         kept = self._kept.get(one.key)
         if kept is not None:
@@ -280,7 +280,7 @@ class PastContents:
         if one is None:
             return None
         try:
-            return Manifest.from_json(self.get(one, MOST_DOCUMENT_BYTES), one.key)
+            return Manifest.from_json(self.get(one, MAX_DOCUMENT_BYTES), one.key)
         except (BagDamaged, StoreError, LakeError):
             return None
 
@@ -562,10 +562,10 @@ class StorePast:
             begin_ns = date_ns(date)
             where, has_date = f't_start_ns >= {begin_ns} AND t_start_ns < {begin_ns + DAY_NS}', schema.UNDATED.__ne__
         table = rows_of(self._source, schema.OBJECTS, findings, robot=robot, has_date=has_date, where=where,
-                        columns=_COLUMNS, order='t_start_ns, key', limit=MOST_ROWS, by=by)  # fmt: skip
+                        columns=_COLUMNS, order='t_start_ns, key', limit=MAX_ROWS, by=by)  # fmt: skip
         left = [f'{one.key}: {one.why}' for one in findings][:3]
         problem = f'{len(findings)} parts of the catalog cannot be read, such as {left[0]}' if left else ''
-        return PastDay(table, problem or ('this is not all of the day' if len(table) >= MOST_ROWS else ''))
+        return PastDay(table, problem or ('this is not all of the day' if len(table) >= MAX_ROWS else ''))
 
     def gaps(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, Any]:
         """Raises StoreError."""

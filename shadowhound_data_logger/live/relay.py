@@ -25,7 +25,7 @@ import orjson
 
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.access import TokenRefused, token_of
-from shadowhound_data_logger.live.kinds import FULL, KINDS, MOST_NAMES, LiveItem, check_jpeg
+from shadowhound_data_logger.live.kinds import FULL, KINDS, MAX_NAMES, LiveItem, check_jpeg
 from shadowhound_data_logger.live.panels import BULK
 from shadowhound_data_logger.live.viewer import ACKNOWLEDGED, SMALL_LANE
 
@@ -277,7 +277,7 @@ def _check(kind: str, head: Mapping[str, Any], body: bytes) -> None:
             raise ValueError('its cloud is none')
     elif kind in _SERIES:
         names = head['names']
-        if not (isinstance(names, list) and len(names) <= MOST_NAMES and all(isinstance(name, str) for name in names)):
+        if not (isinstance(names, list) and len(names) <= MAX_NAMES and all(isinstance(name, str) for name in names)):
             raise ValueError('its figures have no names')
         if int(head['rows']) * (8 + 4 * len(names)) != len(body):
             raise ValueError('its figures are not as many as it says')

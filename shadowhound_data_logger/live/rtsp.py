@@ -28,7 +28,7 @@ SCRIPT: Final = Path(__file__).with_name('rtsp_process.py')
 USER: Final = 'viewer'
 START_S: Final = 20.0
 AGAIN_S: Final = 5.0
-MOST_SIDE: Final = 2040
+MAX_SIDE: Final = 2040
 PYTHON: Final = Path('/usr/bin/python3')
 """Of the system."""
 MAX_WAITING: Final = 4 << 20
@@ -211,8 +211,8 @@ def unsuited(jpeg: bytes) -> str:
         height, width, _, sampling = simplejpeg.decode_jpeg_header(jpeg)
     except ValueError as error:
         return f'it is no JPEG: {error}'
-    if width % 8 or height % 8 or max(width, height) > MOST_SIDE:
-        return f'{width} x {height} pixels; RFC 2435 has multiples of 8 up to {MOST_SIDE}'
+    if width % 8 or height % 8 or max(width, height) > MAX_SIDE:
+        return f'{width} x {height} pixels; RFC 2435 has multiples of 8 up to {MAX_SIDE}'
     if sampling not in ('420', '422'):
         return f'its colors are sampled as {sampling}; RFC 2435 has 420 and 422'
     return '' if _coding(jpeg) == _BASELINE else 'it is no baseline JPEG'

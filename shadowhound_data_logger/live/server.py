@@ -230,7 +230,7 @@ class LiveServer:
             began_s = time.monotonic()
             self._drop_silent()
             if self._topics is not None:
-                self._topics.worker.look()
+                self._topics.worker.poll()
             if self.viewers.connected and not self._settings.is_of_store:
                 try:
                     await self._tell_figures(with_ledger=rounds % LEDGER_EVERY == 0)

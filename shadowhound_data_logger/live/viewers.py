@@ -247,7 +247,7 @@ class Viewers:
         is_watched = self.connected or self._cameras.rtsp is not None
         self.wanted = {topic: frozenset(sizes) for topic, sizes in wanted.items()} if is_watched else None
         if self.wanted is None and before is not None:
-            heap.give_back()
+            heap.trim()
         self._kept = {key: item for key, item in self._kept.items() if self.wanted and key[0] in self.wanted}
         if self.wanted != before:
             self._wake()

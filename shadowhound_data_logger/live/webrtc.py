@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 MAX_PEERS: Final = 8
 MAX_ENCODED: Final = 2
 """Topics that are encoded at a time."""
-MOST_SIDE: Final = 1920
+MAX_SIDE: Final = 1920
 """Pixels; of a larger frame no more is encoded than these."""
 CLOCK_HZ: Final = 90_000
 """Of RTP timestamps of video (RFC 7741)."""
@@ -49,7 +49,7 @@ RATE_SHARE: Final = 0.85
 """Of what a receiver says that its link carries."""
 RAISE_EVERY_S: Final = 4.0
 """A new rate begins with a key frame, so a better one waits."""
-MOST_WAITING: Final = 10
+MAX_WAITING: Final = 10
 """Packets of a peer whose turn does not come; then it goes on with the next key frame."""
 CONNECT_S: Final = 10.0
 VP8: Final = 'video/VP8'
@@ -161,13 +161,13 @@ class _Vp8Encoder:
 
 
 def _frame(jpeg: bytes) -> Any:
-    """A frame (av.VideoFrame, yuv420p) with even sides of at most MOST_SIDE pixels. Raises ValueError."""
+    """A frame (av.VideoFrame, yuv420p) with even sides of at most MAX_SIDE pixels. Raises ValueError."""
     height, width, *_ = simplejpeg.decode_jpeg_header(jpeg)
     check_pixels(width, height)
-    least = -(-max(height, width) // MOST_SIDE)
+    least = -(-max(height, width) // MAX_SIDE)
     pixels = simplejpeg.decode_jpeg(jpeg, 'RGB', fastdct=True, fastupsample=True,
                                     min_height=height // least, min_width=width // least)  # fmt: skip
-    every = -(-max(pixels.shape[:2]) // MOST_SIDE)
+    every = -(-max(pixels.shape[:2]) // MAX_SIDE)
     pixels = pixels[::every, ::every]
     height, width = (side - side % 2 for side in pixels.shape[:2])
     if not height or not width:
@@ -201,7 +201,7 @@ class _PacketTrack(MediaStreamTrack):  # type: ignore[misc]
     def offer(self, encoded: _Encoded) -> None:
         if not self._is_asked:
             return
-        if self._waiting.qsize() >= MOST_WAITING:
+        if self._waiting.qsize() >= MAX_WAITING:
             while not self._waiting.empty():
                 self._waiting.get_nowait()
             self._needs_key = True

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import Clock
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.errors import SpoolError, StoreUnavailable
@@ -62,12 +62,12 @@ def objects_of(record: Mapping[str, Any], start: Mapping[str, Any], folder: Miss
     """
     kind, robot, files = record.get('k'), start['robot'], files or folder.files
     home = f'{robot}/missions/{run.run_id if run else folder.mission_id}'
-    metadata = {words.ROBOT: robot, words.MISSION_ID: folder.mission_id, words.MISSION_TYPE: start['type']}
-    metadata |= {words.RUN_ID: run.run_id} if run else {}
+    metadata = {meta.ROBOT: robot, meta.MISSION_ID: folder.mission_id, meta.MISSION_TYPE: start['type']}
+    metadata |= {meta.RUN_ID: run.run_id} if run else {}
     time_ns = int(record.get('t', 0))
     if kind == 'frame':
         number, path = int(record['id']), files / record['file']
-        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, words.FRAME_ID: str(number)}
+        key, more = f'{home}/camera/frame_{number:06d}.jpg', {**record.get('marks', {}), **metadata, meta.FRAME_ID: str(number)}
         yield from _item(path, BUCKET, key, time_ns, more, is_disposable=not record.get('artifact'))
     elif kind == 'trajectory':
         yield from _trajectory(files / record['file'], home, start, time_ns, metadata)
@@ -97,7 +97,7 @@ def _item(path: Path, bucket: str, key: str, time_ns: int, metadata: Mapping[str
         bucket=bucket, key=key, body=body, content_type=CONTENT_TYPES[extension], sensor='missions', topic=None, type='',
         samples=0, t_start_ns=time_ns, t_end_ns=time_ns, priority=FRAME_PRIORITY if is_frame else 1,
         protected=not is_frame, metadata=metadata,
-        held=None if words.RUN_ID in metadata else held_reason(metadata[words.MISSION_ID]),
+        held=None if meta.RUN_ID in metadata else held_reason(metadata[meta.MISSION_ID]),
     )  # fmt: skip
     yield MissionObject(content, path, is_disposable)
 
@@ -134,7 +134,7 @@ class Spooler:
             found = spool.held(held_reason(mission_id))
             spool.bind([
                 Binding(item.id, item.key.replace(f'/missions/{mission_id}/', f'/missions/{run_id}/', 1),
-                        {**item.metadata, words.RUN_ID: run_id}, item.t_start_ns, item.t_end_ns)
+                        {**item.metadata, meta.RUN_ID: run_id}, item.t_start_ns, item.t_end_ns)
                 for item in found
             ])  # fmt: skip
         return bool(found)

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND
-from shadowhound_data_logger.core.untrusted import check_commas, csv_encoding
+from shadowhound_data_logger.core.untrusted import check_separator, csv_encoding
 from shadowhound_data_logger.missions.folder import MissionFolder, read_json, write_json
 from shadowhound_data_logger.missions.state import BATTERY, TEMPERATURE, policy_list
 
@@ -168,7 +168,7 @@ def read_path(path: Path) -> list[tuple[float, float, float]]:
     with path.open(encoding=encoding, errors='replace', newline='') as file:
         lines = csv.reader(line.replace('\0', '') for line in file)
         names = [name.strip().lower() for name in next(lines, [])]
-        check_commas(','.join(names))
+        check_separator(','.join(names))
         places = [names.index(name) for name in ('timestamp', 'x', 'y')]
         for line in lines:
             try:

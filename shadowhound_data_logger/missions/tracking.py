@@ -19,7 +19,7 @@ from typing import Any, Final, Protocol
 
 from shadowhound_data_logger.core.config import ENDPOINTS
 from shadowhound_data_logger.core.errors import TrackingRefused, TrackingUnavailable
-from shadowhound_data_logger.core.tls import causes, distrust
+from shadowhound_data_logger.core.tls import causes, certificate_problem
 from shadowhound_data_logger.missions.folder import Run
 from shadowhound_data_logger.missions.state import Point
 
@@ -252,11 +252,11 @@ class MlflowTracking:
             text = f'{self.where} {what}: {_USER.sub("//", str(error))[:500]}'
             if code in REFUSALS and is_own:
                 raise TrackingRefused(text, code=code) from error
-            self._raise_distrust(error)
+            self._raise_certificate_problem(error)
             of_object = code in REFUSALS or _is_of_object(error)
             raise TrackingUnavailable(text, remedy=remedy_for(code), code=code, of_object=of_object) from error
         except Exception as error:  # clients and artifact stores raise many types (a captive portal's page is not JSON)
-            self._raise_distrust(error)
+            self._raise_certificate_problem(error)
             text = f'{self.where} {what}: {type(error).__name__}: {_USER.sub("//", str(error))[:500]}'
             status = _status(error)
             if status == TOO_LARGE:
@@ -266,10 +266,10 @@ class MlflowTracking:
             remedy = remedy_for(code) if code else remedy or remedy_for('')
             raise TrackingUnavailable(text, remedy=remedy, code=code, of_object=_is_of_object(error)) from error
 
-    def _raise_distrust(self, error: Exception) -> None:
+    def _raise_certificate_problem(self, error: Exception) -> None:
         """Raises TrackingUnavailable if the certificate of the server or of the artifact store is not trusted."""
         bundle = 'MLFLOW_TRACKING_SERVER_CERT_PATH (AWS_CA_BUNDLE if artifacts are sent to the S3 server itself)'
-        if found := distrust(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
+        if found := certificate_problem(error, self.where, bundle=bundle, address='MLFLOW_TRACKING_URI'):
             raise TrackingUnavailable(found[0], remedy=found[1], code='CERTIFICATE') from error
 
 

@@ -143,7 +143,7 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
 
     ``arguments`` are those of ROS, without the program's name; ``robot`` is the environment before we changed it.
     """
-    heap.bound()
+    heap.limit_arenas()
     try:
         if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
             return refuse(rest)
@@ -234,7 +234,7 @@ def log_until(stop: StopSignals, ros: Ros) -> None:
             service.alive()
             if time.monotonic() - given_back_s > GIVE_BACK_S:
                 given_back_s = time.monotonic()
-                heap.give_back()
+                heap.trim()
     finally:
         service.stopping()
         node.get_logger().info('closing: open batches are finished and delivered')

@@ -19,7 +19,7 @@ from shadowhound_data_logger.bags.naming import BAGS
 from shadowhound_data_logger.bags.queue import BagQueue
 from shadowhound_data_logger.bags.recorder import Recorder
 from shadowhound_data_logger.bags.recovery import BagRecovery
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings
@@ -256,7 +256,7 @@ class Pipeline:
             return
         self._due_s = now_s + PERIOD_S
         self._name_held()
-        self.uploader.wait_for(self._rules.look())
+        self.uploader.wait_for(self._rules.poll())
         self.recorder.check_clock()
         self._spool_parts(self._catalog.due)
         self._look_at_link()
@@ -273,7 +273,7 @@ class Pipeline:
     def _supervise(self) -> bool:
         """Start threads again that died; whether any thread failed since the last time."""
         for worker in self._stages.workers:
-            worker.look()
+            worker.poll()
         before, self._failures = self._failures, sum(worker.failures for worker in self._stages.workers)
         return self._failures != before
 
@@ -336,7 +336,7 @@ class Pipeline:
             self._catalog.expedite()
 
     def _tell(self, *, ended: bool = False) -> None:
-        status = self._status.look(ended=ended)
+        status = self._status.poll(ended=ended)
         if status is not None:
             self._status.write(status)
             if self._interface is not None:
@@ -362,7 +362,7 @@ class Pipeline:
 
     def _look_at_link(self, *, is_last: bool = False) -> None:
         """How fast uploads go where the robot is, where somebody may ask for more of them."""
-        found = self._link.look(is_last=is_last) if self._link is not None else None
+        found = self._link.poll(is_last=is_last) if self._link is not None else None
         if found is not None:
             self.writer.put(found, wait=False)
 
@@ -383,5 +383,5 @@ class Pipeline:
         return DataObject(
             bucket=LEDGER_BUCKET, key=dated(pattern, now_ns), key_pattern=pattern,
             body=json.dumps(content, indent=1).encode(), content_type='application/json', sensor='_ledger', topic=None,
-            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={words.ROBOT: robot},
+            type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True, metadata={meta.ROBOT: robot},
         )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import PolicyError, PolicyRefused
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size, from_json
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, check_size, from_json
 from shadowhound_data_logger.policies.manifest import MANIFEST, PolicyManifest
 
 MAX_HEADER_BYTES: Final = 1 << 20
@@ -66,7 +66,7 @@ def check_content(path: Path, name: str) -> None:
 
 
 def _check_json(path: Path) -> None:
-    check_size(path.stat().st_size, MOST_DOCUMENT_BYTES)
+    check_size(path.stat().st_size, MAX_DOCUMENT_BYTES)
     from_json(path.read_bytes())
 
 

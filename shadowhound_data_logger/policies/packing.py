@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import ForeignObject, PolicyError, PolicyRefused
 from shadowhound_data_logger.core.model import SpooledObject
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.core.untrusted import from_json
 from shadowhound_data_logger.policies.content import check_content, check_files
 from shadowhound_data_logger.policies.manifest import (
@@ -165,7 +165,7 @@ def publish(packed: Path, store: ObjectStore, registry: MlflowRegistry, reposito
         size, sha256 = fingerprint(packed / name)
         item = _item(f'{folder}/{name}', packed / name, size, sha256)
         try:
-            steadily(lambda item=item: store.put(item))  # type: ignore[misc]
+            with_retries(lambda item=item: store.put(item))  # type: ignore[misc]
         except ForeignObject as error:
             text = f'the store already has a different {manifest.name}@{manifest.version}: {error.what}'
             raise PolicyError(text, remedy=remedy) from error
@@ -197,4 +197,4 @@ def _content(packed: Path) -> bytes:
 def _item(key: str, path: Path, size: int, sha256: str) -> SpooledObject:
     kind = 'application/json' if path.suffix == '.json' else 'application/octet-stream'
     return SpooledObject(id=0, bucket=BUCKET, key=key, path=path, size=size, sha256=sha256, content_type=kind,
-                         metadata={words.SENSOR: 'policy'}, priority=5, created_ns=time.time_ns())  # fmt: skip
+                         metadata={meta.SENSOR: 'policy'}, priority=5, created_ns=time.time_ns())  # fmt: skip

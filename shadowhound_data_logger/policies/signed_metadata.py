@@ -18,7 +18,7 @@ from tuf.api.metadata import Metadata, Root, Signed, Snapshot, Targets, Timestam
 from shadowhound_data_logger.core import durable_files
 from shadowhound_data_logger.core.errors import ForeignObject, ObjectRefused, PolicyError
 from shadowhound_data_logger.core.model import SpooledObject
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.policies.keys import SIGNED_DAYS, in_days
 from shadowhound_data_logger.policies.manifest import BUCKET
 from shadowhound_data_logger.policies.roots import NEXT, ONLINE, PENDING, ROOT_ROLE, TARGETS, next_root, read_root, signatures
@@ -177,7 +177,7 @@ class SignedMetadata:
     def _get_object(self, name: str) -> tuple[bytes, str]:
         """Content and ETag of an object, empty if it does not exist. An object larger than any metadata is deleted."""
         try:
-            return steadily(lambda: self._store.changed(BUCKET, f'{METADATA}/{name}', '', MAX_METADATA_BYTES)) or (b'', '')
+            return with_retries(lambda: self._store.changed(BUCKET, f'{METADATA}/{name}', '', MAX_METADATA_BYTES)) or (b'', '')
         except ObjectRefused as error:
             if error.data.get('reason') == 'size':
                 self._store.delete(BUCKET, f'{METADATA}/{name}')
@@ -188,7 +188,7 @@ class SignedMetadata:
     def _get(self, name: str) -> bytes | None:
         """The content of an object; None if it does not exist, empty if it is too large."""
         try:
-            return steadily(lambda: self._store.get(BUCKET, f'{METADATA}/{name}', MAX_METADATA_BYTES))
+            return with_retries(lambda: self._store.get(BUCKET, f'{METADATA}/{name}', MAX_METADATA_BYTES))
         except ObjectRefused as error:
             return None if error.data.get('reason') == 'missing' else b''
 
@@ -245,7 +245,7 @@ class SignedMetadata:
                              sha256=hashlib.sha256(body).hexdigest(), content_type='application/json', metadata={}, priority=5,
                              created_ns=time.time_ns())  # fmt: skip
         try:
-            steadily(lambda: self._store.put(item))
+            with_retries(lambda: self._store.put(item))
         except ForeignObject:
             return False
         finally:

@@ -20,7 +20,7 @@ from shadowhound_data_logger.core import durable_files
 from shadowhound_data_logger.core.errors import DataLoggerError, ObjectRefused, PolicyError, PolicyRefused, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.core.options import GIBI
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.policies import trust
 from shadowhound_data_logger.policies.content import files_of
 from shadowhound_data_logger.policies.folder import PolicyFolder
@@ -247,7 +247,7 @@ class PolicySync:
 
     def _get(self, key: str, limit: int, traffic: _Traffic) -> bytes:
         try:
-            content = steadily(lambda: self.store.get(BUCKET, key, limit), pause=self.pause)
+            content = with_retries(lambda: self.store.get(BUCKET, key, limit), pause=self.pause)
         except ObjectRefused as error:
             reason = 'size' if error.data.get('reason') == 'size' else 'missing'
             raise PolicyRefused(reason, f'{error.what}') from error

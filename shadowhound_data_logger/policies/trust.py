@@ -19,7 +19,7 @@ from urllib.parse import unquote
 from shadowhound_data_logger.core import durable_files
 from shadowhound_data_logger.core.clock import FUTURE_SLACK_NS, SECOND, utc
 from shadowhound_data_logger.core.errors import AccessDenied, ObjectRefused, PolicyError, PolicyRefused
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.policies.manifest import BUCKET, PREFIX
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -76,7 +76,7 @@ def refresh(folder: Path, store: ObjectStore, received: Callable[[int], None], p
 
         def _fetch(self, url: str) -> Iterator[bytes]:
             try:
-                body = steadily(lambda: store.get(BUCKET, unquote(url), MAX_METADATA_BYTES), pause=pause)
+                body = with_retries(lambda: store.get(BUCKET, unquote(url), MAX_METADATA_BYTES), pause=pause)
             except ObjectRefused as error:
                 if error.data.get('reason') != 'missing':
                     raise PolicyRefused('untrusted', error.what) from error

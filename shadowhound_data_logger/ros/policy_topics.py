@@ -50,10 +50,10 @@ class PolicyTopics:
         latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(String, '~/policy', latched)
         self._subscription = node.create_subscription(String, '~/health', self._on_health, 10)
-        self._timer = node.create_timer(LOOK_S, self.look)
-        self.look()
+        self._timer = node.create_timer(LOOK_S, self.poll)
+        self.poll()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Publish the active version if it is another one."""
         now = self._folder.current() or ''
         if now != self._told:
@@ -89,7 +89,7 @@ class PolicyTopics:
                             self._folder.current() or 'none')  # fmt: skip
         except (DataLoggerError, OSError) as error:
             log.warning('%s cannot be judged: %s', name, error)
-        self.look()
+        self.poll()
         return ''
 
 

@@ -14,7 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import Clock, utc
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.errors import NameRefused
@@ -29,7 +29,7 @@ from shadowhound_data_logger.spool import clock_record
 from shadowhound_data_logger.spool.gaps import Gap, Watermark
 from shadowhound_data_logger.spool.index import Index
 
-MOST_ROWS: Final = 2000
+MAX_ROWS: Final = 2000
 """At a time: 60 ms of CPU without their statistics, and 10 MB of memory. Further rows are written by the next call."""
 OBJECTS_A_PART: Final = 400
 """Objects per file of statistics. While it is made, those of one object take tens of KB of memory."""
@@ -76,7 +76,7 @@ class CatalogWriter:
             self._kept_due_s = now_s + KEPT_S
             return self._kept_parts()
         made = self.parts()
-        if sum(len(part.catalogs) for part in made) < MOST_ROWS and not self._gaps.has_more:
+        if sum(len(part.catalogs) for part in made) < MAX_ROWS and not self._gaps.has_more:
             self._due_s = now_s + self._settings.period_s
         return made
 
@@ -97,7 +97,7 @@ class CatalogWriter:
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            listed = index.catalog.uncataloged(MOST_ROWS)
+            listed = index.catalog.uncataloged(MAX_ROWS)
         there = {item.id for item in listed}
         # A file removes all of its rows from the list at once: if one is missing there without the others, it is in another file.
         self._handed = [numbers for numbers in self._handed if numbers <= there]
@@ -126,7 +126,7 @@ class CatalogWriter:
             return []
         with closing(Index(self._spool / 'index.db', read_only=True)) as index:
             index.open()
-            listed = index.catalog.unreported(MOST_ROWS)
+            listed = index.catalog.unreported(MAX_ROWS)
         there = {(item.id, state) for state, _, item in listed}
         self._told = [told for told in self._told if told <= there]
         handed = frozenset[tuple[int, str]]().union(*self._told)
@@ -140,7 +140,7 @@ class CatalogWriter:
         for robot, date, found in parts.by_folder(rows):
             told = tuple((new[place][2].id, new[place][0]) for place, _ in found)
             part = self._part(robot, date, found, KEPT)
-            made.append(replace(part, catalogs=(), tells=told))
+            made.append(replace(part, catalogs=(), reports=told))
             self._told.append(frozenset(told))
         return made
 
@@ -152,7 +152,7 @@ class CatalogWriter:
         return DataObject(
             bucket=BUCKET, key=of.part_key(robot, date, name), body=parts.encode(rows, of), content_type=parts.CONTENT_TYPE,
             sensor=SENSOR, topic=None, type='', samples=0, t_start_ns=min(times), t_end_ns=max(times), priority=PRIORITY,
-            protected=True, metadata={words.ROBOT: robot, words.COUNT: str(len(rows))},
+            protected=True, metadata={meta.ROBOT: robot, meta.COUNT: str(len(rows))},
             catalogs=tuple(number for number, _ in found) if of is OBJECTS else (),
         )  # fmt: skip
 
@@ -201,8 +201,8 @@ class _GapParts:
                 if is_dated_now or is_new_index or again != self._again or not self._missing <= before:
                     self._version, self._again = 0, again
                     self._marks.clear()
-                found = index.gaps.changed(self._version, MOST_ROWS, offsets)
-                self.has_more = bool(found) and found[-1].version < newest and len(found) >= MOST_ROWS
+                found = index.gaps.changed(self._version, MAX_ROWS, offsets)
+                self.has_more = bool(found) and found[-1].version < newest and len(found) >= MAX_ROWS
                 # A watermark must not be in the store before the gaps that precede it.
                 is_waiting = index.catalog.has_waiting(BUCKET, GAPS.prefix(self._robot), sensor=SENSOR, priority=PRIORITY)
                 marks = [] if self.has_more or is_waiting else index.gaps.watermarks()
@@ -230,7 +230,7 @@ class _GapParts:
     def _row(self, gap: Gap, began_ns: int) -> Statement:
         """After a damaged index, versions start from 0, but revisions keep growing, because the new index began later."""
         is_dated = gap.boot_id is None or gap.from_ns is not None
-        clock = None if gap.boot_id is None else words.SET_LATER if is_dated else words.UNSET
+        clock = None if gap.boot_id is None else meta.SET_LATER if is_dated else meta.UNSET
         name = name_of(
             gap.began_ns, gap.sink, gap.topic, gap.kind, gap.cause, gap.grade, gap.publisher, gap.mission_id, gap.begin_ns
         )
@@ -251,11 +251,11 @@ class _GapParts:
         made = []
         for date, found in groupby(sorted(rows, key=date_of), key=date_of):
             some = list(found)
-            metadata = {words.ROBOT: self._robot, words.COUNT: str(len(some))}
+            metadata = {meta.ROBOT: self._robot, meta.COUNT: str(len(some))}
             made.append(DataObject(
                 bucket=BUCKET, key=GAPS.part_key(self._robot, date, name), body=parts.encode(some, GAPS),
                 content_type=parts.CONTENT_TYPE, sensor=SENSOR, topic=None, type='', samples=0,
                 t_start_ns=now_ns, t_end_ns=now_ns, priority=PRIORITY, protected=True, metadata=metadata,
             ))  # fmt: skip
-        made[-1] = replace(made[-1], metadata={**made[-1].metadata, words.GAP_VERSION: str(version)})
+        made[-1] = replace(made[-1], metadata={**made[-1].metadata, meta.GAP_VERSION: str(version)})
         return made

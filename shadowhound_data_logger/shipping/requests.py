@@ -18,7 +18,7 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Protocol
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, Clock, iso
 from shadowhound_data_logger.core.config import KeepSettings
 from shadowhound_data_logger.core.dataclass_json import as_plain
@@ -28,7 +28,7 @@ from shadowhound_data_logger.core.mailbox import (
     DEFAULT_PRIORITY,
     LATEST_NS,
     MAILBOX_BUCKET,
-    MOST_INBOX_BYTES,
+    MAX_INBOX_BYTES,
     LostObject,
     ObjectCount,
     PullCancel,
@@ -67,7 +67,7 @@ WINDOW_S: Final = 5.0
 """The same in seconds of the link, but one object always may go."""
 WINDOW_BYTES: Final = 4 << 20
 """The same where the pace of the link is not known."""
-MIN_WINDOW, MOST_WINDOW = 1 << 20, 16 << 20
+MIN_WINDOW, MAX_WINDOW = 1 << 20, 16 << 20
 """In bytes."""
 TELL_S: Final = 30.0
 """Between two answers of how far a request is."""
@@ -125,7 +125,7 @@ class RequestServer:
                  mbps: Callable[[], float | None] = lambda: None, may_send: Callable[[], bool] = lambda: True,
                  finished: Callable[[], None] = lambda: None, thin: Callable[[], bool] = lambda: False,
                  monotonic: Callable[[], float] = time.monotonic) -> None:  # fmt: skip
-        """``put`` takes answers to be spooled, ``released`` receives objects that may be shipped; ``mbps`` is the pace.
+        """``put`` matches answers to be spooled, ``released`` receives objects that may be shipped; ``mbps`` is the pace.
 
         While not ``may_send``, requests are accepted and nothing is released for them. ``finished`` is called when all objects of
         a request are in the store: a client may wait for that. ``thin`` makes room for what is kept, a little at a time.
@@ -241,7 +241,7 @@ class RequestServer:
     def _poll(self) -> None:
         """Look into the mailbox; a store that is away, or has none, is asked again."""
         try:
-            found = self._store.changed(MAILBOX_BUCKET, inbox_key(self._robot), self._version, MOST_INBOX_BYTES)
+            found = self._store.changed(MAILBOX_BUCKET, inbox_key(self._robot), self._version, MAX_INBOX_BYTES)
             if found is not None and self._read(found[0]):
                 self._version = found[1]
         except ObjectRefused as error:
@@ -300,7 +300,7 @@ class RequestServer:
         gone: dict[str, list[KeptObject]] = {request.id: [] for request in new}
         for item in self._spool.requests.selectable():
             for request in new:
-                if request.want.takes(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
+                if request.want.matches(item.key, item.sensor, item.topic, item.t_start_ns, item.t_end_ns, item.metadata):
                     if item.is_here:
                         size = request.want.bytes_of(item.key, item.sensor, item.bytes, item.t_start_ns, item.t_end_ns,
                                                      item.metadata)  # fmt: skip
@@ -336,7 +336,7 @@ class RequestServer:
     def _release(self, rows: Sequence[RequestRow]) -> bool:
         """Let the next objects wait for delivery; whether there are any."""
         mbps = self._mbps()
-        window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), MIN_WINDOW), MOST_WINDOW)
+        window = WINDOW_BYTES if mbps is None else min(max(round(WINDOW_S * mbps * 125_000), MIN_WINDOW), MAX_WINDOW)
         count, size = self._spool.requests.released()
         if not rows or count > WINDOW // 2 or size > window // 2:
             return False
@@ -457,7 +457,7 @@ class RequestServer:
             bucket=MAILBOX_BUCKET, key=answer_key(self._robot, row.id, number),
             body=json.dumps(as_plain(answer), indent=1).encode(), content_type='application/json', sensor=ANSWERS, topic=None,
             type='', samples=0, t_start_ns=now_ns, t_end_ns=now_ns, priority=0, protected=True,
-            metadata={words.ROBOT: self._robot}, answers=(row.id, number, row.state),
+            metadata={meta.ROBOT: self._robot}, answers=(row.id, number, row.state),
         ))  # fmt: skip
 
 

@@ -79,9 +79,9 @@ class Uploader:
         self._monotonic = monotonic
         self._rng = rng or random.Random()
         self._schedule = Schedule(settings.threads, settings.backoff_s, monotonic, self._rng, store.pace.bytes_in)
-        told: set[str] = set()
-        self._threads = [Worker(f'upload-{n}', self._round, told=told) for n in range(settings.threads)]
-        self._keeper = Worker('upload-lock', self._keep_lock, told=told)
+        reported: set[str] = set()
+        self._threads = [Worker(f'upload-{n}', self._round, reported=reported) for n in range(settings.threads)]
+        self._keeper = Worker('upload-lock', self._keep_lock, reported=reported)
         self._ended = threading.Event()
         self._lock = threading.Lock()  # guards the counter below
         self._quarantined: Counter[tuple[str, str]] = Counter()
@@ -189,9 +189,9 @@ class Uploader:
         if isinstance(step, Rest):
             self._schedule.rest(step)
         elif isinstance(step, Look):
-            look = partial(self._spool.pending, exclude=step.exclude, without=step.without, waiting_for=step.waiting_for)
-            important = look(IMPORTANT)
-            oldest = look(OLDEST, oldest=True) if len(important) == IMPORTANT else important
+            poll = partial(self._spool.pending, exclude=step.exclude, without=step.without, waiting_for=step.waiting_for)
+            important = poll(IMPORTANT)
+            oldest = poll(OLDEST, oldest=True) if len(important) == IMPORTANT else important
             self._schedule.found(important, sorted(oldest, key=lambda item: item.id)[:OLDEST])
         else:
             self._ship(step.item)

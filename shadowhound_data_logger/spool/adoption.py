@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.durable_files import fingerprint
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.keys import check_key, check_name
@@ -149,7 +149,7 @@ def recorded_place(tree: Tree, part: Path) -> Path | None:
     if not _is_valid_name(bucket, key) or fingerprint(part)[1] != described.get('sha256'):
         return None
     metadata = described.get('metadata')
-    is_kept = isinstance(metadata, dict) and metadata.get(words.SHIP) == words.ON_REQUEST
+    is_kept = isinstance(metadata, dict) and metadata.get(meta.SHIP) == meta.ON_REQUEST
     place = tree.path(State.HELD if held else State.KEPT if is_kept else State.PENDING, held, bucket, key)
     return None if os.path.lexists(place) else place
 
@@ -177,7 +177,7 @@ def _described(bucket: str, key: str, body: FileBody) -> DataObject | None:
         type=_text(described, 'type', ''), samples=_number(described, 'samples', 0),
         t_start_ns=_number(described, 't_start_ns', changed_ns), t_end_ns=_number(described, 't_end_ns', changed_ns),
         priority=min(_number(described, 'priority', 5), 9), protected=described.get('protected') is True,
-        metadata={**{name: value for name, value in own if isinstance(value, str)}, words.SHA256: sha256},
+        metadata={**{name: value for name, value in own if isinstance(value, str)}, meta.SHA256: sha256},
         counts=_counts(described),
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.keys import check_key, unique
 from shadowhound_data_logger.core.model import Binding, SpooledObject, State
@@ -122,11 +122,11 @@ def _own_path(tree: Tree, row: _Row) -> Path:
 
 def _change(index: Index, row: _Row, binding: Binding, now_ns: int) -> None:
     key = free_key(index, row['bucket'], binding.key, row['key'])
-    metadata = {**binding.metadata, words.SHA256: row['sha256']}
+    metadata = {**binding.metadata, meta.SHA256: row['sha256']}
     created_ns = row['created_ns']
     if created_ns < EARLIEST_SANE_NS <= now_ns:  # spooled before the clock was set; the waiting time is computed from this
         created_ns = binding.t_end_ns if EARLIEST_SANE_NS <= binding.t_end_ns <= now_ns else now_ns
-    state = State.KEPT if metadata.get(words.SHIP) == words.ON_REQUEST else State.PENDING
+    state = State.KEPT if metadata.get(meta.SHIP) == meta.ON_REQUEST else State.PENDING
     index.states.set_bound(row, key, binding, metadata, created_ns, state)
 
 

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Final, NamedTuple
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.spool.gap_table import GapTable
 from shadowhound_data_logger.spool.table import Table, after
 
@@ -60,7 +60,7 @@ class CatalogTable(Table):
             ' LEFT JOIN statistics USING (id) ORDER BY id LIMIT ?', (limit,),
         )  # fmt: skip
         found = [(*row, json.loads(metadata)) for *row, metadata in rows]
-        return [UncatalogedObject(number, bucket, metadata.get(words.CONTENT_KEY, key), size, kind, metadata, packed or b'')
+        return [UncatalogedObject(number, bucket, metadata.get(meta.CONTENT_KEY, key), size, kind, metadata, packed or b'')
                 for number, bucket, key, size, kind, packed, metadata in found]  # fmt: skip
 
     def take_uncataloged(self, ids: Collection[int]) -> bool:

@@ -26,7 +26,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
@@ -219,11 +219,11 @@ def content_sha256(body: bytes | FileBody) -> str:
 
 def facts(item: DataObject) -> dict[str, str]:
     """An object's metadata in the store, from which its row of the catalog can be rebuilt; ``item.metadata`` take precedence."""
-    found = {words.SENSOR: item.sensor}
+    found = {meta.SENSOR: item.sensor}
     if item.topic is not None:
-        found |= {words.TOPIC: item.topic, words.TYPE: item.type, words.COUNT: str(item.samples)}
+        found |= {meta.TOPIC: item.topic, meta.TYPE: item.type, meta.COUNT: str(item.samples)}
     if item.t_start_ns >= EARLIEST_SANE_NS:
-        found |= {words.T_START_NS: str(item.t_start_ns), words.T_END_NS: str(item.t_end_ns)}
+        found |= {meta.T_START_NS: str(item.t_start_ns), meta.T_END_NS: str(item.t_end_ns)}
     return {**found, **item.metadata}
 
 

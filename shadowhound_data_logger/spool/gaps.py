@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Final, NamedTuple
 
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, FUTURE_SLACK_NS, SECOND, Clock
-from shadowhound_data_logger.core.stamps import NO_TIMES, Times, is_of_two_clocks
+from shadowhound_data_logger.core.stamps import NO_TIMES, Times, clocks_differ
 
 MISSED, REJECTED, DROPPED, EVICTED, QUARANTINED = 'missed', 'rejected', 'dropped', 'evicted', 'quarantined'
 """Kinds."""
@@ -183,7 +183,7 @@ class TopicGaps:
         stamps more than a day ahead of our clock count as unknown; if only one of the two is UTC, it is used for both. Without a
         publisher, the times may be by different publishers' clocks: then both are converted to the clock of ``after``.
         """
-        if not publisher and is_of_two_clocks(before, after):
+        if not publisher and clocks_differ(before, after):
             before = before._replace(stamp_ns=after.stamp_ns - (after.received_ns - before.received_ns))
         from_ns, to_ns = self._time(before.stamp_ns), self._time(after.stamp_ns)
         if (from_ns < EARLIEST_SANE_NS) != (to_ns < EARLIEST_SANE_NS):

@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.model import ObjectInfo, State
 from shadowhound_data_logger.spool.gap_table import GapTable
@@ -66,7 +66,7 @@ class HistoryTable(Table):
         """
         rows = self._db.execute(
             'SELECT id, bucket, key, sensor, state, bytes, sha256, settled_ns, ifnull(CASE WHEN json_valid(metadata) THEN'  # noqa: S608
-            f" CAST(json_extract(metadata, '$.{words.RECEIVED_START_NS}') AS INTEGER) - t_start_ns END, 0)"
+            f" CAST(json_extract(metadata, '$.{meta.RECEIVED_START_NS}') AS INTEGER) - t_start_ns END, 0)"
             ' FROM objects INDEXED BY settled'
             " WHERE state IN ('delivered', 'deduplicated', 'evicted') AND settled_ns < ?"
             ' AND NOT EXISTS (SELECT 1 FROM uncataloged WHERE uncataloged.id = objects.id)'

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
 from shadowhound_data_logger.spool.object_table import ObjectStates, ObjectTable
@@ -67,9 +67,9 @@ class KeptTable(Table):
             self._db.execute(f'UPDATE tally SET samples = samples - ? WHERE 1{was}', (count, account))  # noqa: S608
             self._db.execute('UPDATE contents SET samples = samples - ? WHERE id = ? AND topic = ?', (count, row['id'], account))
         metadata = json.loads(row['metadata'])
-        word = words.MESSAGES if words.MESSAGES in metadata else words.COUNT
+        word = meta.MESSAGES if meta.MESSAGES in metadata else meta.COUNT
         step = 2 * _step(metadata)
-        left = {**metadata, words.SHA256: body.sha256, word: str(samples), words.THINNED: str(step)}
+        left = {**metadata, meta.SHA256: body.sha256, word: str(samples), meta.THINNED: str(step)}
         values = {'bytes': len(body), 'sha256': body.sha256, 'samples': samples, 'metadata': json.dumps(left)}
         self._states.set_thinned(row['id'], values)
         # A separate state: a catalog part that is being written describes the former content, and removes the former state.
@@ -85,4 +85,4 @@ class KeptTable(Table):
 
 def _step(metadata: Mapping[str, str]) -> int:
     """One of how many images or clouds is left."""
-    return int(metadata.get(words.THINNED, 1))
+    return int(metadata.get(meta.THINNED, 1))

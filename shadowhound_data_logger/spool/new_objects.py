@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.keys import check_key
 from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State, waits_for
@@ -115,7 +115,7 @@ class NewObjects:
     def stage(self, objects: Sequence[DataObject], not_stored: Collection[int]) -> list[DataObject]:
         """The objects with their content in durable files next to the parts.
 
-        Skips those with indexes in ``not_stored``, and those that look like repeats. Raises OSError; then ``close`` cleans up.
+        Skips those with indexes in ``not_stored``, and those that poll like repeats. Raises OSError; then ``close`` cleans up.
         """
         expected = self._repeats.expected(objects)
         taken = [
@@ -134,7 +134,7 @@ class NewObjects:
             state, reason = State.QUARANTINED, MISSING
         key = free_key(self._index, item.bucket, check_key(item.key))
         sha256 = content_sha256(item.body)
-        metadata = {**facts(item), words.SHA256: sha256}
+        metadata = {**facts(item), meta.SHA256: sha256}
         if state is State.PENDING:
             holder = self._repeats.holder(self._index, item, sha256)
             if holder is not None:
@@ -145,8 +145,8 @@ class NewObjects:
             item = self._staged(item)  # it looked like a repeat of an object that another process has evicted
             self._sync()
         number = self._index.states.insert(item, key, sha256, state, reason, metadata, self._now_ns)
-        if words.GAP_VERSION in item.metadata:
-            self._index.gaps.set_reported(item.metadata[words.ROBOT], int(item.metadata[words.GAP_VERSION]))
+        if meta.GAP_VERSION in item.metadata:
+            self._index.gaps.set_reported(item.metadata[meta.ROBOT], int(item.metadata[meta.GAP_VERSION]))
         path = self._tree.part(number)
         if state in _WITH_FILE and isinstance(item.body, FileBody):
             new = description(item, key, sha256, metadata)
@@ -195,7 +195,7 @@ class NewObjects:
         if not is_staged(self._tree, item.body):
             return item
         sha256 = content_sha256(item.body)
-        attached = description(item, item.key, sha256, {**facts(item), words.SHA256: sha256})
+        attached = description(item, item.key, sha256, {**facts(item), meta.SHA256: sha256})
         if isinstance(item.body, bytes):
             path = self._tree.new_body(self._session)
             self._bodies.append(path)
@@ -218,6 +218,6 @@ class NewObjects:
 
     def _add_repeat(self, item: DataObject, key: str, metadata: Mapping[str, str]) -> None:
         sha256 = content_sha256(item.body)
-        metadata = {**metadata, words.SHA256: sha256}
+        metadata = {**metadata, meta.SHA256: sha256}
         number = self._index.states.insert(item, key, sha256, State.PENDING, None, metadata, self._now_ns)
         self._index.states.move([number], State.DEDUPLICATED, None, self._now_ns)

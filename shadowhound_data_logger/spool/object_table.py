@@ -11,7 +11,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.model import (
     EVENTS_WHEN,
     UPLOAD_WHEN,
@@ -255,9 +255,9 @@ def _fate(sensor: str, metadata: Mapping[str, str], *, protected: bool) -> dict[
     """The columns that decide when an object is uploaded, and to what its loss is attributed."""
     return {
         'waits_for': waits_for(sensor, metadata, protected=protected),
-        'on_request': metadata.get(words.SHIP) == words.ON_REQUEST,
-        'event': words.EVENT in metadata,
-        'mission': metadata.get(words.MISSION_ID, ''),
+        'on_request': metadata.get(meta.SHIP) == meta.ON_REQUEST,
+        'event': meta.EVENT in metadata,
+        'mission': metadata.get(meta.MISSION_ID, ''),
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND
 from shadowhound_data_logger.core.model import State
 from shadowhound_data_logger.core.stamps import BY_RECEIVED, BY_STAMP
@@ -15,9 +15,9 @@ from shadowhound_data_logger.spool.table import Table, after
 
 DAY_NS: Final = 24 * 3600 * SECOND
 MAX_NS: Final = (1 << 63) - 1
-_DESCRIBED: Final = (words.MISSION_ID, words.MISSION_TYPE, words.POSE, words.BATTERY, words.CONTENT_KEY)
+_DESCRIBED: Final = (meta.MISSION_ID, meta.MISSION_TYPE, meta.POSE, meta.BATTERY, meta.CONTENT_KEY)
 _RECEIVED: Final = tuple(
-    f"CAST(json_extract(metadata, '$.{word}') AS INTEGER)" for word in (words.RECEIVED_START_NS, words.RECEIVED_END_NS)
+    f"CAST(json_extract(metadata, '$.{word}') AS INTEGER)" for word in (meta.RECEIVED_START_NS, meta.RECEIVED_END_NS)
 )
 _ARRIVED: Final = """ifnull(CASE WHEN json_valid(metadata)
   THEN CAST(json_extract(metadata, '$.received_start_ns') AS INTEGER) END, t_start_ns)"""
@@ -92,7 +92,7 @@ class OverviewTable(Table):
         start = _START[by]
         row: tuple[Any, ...] | None = self._db.execute(
             f'SELECT {start}, t_start_ns, t_end_ns, {_RECEIVED[1]}, topic, state, settled_ns, mission,'  # noqa: S608
-            f" json_extract(metadata, '$.{words.MISSION_TYPE}'), json_extract(metadata, '$.{words.BATTERY}') FROM objects"
+            f" json_extract(metadata, '$.{meta.MISSION_TYPE}'), json_extract(metadata, '$.{meta.BATTERY}') FROM objects"
             f' WHERE sensor = ? AND {start} >= ? AND {start} < ? AND key >= ? AND key < ?'
             f" AND state <> 'evicted' AND json_valid(metadata) ORDER BY {start} {'DESC' if is_last else ''} LIMIT 1",
             (sensor, begin_ns, end_ns, f'{robot}/', after(f'{robot}/')),

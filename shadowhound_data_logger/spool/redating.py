@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS
 from shadowhound_data_logger.core.clock_watch import ClockWatch
 from shadowhound_data_logger.core.dating import Dating
@@ -34,7 +34,7 @@ CLOCK: Final = 'clock'
 """Why an object is held."""
 STEP: Final = 256
 """Objects dated at a time: some 30 ms."""
-_TIMES: Final = (words.T_START_NS, words.T_END_NS)
+_TIMES: Final = (meta.T_START_NS, meta.T_END_NS)
 
 
 class Redating:
@@ -57,13 +57,13 @@ class Redating:
         start_ns, end_ns = item.t_start_ns, item.t_end_ns
         if start_ns >= EARLIEST_SANE_NS:
             away_ns = offset_ns or end_ns - self._watch.boot_ns()
-            clock = words.SET if offset_ns else words.PUBLISHER
+            clock = meta.SET if offset_ns else meta.PUBLISHER
             return replace(
-                item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), words.CLOCK: clock}
+                item, metadata={**item.metadata, **_boot(boot_id, start_ns - away_ns, end_ns - away_ns), meta.CLOCK: clock}
             )
         known = {name: value for name, value in item.metadata.items() if name not in _TIMES}
-        metadata = {**known, **_boot(boot_id, start_ns, end_ns), words.CLOCK: words.UNSET}
-        metadata[words.KEY_PATTERN] = item.key_pattern or item.key
+        metadata = {**known, **_boot(boot_id, start_ns, end_ns), meta.CLOCK: meta.UNSET}
+        metadata[meta.KEY_PATTERN] = item.key_pattern or item.key
         if offset_ns:
             key, metadata = _final(metadata, start_ns, end_ns, offset_ns)
             return replace(item, key=key, metadata=metadata, t_start_ns=start_ns + offset_ns, t_end_ns=end_ns + offset_ns)
@@ -75,7 +75,7 @@ class Redating:
 
         Raises OSError or sqlite3.Error.
         """
-        if self._watch.look() or not self._record.knows(self._watch.boot_id, self._watch.offset_ns()):
+        if self._watch.poll() or not self._record.knows(self._watch.boot_id, self._watch.offset_ns()):
             self._record.note(self._watch)
         bindings = [binding for item in self._spool.held(CLOCK, STEP) if (binding := self._binding(item)) is not None]
         if not bindings:
@@ -87,7 +87,7 @@ class Redating:
 
     def _binding(self, item: HeldObject) -> Binding | None:
         """The final key and times of a held object; None if it must wait."""
-        offset_ns = self._offset_of(item.metadata.get(words.BOOT_ID, ''))
+        offset_ns = self._offset_of(item.metadata.get(meta.BOOT_ID, ''))
         if offset_ns is None:
             return None
         if offset_ns and item.t_start_ns < EARLIEST_SANE_NS:
@@ -104,12 +104,12 @@ class Redating:
 
 
 def _boot(boot_id: str, start_ns: int, end_ns: int) -> dict[str, str]:
-    return {words.BOOT_ID: boot_id, words.BOOT_START_NS: str(start_ns), words.BOOT_END_NS: str(end_ns)}
+    return {meta.BOOT_ID: boot_id, meta.BOOT_START_NS: str(start_ns), meta.BOOT_END_NS: str(end_ns)}
 
 
 def _final(metadata: Mapping[str, str], start_ns: int, end_ns: int, offset_ns: int) -> tuple[str, dict[str, str]]:
     """Key and metadata of an object that is dated now. Raises NameRefused, LookupError or ValueError for invalid metadata."""
-    times = {words.T_START_NS: str(start_ns + offset_ns), words.T_END_NS: str(end_ns + offset_ns)}
-    rest = {name: value for name, value in metadata.items() if name != words.KEY_PATTERN}
-    key = dated(metadata[words.KEY_PATTERN], start_ns + offset_ns)
-    return key, {**rest, **times, words.CLOCK: words.SET_LATER, words.CLOCK_OFFSET_NS: str(offset_ns)}
+    times = {meta.T_START_NS: str(start_ns + offset_ns), meta.T_END_NS: str(end_ns + offset_ns)}
+    rest = {name: value for name, value in metadata.items() if name != meta.KEY_PATTERN}
+    key = dated(metadata[meta.KEY_PATTERN], start_ns + offset_ns)
+    return key, {**rest, **times, meta.CLOCK: meta.SET_LATER, meta.CLOCK_OFFSET_NS: str(offset_ns)}

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.model import DataObject, FileBody, State
 from shadowhound_data_logger.spool.files import content_sha256
 from shadowhound_data_logger.spool.index import Index
@@ -81,7 +81,7 @@ class Repeats:
             return None
         index.states.protect(item.bucket, last.key)  # its eviction would lose all its repeats, too
         self._next[_source(item)] = replace(last, repeats=last.repeats + 1, until_ns=item.t_end_ns)
-        return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), {words.CONTENT_KEY: last.key})
+        return Holder(FileBody(Path(last.key), row['bytes'], last.sha256), {meta.CONTENT_KEY: last.key})
 
     def stored(self, item: DataObject, key: str, sha256: str) -> Mapping[str, str]:
         """Remember an object that the sensor stored; returns the metadata that describe the repeats before it."""
@@ -91,7 +91,7 @@ class Repeats:
         self._next[_source(item)] = _Last(key, sha256)
         if last is None or not last.repeats:
             return {}
-        return {words.REPEATS: str(last.repeats), words.REPEATS_OF: last.key, words.REPEATS_UNTIL_NS: str(last.until_ns)}
+        return {meta.REPEATS: str(last.repeats), meta.REPEATS_OF: last.key, meta.REPEATS_UNTIL_NS: str(last.until_ns)}
 
 
 def _source(item: DataObject) -> tuple[str, str, str | None]:

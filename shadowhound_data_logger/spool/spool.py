@@ -344,7 +344,7 @@ class Spool:
         index = self._connections.writing
         if item.answers is not None and not index.requests.take_answer(*item.answers, self._clock.wall_ns()):
             return False
-        return index.catalog.take_uncataloged(item.catalogs) and index.catalog.take_unreported(item.tells)
+        return index.catalog.take_uncataloged(item.catalogs) and index.catalog.take_unreported(item.reports)
 
     def _set_apart(self, item: SpooledObject, reason: str | None) -> None:
         """Move a file to the quarantine, unless the object has become pending again; during a recovery, the next startup does it.

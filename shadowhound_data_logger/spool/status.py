@@ -19,7 +19,7 @@ from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.stamps import describe
 from shadowhound_data_logger.core.status import NodeStatus, OtherType, SpoolStatus, TopicStatus, Totals
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, from_strict_json
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, from_strict_json
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.local_robot import robots
 
@@ -130,7 +130,7 @@ def _written(spool: Path, robot: str) -> tuple[NodeStatus, str]:
     """The last status of a node, and why it cannot be read; a power cut may damage it. Without figures if there is none."""
     path = file(spool, robot)
     try:
-        return parse(NodeStatus, from_strict_json(path.read_bytes(), MOST_DOCUMENT_BYTES)), ''
+        return parse(NodeStatus, from_strict_json(path.read_bytes(), MAX_DOCUMENT_BYTES)), ''
     except FileNotFoundError:
         return NodeStatus(), ''
     except (OSError, ValueError) as error:

@@ -40,7 +40,7 @@ class Content:
 class ObjectStore(Protocol):
     """Puts, gets and lists objects in buckets. Lifecycle: new; open once; use from any thread; close once.
 
-    Each request is tried once (``retry.steadily`` retries). The only exceptions are those of
+    Each request is tried once (``retry.with_retries`` retries). The only exceptions are those of
     ``shadowhound_data_logger.core.errors``: StoreUnavailable (transient), CredentialsRejected, BucketMissing, AccessDenied,
     ObjectRefused, ForeignObject. Methods that read raise ObjectRefused with ``data['reason'] == 'missing'`` if the object does
     not exist, and ``'name'`` for a key that is not a path.

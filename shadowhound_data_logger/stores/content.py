@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import ForeignObject, NameRefused, ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.core.keys import check_key, check_name
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
@@ -120,7 +120,7 @@ def opened(item: SpooledObject) -> Iterator[int]:
 
 def object_metadata(item: SpooledObject) -> dict[str, str]:
     """The metadata that a store keeps with the content; always with ``sha256``."""
-    return {**item.metadata, words.SHA256: item.sha256}
+    return {**item.metadata, meta.SHA256: item.sha256}
 
 
 def identical_or_foreign(item: SpooledObject, held: ObjectInfo, content_sha256: Callable[[], str]) -> Put:

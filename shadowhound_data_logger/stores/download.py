@@ -12,7 +12,7 @@ from typing import IO, Any, Final, TypeVar
 
 from shadowhound_data_logger.core.errors import ObjectRefused, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
 
@@ -50,7 +50,7 @@ def download(
     try:
         with _opened(part) as file:
             transfer = _Transfer(store, wanted, file, on_progress)
-            found = retry_damaged(lambda: steadily(transfer.complete, tries=TRIES, pause=pause))
+            found = retry_damaged(lambda: with_retries(transfer.complete, tries=TRIES, pause=pause))
             if is_synced:
                 os.fsync(file.fileno())
     except ObjectRefused as error:

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.stores.bandwidth import Pace
@@ -98,7 +98,7 @@ class MemoryStore:
             held, _ = self._objects[bucket, key]
             if held.etag != version:
                 return False
-            metadata = {**held.metadata, words.SHA256: sha256}
+            metadata = {**held.metadata, meta.SHA256: sha256}
             new = dataclasses.replace(held, size=len(body), sha256=sha256, metadata=metadata, etag=sha256)
             self._objects[bucket, key] = new, body
         return True

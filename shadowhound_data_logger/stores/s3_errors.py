@@ -24,7 +24,7 @@ from shadowhound_data_logger.core.errors import (
     StoreUnavailable,
     StoreUntrusted,
 )
-from shadowhound_data_logger.core.tls import causes, distrust, distrust_told
+from shadowhound_data_logger.core.tls import causes, certificate_problem, rustls_certificate_problem
 
 REQUEST_ERRORS: Final = (boto.BotoCoreError, boto.ClientError, ResponseParserError, urllib3.HTTPError, OSError, ValueError)
 """Everything that a request through botocore can raise. ValueError is raised for a truncated header.
@@ -149,7 +149,7 @@ def classify(error: Exception, request: Request) -> StoreError:
     """
     if isinstance(error, boto.ClientError):
         return _answered(error, request)
-    untrusted = distrust(error, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
+    untrusted = certificate_problem(error, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
     kind, message, remedy = (StoreUntrusted, *untrusted) if untrusted else _unanswered(error)
     return _error(kind, message, remedy, request, code=type(error).__name__)
 
@@ -195,7 +195,7 @@ def refused(code: str, status: int, detail: str, request: Request, *, is_head: b
 
 def unreachable(reason: str, request: Request, *, is_proxied: bool = False) -> StoreError:
     """The error for a request without an answer, by a client whose errors are only text."""
-    untrusted = distrust_told(reason, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
+    untrusted = rustls_certificate_problem(reason, 'Tower at {endpoint}', bundle='AWS_CA_BUNDLE', address='AWS_ENDPOINT_URL')
     row = (StoreUntrusted, *untrusted) if untrusted else _PROXY if is_proxied else _SILENT
     return _error(*row, request, code='no answer')
 

@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.errors import (
 )
 from shadowhound_data_logger.core.model import ObjectInfo, Put, SpooledObject
 from shadowhound_data_logger.core.options import StoreSettings, UploadSettings
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.stores.base import Content, has_changed, joined
 from shadowhound_data_logger.stores.content import CHUNK_BYTES, check_read, paths, warn_of
 from shadowhound_data_logger.stores.s3_metadata import from_headers
@@ -204,7 +204,7 @@ class ObstoreStore:
             known = len(found)
             try:
                 if found:
-                    steadily(lambda: self._request(bucket, folder, read, is_listing=True))
+                    with_retries(lambda: self._request(bucket, folder, read, is_listing=True))
                 else:
                     self._request(bucket, folder, read, is_listing=True)
             except BucketMissing:

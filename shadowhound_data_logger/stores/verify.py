@@ -13,7 +13,7 @@ from typing import Final
 
 from shadowhound_data_logger.core.errors import AccessDenied, BucketMissing, ObjectRefused
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.retry import steadily
+from shadowhound_data_logger.core.retry import with_retries
 from shadowhound_data_logger.stores.base import ObjectStore
 
 MISSING: Final = 'missing'
@@ -61,11 +61,11 @@ def check_object(store: ObjectStore, bucket: str, key: str, size: int | None, sh
     Raises StoreError if that cannot be determined.
     """
     try:
-        held = steadily(lambda: store.head(bucket, key), pause=pause)
+        held = with_retries(lambda: store.head(bucket, key), pause=pause)
         kind = compare(held, size, sha256)
         content = ''
         if deep and sha256 is not None and kind not in {MISSING, SIZE}:
-            content = steadily(lambda: _content_sha256(store, bucket, key), pause=pause)
+            content = with_retries(lambda: _content_sha256(store, bucket, key), pause=pause)
             if content != sha256:
                 kind = CHECKSUM
             elif kind == FOREIGN:

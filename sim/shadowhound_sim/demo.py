@@ -141,12 +141,12 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
                 agent = agents.enter_context(demo_mission.start(folder, environ))
             with demo_report.progress(console, duration_s) as show:
 
-                def look(reading: demo_run.SpoolReading) -> None:
+                def poll(reading: demo_run.SpoolReading) -> None:
                     show(reading)
                     if with_mission and reading.t > duration_s - AT_THE_DOCK_S:
                         agent.ask_to_stop()
 
-                record = demo_run.patrol(folder, node, outage, environ, duration_s, look)
+                record = demo_run.patrol(folder, node, outage, environ, duration_s, poll)
             run_id = demo_mission.end(agent, console) if with_mission else ''
         began = time.monotonic()
         node.stop(demo_processes.STOP_S)

@@ -101,7 +101,7 @@ class StoreOutage:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._pool.shutdown()
 
-    def look(self, t: float, *, is_last: bool = False) -> None:
+    def poll(self, t: float, *, is_last: bool = False) -> None:
         """Do what is due; with ``is_last`` the server comes back at once. Raises ServerFailed when it does not."""
         if self._step is not None:
             if not self._step.done():
@@ -162,7 +162,7 @@ def _follow(spool: Path, processes: tuple[Child, Child], outage: StoreOutage, sh
             began = now
         if began is not None:
             t = now - began
-            outage.look(t, is_last=stopped_s is not None)
+            outage.poll(t, is_last=stopped_s is not None)
             objects = found['objects']
             reading = SpoolReading(t, messages, objects['spooled'], objects['delivered'], objects['pending'],
                               found['bytes']['spooled'], patrolled.room(t), outage.state)  # fmt: skip

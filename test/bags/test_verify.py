@@ -15,7 +15,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
 from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, verify_remote
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
 from shadowhound_data_logger.stores.memory import MemoryStore
@@ -154,7 +154,7 @@ def test_a_slice_that_was_thinned_is_no_damage(folder: Path) -> None:
     assert [check.name for check in verify_remote(store, bag).findings][:1] == [FIRST]
     thinned = put_item(folder / FIRST, bag.slices[0].key, NAME, 9)
     store.delete(BUCKET, bag.slices[0].key)
-    store.put(replace(thinned, metadata={**thinned.metadata, words.THINNED: '2'}))
+    store.put(replace(thinned, metadata={**thinned.metadata, meta.THINNED: '2'}))
     for deep in (False, True):
         found = verify_remote(store, find_bag(store, 'thor', NAME), deep=deep)
         assert FIRST not in {check.name for check in found.findings}

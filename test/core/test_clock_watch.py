@@ -33,7 +33,7 @@ def test_setting_it_is_a_step(clocks: Clocks) -> None:
     watch = ClockWatch(clocks, 600.0)
     clocks.set()
     assert (watch.is_set, watch.state().unset_s, watch.state().steps) == (True, 0.0, 0)
-    assert [watch.look() for _ in range(3)] == [True, False, False]
+    assert [watch.poll() for _ in range(3)] == [True, False, False]
     assert watch.state().steps == 1
 
 
@@ -43,7 +43,7 @@ def test_a_step_is_more_than_a_second(clocks: Clocks, step_s: float, steps: int)
     clocks.set()
     watch = ClockWatch(clocks, 600.0)
     clocks.offset_ns += round(step_s * SECOND)
-    assert watch.look() is bool(steps)
+    assert watch.poll() is bool(steps)
     clocks.wait(7)
     state = watch.state()
     assert (state.steps, state.last_step_s, state.last_step_age_s) == ((1, step_s, 7.0) if steps else (0, None, None))
@@ -56,7 +56,7 @@ def test_a_clock_that_is_slewed_does_not_step(clocks: Clocks) -> None:
     for _ in range(4 * 3600):
         clocks.wait(1)
         clocks.offset_ns += 500_000
-        assert not watch.look()
+        assert not watch.poll()
 
 
 def test_it_is_not_waited_for_for_ever(clocks: Clocks) -> None:
@@ -76,7 +76,7 @@ def test_a_clock_that_is_lost_is_waited_for_anew(clocks: Clocks) -> None:
     watch = ClockWatch(clocks, 600.0)
     clocks.wait(5000)
     clocks.set(0)
-    watch.look()
+    watch.poll()
     clocks.wait(599)
     state = watch.state()
     assert (state.is_set, state.gave_up, state.unset_s) == (False, False, 599.0)
@@ -91,7 +91,7 @@ def test_each_change_is_said_once(clocks: Clocks, caplog: pytest.LogCaptureFixtu
         caplog.clear()
         clocks.wait(seconds)
         for _ in range(3):
-            watch.look()
+            watch.poll()
         return [record.getMessage().split(';')[0].split(':')[0] for record in caplog.records]
 
     assert said(0) == ['the clock of this machine is not set']

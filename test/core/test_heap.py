@@ -32,9 +32,9 @@ def faults(option: str) -> int:
     return int(subprocess.run([sys.executable, '-c', PROGRAM, option], capture_output=True, text=True, check=True).stdout)
 
 
-def test_what_is_kept_is_not_taken_from_the_system_again() -> None:
+def test_kept_blocks_are_not_requested_from_the_system_again() -> None:
     if not hasattr(ctypes.CDLL(None), 'mallopt'):
         pytest.skip('this C library has no such options')
     pages = BLOCKS * BLOCK // 4096
-    assert faults('keep') < pages
-    assert faults('bound') >= ROUNDS * pages // 2, 'what is bound goes back each time'
+    assert faults('keep_free_blocks') < pages
+    assert faults('limit_arenas') >= ROUNDS * pages // 2, 'large blocks are returned each time'

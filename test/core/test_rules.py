@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shadowhound_data_logger.core.errors import SettingError
-from shadowhound_data_logger.core.rules import Judged, Rule, read_rule
+from shadowhound_data_logger.core.rules import Rule, RuleResult, read_rule
 
 
 @dataclass
@@ -41,8 +41,8 @@ def read(text: str) -> Rule:
     return found
 
 
-def judge(text: str, known: Known, now_s: float = 0.0) -> Judged:
-    return read(text).judge(known, now_s)
+def evaluate(text: str, known: Known, now_s: float = 0.0) -> RuleResult:
+    return read(text).evaluate(known, now_s)
 
 
 def test_an_empty_rule_is_none() -> None:
@@ -62,7 +62,7 @@ def test_an_empty_rule_is_none() -> None:
 ])  # fmt: skip
 def test_what_rules_say(text: str, holds: bool) -> None:
     known = Known({'lowstate:bms_state.soc': 42.0, 'dock/at:data': 1.0}, ['lab'], 12 * 60, 'patrol')
-    assert judge(text, known).holds is holds
+    assert evaluate(text, known).holds is holds
 
 
 @pytest.mark.parametrize(('text', 'holds'), [
@@ -72,38 +72,38 @@ def test_what_rules_say(text: str, holds: bool) -> None:
 ])  # fmt: skip
 def test_what_is_unknown_is_neither_true_nor_false(text: str, holds: bool | None) -> None:
     known = Known(ssids='the system does not tell', at='the clock of this machine is not set')
-    found = judge(text, known)
+    found = evaluate(text, known)
     assert found.holds is holds
     assert holds is not None or 'unknown' in found.why
 
 
 def test_a_number_that_is_not_finite_is_unknown() -> None:
-    assert judge('soc:data < 30', Known({'soc:data': float('nan')})).holds is None
+    assert evaluate('soc:data < 30', Known({'soc:data': float('nan')})).holds is None
 
 
 def test_why_it_does_not_hold() -> None:
     known = Known({'lowstate:bms_state.soc': 27.0}, ['cafe'])
-    found = judge('lowstate:bms_state.soc > 30 and wifi.ssid == "lab" and not mission', known)
+    found = evaluate('lowstate:bms_state.soc > 30 and wifi.ssid == "lab" and not mission', known)
     assert found.why == 'lowstate:bms_state.soc > 30: it is 27; wifi.ssid == "lab": it is "cafe"'
 
 
 def test_a_number_has_to_hold_for_its_time() -> None:
     rule, known = read('soc:data > 30 for 5'), Known({'soc:data': 31.0})
-    assert [bool(rule.judge(known, now).holds) for now in (0.0, 4.9, 5.0)] == [False, False, True]
+    assert [bool(rule.evaluate(known, now).holds) for now in (0.0, 4.9, 5.0)] == [False, False, True]
     known.numbers['soc:data'] = 29.0
-    assert not rule.judge(known, 6.0).holds
+    assert not rule.evaluate(known, 6.0).holds
     known.numbers['soc:data'] = 31.0
-    assert [bool(rule.judge(known, now).holds) for now in (7.0, 11.9, 12.0)] == [False, False, True]
+    assert [bool(rule.evaluate(known, now).holds) for now in (7.0, 11.9, 12.0)] == [False, False, True]
     known.numbers.clear()
-    assert rule.judge(known, 13.0).holds is None
+    assert rule.evaluate(known, 13.0).holds is None
 
 
 def test_every_part_is_judged_even_where_one_decides() -> None:
     """Else the time for which a number has to hold would begin when the other part changes."""
     rule, known = read('mission and soc:data > 30 for 5'), Known({'soc:data': 31.0})
-    assert not rule.judge(known, 0.0).holds
+    assert not rule.evaluate(known, 0.0).holds
     known.type = 'patrol'
-    assert rule.judge(known, 5.0).holds
+    assert rule.evaluate(known, 5.0).holds
 
 
 def test_topics_are_those_that_it_asks() -> None:
@@ -140,4 +140,4 @@ def test_any_text_is_read_or_refused(text: str) -> None:
     except SettingError:
         return
     if found is not None:
-        assert found.judge(Known(), 0.0).why
+        assert found.evaluate(Known(), 0.0).why

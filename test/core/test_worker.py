@@ -157,11 +157,11 @@ def test_a_thread_that_ends_is_started_again(monkeypatch: pytest.MonkeyPatch, ca
     assert worker.failures == 0
     monkeypatch.setattr(worker_module, 'FIRST_PAUSE_S', 0.2)
     for _ in range(3):
-        worker.look()
+        worker.poll()
     assert (worker.failures, worker.deaths, worker.failing, worker.alive) == (1, 1, True, False)
     assert worker.status().last_error == 'MemoryError: for the log'
     assert not well.is_set()
-    until(lambda: worker.look() or worker.alive)  # type: ignore[func-returns-value]
+    until(lambda: worker.poll() or worker.alive)  # type: ignore[func-returns-value]
     assert well.wait(60)
     until(lambda: not worker.failing)
     assert (worker.failures, worker.deaths) == (1, 1)
@@ -177,10 +177,10 @@ def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, 'start', lambda _: _raise(RuntimeError("can't start new thread")))
         worker.start()
-        worker.look()
+        worker.poll()
         assert (worker.deaths, worker.last_error) == (1, "RuntimeError: can't start new thread")
-        until(lambda: worker.look() or worker.deaths > 2)  # type: ignore[func-returns-value]
-    until(lambda: worker.look() or well.is_set())  # type: ignore[func-returns-value]
+        until(lambda: worker.poll() or worker.deaths > 2)  # type: ignore[func-returns-value]
+    until(lambda: worker.poll() or well.is_set())  # type: ignore[func-returns-value]
     worker.stop()
     assert worker.join(60)
 
@@ -188,12 +188,12 @@ def test_a_system_that_gives_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_looking_at_one_that_is_not_wanted_starts_nothing() -> None:
     """Neither before its start nor after its stop."""
     worker = Worker('idle', lambda: None)
-    worker.look()
+    worker.poll()
     assert not worker.alive
     worker.start()
     worker.stop()
     assert worker.join(60)
-    worker.look()
+    worker.poll()
     assert (worker.alive, worker.failures) == (False, 0)
 
 
@@ -216,8 +216,8 @@ def test_how_long_a_round_lasts_is_told() -> None:
 
 def test_workers_that_share_what_was_told(caplog: pytest.LogCaptureFixture) -> None:
     """A defect that many of them meet, again and again, is one entry in the log, with its traceback."""
-    told: set[str] = set()
-    workers = [Worker(f'w-{number}', lambda: _raise(ValueError('x')), told=told) for number in range(3)]
+    reported: set[str] = set()
+    workers = [Worker(f'w-{number}', lambda: _raise(ValueError('x')), reported=reported) for number in range(3)]
     for worker in workers:
         worker.start()
     until(lambda: all(worker.failures > 2 for worker in workers))
@@ -235,7 +235,7 @@ def _raise(error: BaseException) -> None:
 def test_one_that_fails_again_and_again_may_be_tried_rarely() -> None:
     """The pause doubles up to its own longest one."""
     worker = Worker('rare', lambda: None, longest_pause_s=0.003)
-    assert [worker._longer_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]
+    assert [worker._next_pause() for _ in range(4)] == [0.001, 0.002, 0.003, 0.003]
 
 
 def test_who_looks_while_it_starts_sees_no_death(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,11 +245,11 @@ def test_who_looks_while_it_starts_sees_no_death(monkeypatch: pytest.MonkeyPatch
 
     def looked_at(thread: threading.Thread) -> None:
         start(thread)
-        worker.look()
+        worker.poll()
 
     monkeypatch.setattr(threading.Thread, 'start', looked_at)
     worker.start()
-    worker.look()
+    worker.poll()
     worker.stop()
     assert worker.join(10.0)
     assert (worker.deaths, worker.failures, worker.last_error) == (0, 0, '')

@@ -36,5 +36,5 @@ def test_a_server_that_lets_two_win_is_told(winners: int, severity: Severity) ->
         server.races = {f'/sensor-data/thor/_doctor/{name}': threading.Barrier(s3.RACERS) for name in NAMES}
     (found,) = raced(server)
     assert (found.check, found.severity) == ('s3.race', severity)
-    assert winners == 1 or f'[{", ".join(["4"] * s3.RACES)}] won' in found.seen
+    assert winners == 1 or f'[{", ".join(["4"] * s3.RACES)}] succeeded' in found.seen
     assert not server.objects

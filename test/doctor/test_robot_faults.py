@@ -262,7 +262,7 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
     'small socket buffers of Fast DDS': (small_buffers_of_fast_dds, 'sockets', 'sockets.buffer', ('net.core.rmem_max', 'sysctl')),
     'small socket buffers of the node': (small_buffers_of_the_node, 'sockets', 'sockets.buffer', ('systemctl restart',)),
     'a middleware that the node refuses': (refused_middleware, 'ros.environment', 'ros.listener', ()),
-    'small shared memory': (without(*PROFILE_FILES), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
+    'small default shared memory': (without(*PROFILE_FILES), 'sockets', 'sockets.profile', ('fastdds_shm.xml',)),
     **{
         f'the profile that Fast DDS reads on {distribution} is not there, the other one is': (
             wrong(read, '/nowhere.xml', **{other: str(PROFILE)}, ROS_DISTRO=distribution), 'sockets', 'sockets.profile',
@@ -270,11 +270,11 @@ FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
         for distribution, read, other in (('humble', *PROFILE_FILES), ('kilted', *reversed(PROFILE_FILES)))
     },
     'small shared memory of the driver': (driver_with_small_memory(), 'sockets', 'sockets.driver',
-                                          ('start the driver again', 'export FASTDDS_DEFAULT')),
+                                          ('restart the driver', 'export FASTDDS_DEFAULT')),
     'small shared memory of a driver with Fast DDS 2': (driver_with_small_memory(ROS_DISTRO='humble'), 'sockets',
                                                         'sockets.driver', ('export FASTRTPS_DEFAULT',)),
     'shared memory that a killed process has left': (left_segment, 'sockets', 'sockets.orphans', ('--fix', 'when it starts')),
-    'a port that a killed process has left': (unfinished_port, 'sockets', 'sockets.ports', ('--fix', 'goes on')),
+    'a port that a killed process has left': (unfinished_port, 'sockets', 'sockets.ports', ('--fix', 'then continues')),
     'node not running': (not_running, 'spool', 'node.running', ('sensor_logger_node',)),
     'node that is paused': (lambda scene: scene.run_node(paused=True), 'spool', 'node.status', ('/pause ', '{data: false}')),
     'publishers that the node does not hear': (unheard, 'spool', 'node.unheard', ('capture.rmw: robot', 'CYCLONEDDS_URI')),
@@ -320,10 +320,12 @@ def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> 
     robot.environ['RMW_IMPLEMENTATION'] = 'rmw_cyclonedds_cpp'
     assert robot.findings('sockets') == []
     (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
-    assert told.seen.startswith("the node would listen by rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS hands on")
+    assert told.seen.startswith(
+        "the node would listen with rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS hands on"
+    )
     robot.run_node(middleware=beside(rmw='rmw_cyclonedds_cpp', why="the robot's own", asked='robot', receive_bytes=MEBI))
     (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
-    assert told.seen == "the node listens by rmw_cyclonedds_cpp (the robot's own); capture.rmw is robot"
+    assert told.seen == "the node listens with rmw_cyclonedds_cpp (the robot's own); capture.rmw is robot"
     assert [result.check for result in robot.findings('sockets')] == ['sockets.cyclone']
 
 
@@ -387,7 +389,7 @@ def test_no_password_is_shown(robot: Scene, name: str, url: str) -> None:
     )
     assert 'ter2' not in told
     assert 'crash' not in told
-    assert f'{name} holds a user and a password' in told
+    assert f'{name} contains a user and a password' in told
 
 
 def test_a_slow_disk_is_named_in_time(robot: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

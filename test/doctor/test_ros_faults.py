@@ -87,7 +87,7 @@ def test_two_names_of_one_topic(scene: Scene, monkeypatch: pytest.MonkeyPatch) -
     )  # fmt: skip
     monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
     monkeypatch.setattr(ros_watch, 'discover', lambda _, names: {name: [SimpleNamespace(type='a/msg/B')] for name in names})
-    monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __, ___: [ros_watch.Heard(name, []) for name in found])
+    monkeypatch.setattr(ros_watch, 'listen', lambda _, found, __, ___: [ros_watch.WatchedTopic(name, []) for name in found])
     own = {'sensors': ['imu', 'again'], 'again.topics': ['/imu'], 'again.types': ['sensor_msgs/msg/Imu']}
     context = make(scene.environ, role=scene.role, parameters=own, root=scene.root)
     assert [result.check for result in ros.check(context) if result.is_finding].count('ros.topic') == 2
@@ -107,7 +107,7 @@ def test_a_healthy_robot_gives_no_finding(examined: Examined) -> None:
 
 FAULTS = {
     'missing topic': ('unheard', 'ros.topic', ('ros2 topic list | grep /unheard/imu', 'imu.enabled: false')),
-    'nothing arrives': ('mute', 'ros.loss', ('ros2 topic hz /mute/odom', '--only sockets')),
+    'no message arrives': ('mute', 'ros.loss', ('ros2 topic hz /mute/odom', '--only sockets')),
     'wrong rate': ('slow', 'ros.rate', ('ros2 topic hz /slow/odom', '--rate /slow/odom=')),
     'wrong QoS of a publisher': ('soft', 'ros.qos', ('ros2 topic info -v /soft/odom',)),
     'wrong QoS of a subscriber': ('deaf', 'ros.qos', ('qos_profile_sensor_data',)),

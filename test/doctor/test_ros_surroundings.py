@@ -12,7 +12,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from shadowhound_data_logger.doctor import ros, ros_environment, ros_watch
-from shadowhound_data_logger.doctor.ros_watch import Heard
+from shadowhound_data_logger.doctor.ros_watch import WatchedTopic
 
 STORE = get_typestore(Stores.LATEST)
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
@@ -51,7 +51,7 @@ def tf(age_s: float) -> bytes:
 def test_frames_that_do_not_move(received: int, age_s: float | None, is_finding: bool) -> None:
     """A publisher that is silent, or repeats old transforms."""
     newest = b'' if age_s is None else tf(age_s)
-    one = Heard('/tf', [], TRANSFORMS, received=received, newest=newest, window_s=2.5)
+    one = WatchedTopic('/tf', [], TRANSFORMS, received=received, newest=newest, window_s=2.5)
     assert checks(ros._transforms(one)) == [('ros.tf', is_finding)]
 
 

@@ -144,9 +144,9 @@ class Driver:
         """For ever: count what comes."""
         while True:
             time.sleep(TAKE_S)
-            self.look()
+            self.poll()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Count what came meanwhile."""
         with self._lock:
             for topic, reader in self._readers.items():

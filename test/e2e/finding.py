@@ -47,7 +47,7 @@ def listen(cases: Sequence[Mapping[str, str]]) -> None:
 
     def heard() -> list[list[str]]:
         for driver in drivers:
-            driver.look()
+            driver.poll()
         return [[topic for topic in TOPICS if driver.obey({'do': 'count', 'topic': topic})] for driver in drivers]
 
     answer(heard)

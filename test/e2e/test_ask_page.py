@@ -19,7 +19,7 @@ from shadowhound_tower.embedded import Tower
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'ask.md'
 HOME = '/home/ann/.shadowhound'
 """As the page has it."""
-MOST_LINES, FIRST_LINES = 9, 4
+MAX_LINES, FIRST_LINES = 9, 4
 """Of a longer answer the first lines stand on the page, and what comes after its table."""
 COMMAND = '    $ '
 
@@ -50,7 +50,7 @@ def answered(page: str, ask: Callable[[str], str]) -> str:
 
 
 def shortened(lines: list[str]) -> list[str]:
-    if len(lines) <= MOST_LINES:
+    if len(lines) <= MAX_LINES:
         return lines
     after = lines.index('') if '' in lines else len(lines)
     return [*lines[:FIRST_LINES], '...', *lines[after:]]

@@ -89,10 +89,10 @@ def test_patrol_look_pull_and_train(  # noqa: PLR0915 - one story
     node = processes.node(tower.environment(), {**settings(), 'keep.poll_s': 1.0})
     processes.sim('image_raw:=false', GENTLE)
     patrols(processes, node)
-    look, sheet, ask, fetch, export = commands()
+    poll, sheet, ask, fetch, export = commands()
     # What the robot keeps is known within seconds, while none of it has been sent.
-    until(lambda: run(look, '--json')['objects'] > 5, 'the rows have arrived')
-    offer = run(look, '--json')
+    until(lambda: run(poll, '--json')['objects'] > 5, 'the rows have arrived')
+    offer = run(poll, '--json')
     assert offer['lost'] == {}
     found = run(['query', '--sensor', 'camera', '--since', 'today'], '--json')
     assert found == []
@@ -122,7 +122,7 @@ def test_patrol_look_pull_and_train(  # noqa: PLR0915 - one story
     run(export)
     told = json.loads((tmp_path / 'go2_patrol/meta/info.json').read_bytes())
     assert told['total_episodes'] == 1
-    assert run([*look, '--mission-type', 'patrol'], '--json')['objects'] == 0
+    assert run([*poll, '--mission-type', 'patrol'], '--json')['objects'] == 0
     flags = {'robot': processes.robot, 'mission_type': 'patrol', 'since': 'today'}
     made = MissionDataset(**flags, pull=True)
     assert len(made) >= FRAMES

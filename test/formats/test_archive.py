@@ -154,8 +154,8 @@ def test_the_same_batch_gives_the_same_bytes(ros: Any, format_name: str, stamp_n
     if stamp_ns != STAMP_NS:
         return
     if format_name == 'zip':
-        with zipfile.ZipFile(io.BytesIO(made.body)) as unpacked:
-            (when,) = {entry.date_time for entry in unpacked.infolist()}
+        with zipfile.ZipFile(io.BytesIO(made.body)) as decompress:
+            (when,) = {entry.date_time for entry in decompress.infolist()}
         assert when == (2025, 10, 18, 12, 0, 0)
     else:
         with tarfile.open(fileobj=io.BytesIO(made.body)) as packed:
@@ -170,8 +170,8 @@ def test_the_files_are_plain(ros: Any) -> None:
     assert tar[257:265] == b'ustar\x0000'
     assert len(tar) % 512 == 0
     assert tar.endswith(bytes(1024))
-    with tarfile.open(fileobj=io.BytesIO(tar)) as unpacked:
-        entries = unpacked.getmembers()
+    with tarfile.open(fileobj=io.BytesIO(tar)) as decompress:
+        entries = decompress.getmembers()
     assert [(entry.mode, entry.uid, entry.isfile(), entry.pax_headers) for entry in entries] == [(0o644, 0, True, {})] * 2
     with zipfile.ZipFile(io.BytesIO(pack(ros, COMPRESSED, cdr, format_name='zip').object.body)) as packed:
         entries = packed.infolist()

@@ -22,7 +22,7 @@ from lake.making import NOON_NS, folder_store, row
 from PIL import Image
 
 from shadowhound_data_logger.core.errors import LakeError
-from shadowhound_data_logger.core.untrusted import MOST_OBJECT_BYTES, MOST_PIXELS, from_json, from_yaml, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, MAX_PIXELS, decompress, from_json, from_yaml
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import decode
 from shadowhound_data_logger.lake.bucket import Bucket
@@ -87,7 +87,7 @@ def test_a_picture_that_is_too_large_is_refused_by_its_header(tmp_path: Path, ma
     assert 'it claims 12,000 x 12,000 pixels' in ran.stdout, ran.stderr
     with pytest.raises(ValueError, match='none of 1 frames'):
         contact_sheet([LoggedFrame(NOON_NS, 1, tmp_path / 'evil')], '', NOON_NS, tmp_path / 'sheet.jpg')
-    assert MOST_PIXELS >= 7680 * 4320, '8K is not a bomb'
+    assert MAX_PIXELS >= 7680 * 4320, '8K is not a bomb'
 
 
 def test_only_formats_of_ours_are_tried() -> None:
@@ -215,7 +215,7 @@ def test_no_more_of_an_object_is_read_than_its_row_says() -> None:
 
     with Prefetch(read, 1000, 1) as bodies:
         assert bodies.get(Object('b', 'k', 7, '')) == b'content'
-        for size in (MOST_OBJECT_BYTES + 1, 0, -1, 1 << 62):
+        for size in (MAX_OBJECT_BYTES + 1, 0, -1, 1 << 62):
             with pytest.raises(LakeError, match='allowed are up to'):
                 bodies.get(Object('b', f'k{size}', size, ''))
     assert asked == [7]
@@ -261,4 +261,4 @@ def test_documents_have_an_end() -> None:
         with pytest.raises(ValueError, match=r'.'):
             from_yaml(text)
     with pytest.raises(ValueError, match='is not supported'):
-        unpacked('brotli', b'', 5)
+        decompress('brotli', b'', 5)

@@ -20,7 +20,7 @@ from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.cli.pull import _sentence
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings, StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
@@ -70,7 +70,7 @@ class Field:
         items = [
             make(f'thor/camera/20251018/{number:06d}_front.jpg', bytes([number]) * size, t_start_ns=NOON_NS + number * SECOND,
                  t_end_ns=NOON_NS + number * SECOND,
-                 metadata={words.ROBOT: 'thor', words.POSE: f'{number} 0 0 odom', words.SHIP: words.ON_REQUEST})
+                 metadata={meta.ROBOT: 'thor', meta.POSE: f'{number} 0 0 odom', meta.SHIP: meta.ON_REQUEST})
             for number in numbers
         ]  # fmt: skip
         receive(self.spool, len(items))
@@ -238,9 +238,9 @@ def test_a_name_that_nothing_has_is_wrong_usage(field: Field, arguments: list[st
     """The nearest names are suggested; what the robot keeps and the catalog does not know exists as well."""
     field.records(1)
     item = make('thor/thermal/20251018/000000_x.jpg', t_start_ns=NOON_NS, t_end_ns=NOON_NS, sensor='thermal', topic='/thermal',
-                metadata={words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST, words.MISSION_TYPE: 'patrol'})  # fmt: skip
+                metadata={meta.ROBOT: 'thor', meta.SHIP: meta.ON_REQUEST, meta.MISSION_TYPE: 'patrol'})  # fmt: skip
     slice_ = make('thor/rosbags/patrol_20251018/0.mcap', t_start_ns=NOON_NS, t_end_ns=NOON_NS, sensor='bag', topic=None,
-                  metadata={words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST})  # fmt: skip
+                  metadata={meta.ROBOT: 'thor', meta.SHIP: meta.ON_REQUEST})  # fmt: skip
     receive(field.spool, 2)
     field.spool.commit([item, slice_])
     field.passes()

@@ -120,7 +120,7 @@ def test_an_authority_is_no_server(
     """Its own certificate is not taken of a server, though it is the one that is trusted."""
     with behind_tls(filled.endpoint_url, authorities['authority'].itself()) as front:
         source = Bucket(towards(front.url), 'sensor-data')
-        with pytest.raises(StoreUntrusted, match='is that of an authority, which'):
+        with pytest.raises(StoreUntrusted, match='is a CA certificate, which'):
             source.folders('')
     assert front.inside.heard == b''
 

@@ -21,7 +21,7 @@ from shadowhound_data_logger.live.kinds import (
     HALF,
     KINDS,
     MAX_NAME,
-    MOST_NAMES,
+    MAX_NAMES,
     SIZES,
     SMALLEST,
     LiveItem,
@@ -184,7 +184,7 @@ def test_joints_without_end_are_cut() -> None:
     joints = cdr(new(name, header=header(), name=names, position=np.zeros(2000), velocity=empty, effort=empty), name)
     item = series('/joints', KINDS[name], name, TYPES, [(10.0, joints)])
     assert item.head is not None
-    assert (len(item.head['names']), max(map(len, item.head['names']))) == (MOST_NAMES, MAX_NAME)
+    assert (len(item.head['names']), max(map(len, item.head['names']))) == (MAX_NAMES, MAX_NAME)
 
 
 @pytest.mark.parametrize(('unknown', 'names'), [

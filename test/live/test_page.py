@@ -857,11 +857,11 @@ def test_each_cause_of_a_gap_has_its_own_color(browser: Browser, tmp_path: Path,
         assert page.locator('rect.gap').evaluate_all('all => all.map(rect => rect.dataset.cause)') == causes
         for scheme in ('light', 'dark'):
             page.emulate_media(color_scheme=scheme)
-            drawn = [tuple(look) for look in page.locator('rect.gap').evaluate_all(looks)]
+            drawn = [tuple(poll) for poll in page.locator('rect.gap').evaluate_all(looks)]
             assert len(set(drawn)) == len(causes)
             assert all(hue.startswith('rgb(') and mark in {'', page_rgb(page, '--panel')} for hue, _, mark in drawn)
             swatches = page.locator('.legend svg[data-swatch] rect')
-            assert [tuple(look) for look in swatches.evaluate_all(looks)] == drawn
+            assert [tuple(poll) for poll in swatches.evaluate_all(looks)] == drawn
             hues = sorted({hue for hue, _, _ in drawn})
             for kind in ('', *BLINDNESS):
                 apart = {(one, other): float(np.linalg.norm(seen(one, kind) - seen(other, kind)))

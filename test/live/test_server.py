@@ -258,24 +258,24 @@ def test_who_acknowledges_what_he_does_not_read_gets_no_more(tmp_path: Path, mon
     asyncio.run(asyncio.wait_for(run(), 30.0))
 
 
-def test_memory_is_given_back_once_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_trimmed_once_nobody_watches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not while somebody does, and not again while nobody comes."""
-    given_back: list[int] = []
+    trimmed: list[int] = []
 
     async def run() -> None:
         async with serving(tmp_path, monkeypatch) as page:
-            monkeypatch.setattr(viewers_module.heap, 'give_back', lambda: given_back.append(len(page.server.viewers.connected)))
+            monkeypatch.setattr(viewers_module.heap, 'trim', lambda: trimmed.append(len(page.server.viewers.connected)))
             cookie = f'{COOKIE}={page.cookies["viewer"]}'
             async with aiohttp.ClientSession(headers={'Origin': page.origin, 'Cookie': cookie}) as session:
                 first, second = [await session.ws_connect(f'{page.origin}/ws') for _ in range(2)]
                 await first.close()
                 while len(page.server.viewers.connected) > 1:
                     await asyncio.sleep(0.01)
-                assert given_back == []
+                assert trimmed == []
                 await second.close()
-                while not given_back:
+                while not trimmed:
                     await asyncio.sleep(0.01)
                 page.server.viewers.rewatch()
-        assert given_back == [0]
+        assert trimmed == [0]
 
     asyncio.run(asyncio.wait_for(run(), 30.0))

@@ -42,7 +42,7 @@ def send(home: Path) -> Delivery:
     return delivery
 
 
-def look(client: Any) -> dict[str, Any]:
+def poll(client: Any) -> dict[str, Any]:
     """Artifacts by their own store: the list of the 3.17 client asks for models as well, which a server of 2.x does not know."""
     from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
@@ -60,7 +60,7 @@ def look(client: Any) -> dict[str, Any]:
 def main(home: str) -> None:
     fly(Path(home))
     delivery = send(Path(home))
-    sys.stdout.write(json.dumps(look(delivery._tracking._client)) + '\n')  # type: ignore[attr-defined]
+    sys.stdout.write(json.dumps(poll(delivery._tracking._client)) + '\n')  # type: ignore[attr-defined]
 
 
 if __name__ == '__main__':

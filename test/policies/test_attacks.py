@@ -283,18 +283,18 @@ def test_slow_retrieval(seaweed: Tower, tmp_path: Path, monkeypatch: pytest.Monk
             with closing(open_store(settings, UploadSettings(read_timeout_s=5.0))) as slow:
                 robot = replace(battle.robot, store=slow)
                 failed: list[BaseException] = []
-                look = threading.Thread(target=lambda: failed.extend(_raised(robot.run)))
-                look.start()
+                poll = threading.Thread(target=lambda: failed.extend(_raised(robot.run)))
+                poll.start()
                 assert front.is_slow.wait(60.0)
-                assert look.is_alive()
+                assert poll.is_alive()
                 assert battle.folder.roll_back() is None
                 battle.folder.use(str(first))
                 assert 'expired on' in why_stale(battle.folder.path, time.time_ns() + 20 * DAY_NS)
                 with pytest.raises(PolicyError, match='another process'):
                     battle.robot.run()
                 front.close()
-                look.join(60.0)
-        assert not look.is_alive()
+                poll.join(60.0)
+        assert not poll.is_alive()
         battle.folder.unpin()
         assert battle.taken() == second
 

@@ -123,9 +123,9 @@ def test_a_single_publisher_is_the_sender() -> None:
     """Where the middleware does not name the sender, the only publisher is it; of two nobody knows."""
     senders = Senders()
     assert senders.name(1, 10) is None
-    senders.look(['a'])
+    senders.poll(['a'])
     assert senders.name(2, 20) == senders.name(3, 30) is not None
-    senders.look(['a', 'b'])
+    senders.poll(['a', 'b'])
     assert senders.name(4, 40) is None
     assert senders.name(None, 50) is None
 
@@ -133,7 +133,7 @@ def test_a_single_publisher_is_the_sender() -> None:
 def test_a_successor_is_told_from_its_predecessor() -> None:
     """Numbers that begin anew while time goes on are another publisher's, though the graph does not show it yet."""
     senders = Senders()
-    senders.look(['a'])
+    senders.poll(['a'])
     first = [senders.name(number, number * 10) for number in (1, 2, 3)]
     second = [senders.name(number, 100 + number) for number in (1, 2)]
     assert len({*first}) == len({*second}) == 1
@@ -143,7 +143,7 @@ def test_a_successor_is_told_from_its_predecessor() -> None:
 def test_two_that_the_graph_does_not_show_yet_are_not_taken_for_a_gap() -> None:
     """Numbers that begin anew and then go on where the old ones were come from two publishers: nobody's, and no loss of one."""
     senders = Senders()
-    senders.look(['a'])
+    senders.poll(['a'])
     assert None not in {senders.name(number, number * 10) for number in (1, 2, 3, 4, 5)}
     assert None not in {senders.name(number, 100 + number) for number in (1, 2)}
     assert senders.name(6, 200) is None
@@ -152,7 +152,7 @@ def test_two_that_the_graph_does_not_show_yet_are_not_taken_for_a_gap() -> None:
 def test_a_successor_that_overtakes_its_predecessor_is_one() -> None:
     """It is told apart for as long as it publishes, also when it loses a message after that."""
     senders = Senders()
-    senders.look(['a'])
+    senders.poll(['a'])
     first = {senders.name(number, number * 10) for number in (1, 2, 3)}
     second = {senders.name(number, 100 + number) for number in (1, 2, 3, 4, 5, 8)}
     assert len(first) == len(second) == 1

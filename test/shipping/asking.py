@@ -11,7 +11,7 @@ from typing import Any
 from spool.making import NOON_NS, FakeClock, make, receive, rows
 
 from shadowhound_data_logger.bags.kept import KeptCut
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import KeepSettings, SpoolSettings
 from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, KeptFilter, PullRequest, answers_prefix, encode_inbox, inbox_key
@@ -26,7 +26,7 @@ KEEP = KeepSettings(poll_s=10.0)
 def frame(number: int, *, body: bytes = b'', **fields: Any) -> DataObject:
     """A picture that stays on the robot, one a second."""
     stamp_ns = NOON_NS + number * SECOND
-    said = {words.ROBOT: 'thor', words.POSE: f'{number} 0 0 odom', words.SHIP: words.ON_REQUEST, **fields.pop('metadata', {})}
+    said = {meta.ROBOT: 'thor', meta.POSE: f'{number} 0 0 odom', meta.SHIP: meta.ON_REQUEST, **fields.pop('metadata', {})}
     return make(f'thor/camera/20251018/{number:06d}_front.jpg', body or b'%06d' % number, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
                 metadata=said, **fields)  # fmt: skip
 

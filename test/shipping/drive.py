@@ -25,10 +25,10 @@ class Drive:
         self.schedule.activate(True)
         self.notices: list[Notice] = []
 
-    def look(self, look: Look) -> None:
+    def poll(self, poll: Look) -> None:
         pending = self.spool.pending
-        self.schedule.found(pending(IMPORTANT, exclude=look.exclude, without=look.without),
-                            pending(OLDEST, exclude=look.exclude, without=look.without, oldest=True))  # fmt: skip
+        self.schedule.found(pending(IMPORTANT, exclude=poll.exclude, without=poll.without),
+                            pending(OLDEST, exclude=poll.exclude, without=poll.without, oldest=True))  # fmt: skip
 
     def next(self) -> SpooledObject | None:
         """What is shipped now, None when there is only rest."""
@@ -38,7 +38,7 @@ class Drive:
                 return step.item
             if not isinstance(step, Look):
                 return None
-            self.look(step)
+            self.poll(step)
         raise AssertionError('it looks again and again')
 
     def wait(self) -> SpooledObject:

@@ -144,7 +144,7 @@ def test_a_part_a_period(spool: Spool, clock: FakeClock) -> None:
 
 def test_a_backlog_goes_on_at_the_next_look(spool: Spool, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
     """After an outage parts of a bounded size follow one another without waiting for the next period."""
-    monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MOST_ROWS', 2)
+    monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     hand = Hand()
     catalog = made(spool, clock, hand, period_s=60.0)
     delivered(spool, *'abcde')

@@ -17,7 +17,7 @@ from shadowhound_data_logger.bags.cut import Choice, cut_remote
 from shadowhound_data_logger.bags.kept import CUTTING
 from shadowhound_data_logger.bags.remote import find_bag, read_manifest, state_of
 from shadowhound_data_logger.bags.verify import verify_remote
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import SpoolError
 from shadowhound_data_logger.core.model import DataObject, FileBody
@@ -46,9 +46,9 @@ def kept_slice(folder: Path, number: int, bag: str = BAG, **more: str) -> DataOb
     for one in recorded(number):
         writer.write({each.topic: each for each in (TALK, ECHO)}[one.topic], one.log_ns, one.publish_ns, one.sequence, one.cdr)
     info = writer.close()
-    said = {words.ROBOT: 'thor', words.BAG: bag, words.SLICE: str(number), words.MISSION_ID: 'm1',
-            words.MISSION_TYPE: 'patrol'}  # fmt: skip
-    said |= {words.SHIP: words.ON_REQUEST, **more}
+    said = {meta.ROBOT: 'thor', meta.BAG: bag, meta.SLICE: str(number), meta.MISSION_ID: 'm1',
+            meta.MISSION_TYPE: 'patrol'}  # fmt: skip
+    said |= {meta.SHIP: meta.ON_REQUEST, **more}
     return make(f'thor/rosbags/{bag}/{bag}_{number}.mcap', FileBody(info.path, info.bytes, info.sha256), sensor='bag',
                 topic=None, type='', samples=0, t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, metadata=said,
                 counts={f'{ACCOUNT}/talk': SLICE_S * HERTZ // 2, f'{ACCOUNT}/echo': SLICE_S * HERTZ // 2})  # fmt: skip

@@ -336,7 +336,7 @@ def test_a_backlog_of_rows_is_told_in_pieces_and_the_watermark_last(
     spool: Spool, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No watermark stands over rows that are not told yet."""
-    monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MOST_ROWS', 2)
+    monkeypatch.setattr('shadowhound_data_logger.shipping.catalog_writer.MAX_ROWS', 2)
     for number in range(1, 100, 20):
         hear(spool, number)
         store(spool, f'n{number}')

@@ -14,7 +14,7 @@ import pytest
 from shipping.asking import Desk, frame
 from spool.making import NOON_NS, assert_whole, rows
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import KeepSettings
 from shadowhound_data_logger.core.mailbox import KeptFilter, PullCancel, PullRequest, encode_inbox
@@ -72,8 +72,8 @@ def test_asking_twice_is_asking_once(desk: Desk) -> None:
 ])  # fmt: skip
 def test_a_request_chooses(desk: Desk, want: dict[str, Any], numbers: list[int]) -> None:
     """All that is given must hold."""
-    desk.keeps(*(frame(number, metadata={words.MISSION_ID: 'patrol_1', words.MISSION_TYPE: 'patrol'} if number == 7 else
-                       {words.GPS: f'0 {179.999 if number == 1 else -179.999} 0'} if number in {1, 2} else {})
+    desk.keeps(*(frame(number, metadata={meta.MISSION_ID: 'patrol_1', meta.MISSION_TYPE: 'patrol'} if number == 7 else
+                       {meta.GPS: f'0 {179.999 if number == 1 else -179.999} 0'} if number in {1, 2} else {})
                  for number in range(8)))  # fmt: skip
     if want == {'near': (3.0, 0.5, 1.2)}:
         numbers = [2, 3, 4]

@@ -12,7 +12,7 @@ import pytest
 from shipping.fakes import until
 from shipping.test_with_spool import Draining, data_object, draining, store
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, DataObject, State, waits_for
 from shadowhound_data_logger.spool.index import Index
@@ -28,7 +28,7 @@ def plain(first: int, count: int) -> list[DataObject]:
 
 
 def event(number: int) -> DataObject:
-    return replace(data_object(number, 'bags', priority=1), protected=True, sensor='bag', metadata={words.EVENT: 'fall'})
+    return replace(data_object(number, 'bags', priority=1), protected=True, sensor='bag', metadata={meta.EVENT: 'fall'})
 
 
 def telling(number: int) -> DataObject:
@@ -103,7 +103,7 @@ def test_drained_where_nothing_waits_for_the_rule(draining: Draining) -> None:
 def test_an_object_that_is_protected_later_waits_for_the_same_rule(tmp_path: Path) -> None:
     """The column that ``protect`` changes has the value that ``waits_for`` gives an object that was protected from the start."""
     sensors = ('odom', '_catalog', '_', 'camera_previews', '_previews', 'previews', 'x_previewsx')
-    facts: tuple[dict[str, str], ...] = ({}, {words.EVENT: 'fall'}, {words.EVENT: ''})
+    facts: tuple[dict[str, str], ...] = ({}, {meta.EVENT: 'fall'}, {meta.EVENT: ''})
     index = Index(tmp_path / 'index.db')
     index.open()
     with closing(index), index.transaction():

@@ -86,8 +86,8 @@ def test_a_look_that_overlaps_with_a_settlement_does_not_bring_an_object_back(dr
     assert drive.next() == first
     assert drive.next() == second
     drive.schedule.wake()
-    look = drive.schedule.step()
-    assert isinstance(look, Look)
+    poll = drive.schedule.step()
+    assert isinstance(poll, Look)
     drive.schedule.delivered(first)
     drive.schedule.settled([first.id])
     drive.schedule.found([first], [first])

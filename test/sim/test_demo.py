@@ -220,7 +220,7 @@ class FakeTower:
 def look_until(outage: StoreOutage, t: float, state: str, *, is_last: bool = False) -> None:
     """The outage's own thread needs a moment to report; pytest's timeout is the deadline."""
     while outage.state != state:
-        outage.look(t, is_last=is_last)
+        outage.poll(t, is_last=is_last)
 
 
 @pytest.mark.timeout(60)
@@ -228,13 +228,13 @@ def test_the_s3_server_goes_away_once_and_comes_back() -> None:
     """It goes at its time, stays away for its length, and its span is remembered."""
     tower = FakeTower()
     with StoreOutage(tower, 25.0, 10.0) as outage:  # type: ignore[arg-type]
-        outage.look(24.9)
+        outage.poll(24.9)
         assert outage.state == 'up'
         look_until(outage, 25.0, 'away')
-        outage.look(34.9)
+        outage.poll(34.9)
         assert tower.calls == ['stop']
         look_until(outage, 35.5, 'back')
-        outage.look(60.0)
+        outage.poll(60.0)
     assert tower.calls == ['stop', 'start']
     assert outage.span == (25.0, 35.5)
 

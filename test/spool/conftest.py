@@ -83,7 +83,7 @@ def moments(root: Path, tmp_path: Path) -> Moments:
         made: list[Path] = []
         before: dict[str, bytes] = {}
 
-        def look() -> None:
+        def poll() -> None:
             nonlocal before
             now = {str(path): path.read_bytes() for path in root.rglob('*') if path.is_file() and path.suffix != '.db-shm'}
             if now != before:
@@ -92,14 +92,14 @@ def moments(root: Path, tmp_path: Path) -> Moments:
 
         def watch(_: FrameType, event: str, called: Any) -> None:
             if event == 'c_call' and called.__name__ in CALLS:
-                look()
+                poll()
 
         sys.setprofile(watch)
         try:
             work()
         finally:
             sys.setprofile(None)
-        look()
+        poll()
         assert len(made) > 12
         return made
 

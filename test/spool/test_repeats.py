@@ -9,7 +9,7 @@ import pytest
 from spool.conftest import Open
 from spool.making import BUCKET, NOON_NS, assert_whole, files, make, put, receive, rows, settle, uncataloged
 
-from shadowhound_data_logger.core.metadata_words import CONTENT_KEY
+from shadowhound_data_logger.core.metadata_keys import CONTENT_KEY
 from shadowhound_data_logger.core.model import DataObject, State
 from shadowhound_data_logger.spool.spool import Spool
 

@@ -17,7 +17,7 @@ from spool.conftest import Moments
 from spool.making import NOON_NS, FakeClock, assert_whole, make, receive, rows
 
 from shadowhound_data_logger.bags.naming import BUCKET as BAGS
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import CatalogSettings, KeepSettings, SpoolSettings
 from shadowhound_data_logger.core.model import DataObject, FileBody
@@ -37,7 +37,7 @@ from shadowhound_data_logger.spool.ledger import read as read_ledger
 from shadowhound_data_logger.spool.spool import Spool
 
 KIB = 1 << 10
-SHIP = {words.ROBOT: 'thor', words.SHIP: words.ON_REQUEST}
+SHIP = {meta.ROBOT: 'thor', meta.SHIP: meta.ON_REQUEST}
 CAMERA = Channel('/camera', COMPRESSED_IMAGE, '', '', '', '')
 IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
 
@@ -143,7 +143,7 @@ def bag_slice(robot: Robot, folder: Path, number: int) -> DataObject:
         bucket=BAGS, key=f'thor/patrol/bags/patrol_{number}.mcap', body=FileBody(info.path, info.bytes, info.sha256),
         content_type='application/octet-stream', sensor='bag', topic=None, type='', samples=info.messages,
         t_start_ns=info.t_start_ns, t_end_ns=info.t_end_ns, priority=5,
-        protected=False, metadata={**SHIP, words.MESSAGES: str(info.messages)}, counts=counts,
+        protected=False, metadata={**SHIP, meta.MESSAGES: str(info.messages)}, counts=counts,
     )  # fmt: skip
 
 
@@ -206,13 +206,13 @@ def test_an_archive_loses_every_second_picture(
         path = robot.root / 'kept' / str(row['bucket']) / str(row['key'])
         left, was = messages_of(path.read_bytes(), str(row['content_type'])), whole[str(row['key'])]
         metadata = orjson.loads(str(row['metadata']))
-        step = int(metadata.get(words.THINNED, 1))
+        step = int(metadata.get(meta.THINNED, 1))
         thinned += step > 1
         expected = list(was.items())
         for _ in range(step.bit_length() - 1):
             expected = expected[::2]
         assert left == dict(expected)
-        assert (row['samples'], int(metadata[words.COUNT])) == (len(left), len(left))
+        assert (row['samples'], int(metadata[meta.COUNT])) == (len(left), len(left))
         assert description_of(path)['samples'] == len(left)
     assert thinned > len(items) / 2
     found = assert_whole(robot.root)
@@ -239,7 +239,7 @@ def test_a_slice_loses_pictures_alone(make_robot: Callable[..., Robot], tmp_path
         )
         assert found['/imu'] == 500
         assert found['/camera'] >= 5
-        assert found.total() == row['samples'] == int(orjson.loads(str(row['metadata']))[words.MESSAGES])
+        assert found.total() == row['samples'] == int(orjson.loads(str(row['metadata']))[meta.MESSAGES])
         counts.append(found['/camera'])
     assert counts[0] < 150
     ledger = read_ledger(robot.root, 'thor')
@@ -304,7 +304,7 @@ def test_the_catalog_is_told_of_each_step(make_robot: Callable[..., Robot]) -> N
         return [item.samples for item in made] and [
             count
             for part in made
-            if part.tells
+            if part.reports
             for count in [row['count'] for row in read_rows(bytes(part.body), 'thor').rows['_kept']]  # type: ignore[arg-type]
         ]
 

@@ -14,7 +14,7 @@ import pytest
 from shipping.fakes import until
 from spool.making import assert_whole, files, make, new_spool, receive, rows
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core import worker
 from shadowhound_data_logger.core.errors import NameRefused
 from shadowhound_data_logger.core.model import DataObject, FileBody, SpooledObject, State
@@ -106,7 +106,7 @@ def test_objects_share_commits(opened: Callable[..., SpoolWriter], spool: Spool,
 
 def test_what_stays_here_waits_for_others(opened: Callable[..., SpoolWriter], root: Path, commits: list[int]) -> None:
     """It is committed with the next object that does not, or by itself after a heartbeat, or once it is much."""
-    kept: dict[str, Any] = {'topic': None, 'metadata': {words.SHIP: words.ON_REQUEST}}
+    kept: dict[str, Any] = {'topic': None, 'metadata': {meta.SHIP: meta.ON_REQUEST}}
     writing = opened(0.0)
     for number in range(5):
         writing.put(make(f'kept_{number}', **kept))

@@ -146,12 +146,12 @@ def test_a_key_that_is_taken_meanwhile(server: S3Store, item: SpooledObject, spo
     theirs = spool(KEY, b'theirs')
     looks = []
 
-    def look() -> bool:
+    def poll() -> bool:
         looks.append(server.put(theirs))
         return False  # and the server has the last word
 
     server.put(spool('a', b'x'))
-    assert not server._puts._multipart.put(item, look)
+    assert not server._puts._multipart.put(item, poll)
     assert looks == [Put.CREATED]
     assert server.get(bucket, KEY) == b'theirs'
     assert under_way(server, bucket) == []

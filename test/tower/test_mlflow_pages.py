@@ -89,7 +89,7 @@ def test_no_script_of_a_robot_runs_in_mlflows_pages(tower: Tower, run: dict[str,
 
     expected = {path: path.rpartition('/')[2] if '/artifacts/' in path else 'Model training' for path in pages}
 
-    async def look() -> dict[str, Any]:
+    async def poll() -> dict[str, Any]:
         from playwright.async_api import async_playwright
 
         found: dict[str, Any] = {}
@@ -113,7 +113,7 @@ def test_no_script_of_a_robot_runs_in_mlflows_pages(tower: Tower, run: dict[str,
             await browser.close()
         return found
 
-    found = asyncio.run(look())
+    found = asyncio.run(poll())
     assert len(found) == len(pages)
     assert {path: each for path, each in found.items() if each['dialogs'] or each['pwned'] or each['links']} == {}
     frames = [sandbox for each in found.values() for sandbox in each['frames']]

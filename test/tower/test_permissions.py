@@ -289,7 +289,7 @@ class _Ignoring:
 
 
 @pytest.mark.long('a second of CPU or more')
-@pytest.mark.parametrize(('makes', 'says'), [(False, 'does not honor If-Match'), (True, 'MinIO')])
+@pytest.mark.parametrize(('makes', 'says'), [(False, 'does not apply If-Match'), (True, 'MinIO')])
 def test_the_doctor_tells_a_server_that_ignores_if_match(makes: bool, says: str) -> None:
     """Or that makes what is not there."""
     (found,) = race_mailboxes(_Ignoring(makes=makes))  # type: ignore[arg-type]

@@ -391,7 +391,7 @@ def test_a_neighbor_reaches_s3_and_mlflow_alone(closed: Running) -> None:
 def test_a_tower_knocks_at_its_own_ports_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its start, at the address of others and at its own: another Tower beside it is none of its business."""
     asked: set[tuple[str, int]] = set()
-    monkeypatch.setattr(run.seaweedfs, 'answers_anybody', lambda host, port, _: asked.add((host, port)))
+    monkeypatch.setattr(run.seaweedfs, 'answers_without_keys', lambda host, port, _: asked.add((host, port)))
     run.Runner(tmp_path, '127.0.0.2', 100)._knock()
     ports = {PORTS[name] + GRPC + 100 for name in ('s3', 'filer', 'master', 'volume')}
     assert asked == {(host, port) for host in ('127.0.0.1', '127.0.0.2') for port in ports}

@@ -16,7 +16,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Footer, Statistics
 
-from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, partly_unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, decompress_damaged
 from shadowhound_data_logger.formats.mcap.format import CHUNK, MAGIC, RECORD
 from shadowhound_data_logger.formats.mcap.index import MAX_SUMMARY_BYTES, UNREADABLE, parse
 from shadowhound_data_logger.formats.mcap.record_finder import (
@@ -136,7 +136,7 @@ class DamageScan:
         if name not in COMPRESSIONS or size > MAX_CHUNK_BYTES:
             return RecoveredChunk(f'{what} with the unsupported compression {name[:20]!r}', None, False, False, times)
         data = self._compressed_data(damaged, name, head)
-        raw = partly_unpacked(name, data, size) if name else data
+        raw = decompress_damaged(name, data, size) if name else data
         return RecoveredChunk(what, self.finder.walk_chunk(memoryview(raw))[0], True, False, times)
 
     def _recover_inconsistent_chunk(
@@ -149,7 +149,7 @@ class DamageScan:
             data = self._compressed_data(damaged, compression, head)
             likely = 16 * len(data) + BLOCK_BYTES  # the size itself may be wrong
             limit = size if likely < size <= MAX_CHUNK_BYTES else min(likely, MAX_CHUNK_BYTES)
-            raw = partly_unpacked(compression, data, limit) if compression else data
+            raw = decompress_damaged(compression, data, limit) if compression else data
             contents, end = self.finder.walk_chunk(memoryview(raw))
             if crc and zlib.crc32(raw) == crc:
                 what = f'{contents.lost} messages of unknown channels' if contents.lost else 'wrong fields of a chunk'

@@ -25,7 +25,7 @@ from mcap.records import Chunk as ChunkRecord
 from mcap.records import ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
 
 from shadowhound_data_logger.core.errors import BagDamaged
-from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, decompress
 from shadowhound_data_logger.formats.mcap.format import MAGIC, RECORD, REPEATED
 from shadowhound_data_logger.formats.mcap.ranges import Ranged
 from shadowhound_data_logger.formats.mcap.rosbag2_metadata import qos_in_numbers
@@ -298,7 +298,7 @@ def unpack(content: memoryview, name: str) -> memoryview:
     try:
         chunk = parse(ChunkRecord, content)
         size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
-        found = unpacked(chunk.compression, chunk.data, size) if chunk.compression else chunk.data
+        found = decompress(chunk.compression, chunk.data, size) if chunk.compression else chunk.data
     except (*UNREADABLE, ValueError) as error:
         raise BagDamaged(f'{name} cannot be unpacked: {error}', path=name) from error
     if len(found) != size or (crc and zlib.crc32(found) != crc):

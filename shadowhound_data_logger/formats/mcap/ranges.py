@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from shadowhound_data_logger.core.errors import BagDamaged
-from shadowhound_data_logger.core.untrusted import MOST_DOCUMENT_BYTES, check_size
+from shadowhound_data_logger.core.untrusted import MAX_DOCUMENT_BYTES, check_size
 from shadowhound_data_logger.stores.base import ObjectStore
 
 
@@ -96,7 +96,7 @@ def read_whole(source: Ranged) -> bytes:
 def check_document(name: str, size: int) -> None:
     """Raises BagDamaged if a file is too large for a manifest or metadata.yaml."""
     try:
-        check_size(size, MOST_DOCUMENT_BYTES)
+        check_size(size, MAX_DOCUMENT_BYTES)
     except ValueError as error:
         raise BagDamaged(f'{name} is neither a manifest nor metadata: {error}', path=name) from error
 

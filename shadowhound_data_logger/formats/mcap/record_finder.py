@@ -20,7 +20,7 @@ from typing import Final
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, Metadata, Schema
 
-from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, unpacked
+from shadowhound_data_logger.core.untrusted import MAX_CHUNK_BYTES, decompress
 from shadowhound_data_logger.formats.mcap.format import CHUNK, MAGIC, RECORD, ChunkPacking
 from shadowhound_data_logger.formats.mcap.index import MAX_SUMMARY_BYTES, UNREADABLE, parse, parsed_length
 
@@ -255,7 +255,7 @@ class RecordFinder:
         try:
             chunk = parse(Chunk, self.read(at + RECORD.size, length))
             packing = ChunkPacking(chunk.compression, len(chunk.data), chunk.uncompressed_size)
-            raw = unpacked(chunk.compression, chunk.data, packing.size) if chunk.compression else chunk.data
+            raw = decompress(chunk.compression, chunk.data, packing.size) if chunk.compression else chunk.data
         except (*UNREADABLE, ValueError):
             return None
         if length != CHUNK_FIELDS + len(chunk.compression.encode()) + packing.compressed or len(raw) != packing.size:

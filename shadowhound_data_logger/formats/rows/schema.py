@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
 from shadowhound_data_logger.core.earth import is_place
 
@@ -161,42 +161,42 @@ def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mappin
     ``robot`` always comes from the key; ``sensor`` comes from the key if the metadata does not have it.
     """
     parts = key.split('/')
-    start_ns, end_ns = _int(metadata, words.T_START_NS, words.BOOT_START_NS), _int(metadata, words.T_END_NS, words.BOOT_END_NS)
-    pose = metadata.get(words.POSE, '').split(' ')
+    start_ns, end_ns = _int(metadata, meta.T_START_NS, meta.BOOT_START_NS), _int(metadata, meta.T_END_NS, meta.BOOT_END_NS)
+    pose = metadata.get(meta.POSE, '').split(' ')
     x, y, yaw = (_number(value) for value in (pose[:3] if len(pose) == 4 else ('', '', '')))
     known = None not in (x, y, yaw)
-    fix = metadata.get(words.GPS, '').split(' ')
+    fix = metadata.get(meta.GPS, '').split(' ')
     latitude, longitude, altitude = (_number(value) for value in (fix if len(fix) == 3 else ('', '', '')))
     on_earth = latitude is not None and longitude is not None and is_place(latitude, longitude)
     return {
-        'robot': (parts[0] if len(parts) > 1 else metadata.get(words.ROBOT)) or None,
-        'sensor': metadata.get(words.SENSOR) or (parts[1] if len(parts) > 2 else None),
-        'topic': metadata.get(words.TOPIC) or None,
-        'type': metadata.get(words.TYPE) or None,
+        'robot': (parts[0] if len(parts) > 1 else metadata.get(meta.ROBOT)) or None,
+        'sensor': metadata.get(meta.SENSOR) or (parts[1] if len(parts) > 2 else None),
+        'topic': metadata.get(meta.TOPIC) or None,
+        'type': metadata.get(meta.TYPE) or None,
         'bucket': bucket,
         'key': key,
         'bytes': size,
-        'sha256': metadata.get(words.SHA256) or None,
+        'sha256': metadata.get(meta.SHA256) or None,
         't_start': _micros(start_ns),
         't_end': _micros(end_ns),
         't_start_ns': start_ns,
         't_end_ns': end_ns,
-        'count': _int(metadata, words.COUNT, words.MESSAGES),
-        'mission_id': metadata.get(words.MISSION_ID) or None,
-        'run_id': metadata.get(words.RUN_ID) or None,
-        'mission_type': metadata.get(words.MISSION_TYPE) or None,
+        'count': _int(metadata, meta.COUNT, meta.MESSAGES),
+        'mission_id': metadata.get(meta.MISSION_ID) or None,
+        'run_id': metadata.get(meta.RUN_ID) or None,
+        'mission_type': metadata.get(meta.MISSION_TYPE) or None,
         'x': x if known else None,
         'y': y if known else None,
         'yaw': yaw if known else None,
         'pose_frame': pose[3] if known else None,
-        'battery_pct': _number(metadata.get(words.BATTERY, '')),
-        'clock': metadata.get(words.CLOCK) or None,
-        'clock_offset_ns': _int(metadata, words.CLOCK_OFFSET_NS),
+        'battery_pct': _number(metadata.get(meta.BATTERY, '')),
+        'clock': metadata.get(meta.CLOCK) or None,
+        'clock_offset_ns': _int(metadata, meta.CLOCK_OFFSET_NS),
         'content_type': content_type or None,
         'format_version': FORMAT_VERSION,
-        'received_start_ns': _int(metadata, words.RECEIVED_START_NS),
-        'received_end_ns': _int(metadata, words.RECEIVED_END_NS),
-        'by_arrival': _int(metadata, words.BY_ARRIVAL),
+        'received_start_ns': _int(metadata, meta.RECEIVED_START_NS),
+        'received_end_ns': _int(metadata, meta.RECEIVED_END_NS),
+        'by_arrival': _int(metadata, meta.BY_ARRIVAL),
         'latitude': latitude if on_earth else None,
         'longitude': longitude if on_earth else None,
         'altitude': altitude if on_earth else None,
@@ -207,9 +207,9 @@ def place_of(row: Mapping[str, Any]) -> dict[str, str]:
     """Where the robot was, as the metadata of the object have it; without what is unknown."""
     found = {}
     if row['x'] is not None and row['y'] is not None:
-        found[words.POSE] = f'{row["x"]} {row["y"]} 0 odom'
+        found[meta.POSE] = f'{row["x"]} {row["y"]} 0 odom'
     if row['latitude'] is not None and row['longitude'] is not None:
-        found[words.GPS] = f'{row["latitude"]} {row["longitude"]} 0'
+        found[meta.GPS] = f'{row["latitude"]} {row["longitude"]} 0'
     return found
 
 

@@ -183,7 +183,7 @@ class EncodePool:
         return all(done)
 
     def _step(self) -> None:
-        self._reports.look()
+        self._reports.poll()
         batch = self._queue.get(WAIT_S)
         if batch is not None:
             try:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import MissionSettings, SensorSettings
 from shadowhound_data_logger.core.errors import Rejected
-from shadowhound_data_logger.core.metadata_words import BATTERY, GPS, POSE
+from shadowhound_data_logger.core.metadata_keys import BATTERY, GPS, POSE
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.formats.records import FIX, ODOMETRY, TRANSFORMS
 from shadowhound_data_logger.formats.types import MessageTypes

@@ -73,9 +73,9 @@ class RejectionLog:
                         self._report(key, sensor, each, 'a message')
                         entry.waiting = -1
                 entry.waiting, entry.newest = entry.waiting + each.count, each
-        self.look()
+        self.poll()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Report what waited for its minute; cheap to call often."""
         now_s = self._monotonic()
         if now_s < self._due_s:

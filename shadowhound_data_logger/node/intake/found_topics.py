@@ -46,7 +46,7 @@ def robots_in(topics: Collection[str], own: str) -> list[str]:
 
 
 class FoundTopics:
-    """Finds topics to log. New; ``look`` at each look at the graph."""
+    """Finds topics to log. New; ``poll`` at each look at the graph."""
 
     def __init__(self, node: Node, which: str, named: Collection[str]) -> None:
         """``which`` is ``capture.topics``; ``named`` are full names of the topics that sensors name."""
@@ -61,7 +61,7 @@ class FoundTopics:
         self.not_logged: Mapping[str, str] = {}
         """Topic -> why it is not logged. Replaced as a whole."""
 
-    def look(self, sensors: Mapping[str, SensorSettings], now_s: float) -> Iterator[SensorSettings]:
+    def poll(self, sensors: Mapping[str, SensorSettings], now_s: float) -> Iterator[SensorSettings]:
         """The sensors to add. A topic is judged once: what its publishers are when it is first seen decides."""
         graph = {name: types for name, types in self._node.get_topic_names_and_types() if is_plain_name(name)}
         self._since_s = now_s if self._since_s is None else self._since_s

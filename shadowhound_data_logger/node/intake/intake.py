@@ -169,7 +169,7 @@ class Intake:
 
     def _find(self, now_s: float) -> None:
         """Sensors of topics that the settings do not name; they are subscribed to at the next look."""
-        for sensor in self._found.look(self._sensors, now_s) if self._found is not None else ():
+        for sensor in self._found.poll(self._sensors, now_s) if self._found is not None else ():
             self._sensors[sensor.name] = sensor
             subscriber = Subscriber(self._around, sensor, self._consumers, self._others)
             subscriber.paused = self.paused

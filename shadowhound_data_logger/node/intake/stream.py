@@ -51,7 +51,7 @@ class Senders:
         self._number_before = 0
         self._sent_ns = 0
 
-    def look(self, gids: list[str], now_s: float = 0.0) -> None:
+    def poll(self, gids: list[str], now_s: float = 0.0) -> None:
         """What the graph says now."""
         self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
         if gids and gids != self.gids:
@@ -101,7 +101,7 @@ class Arrivals:
         self._heard_s: float | None = None
         self._looked_s: float | None = None
 
-    def look(self, now_s: float) -> None:
+    def poll(self, now_s: float) -> None:
         """All that waited was taken."""
         self._looked_s = now_s
 
@@ -176,9 +176,9 @@ class TopicStream:
             drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
             deliver(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
 
-    def look(self, now_s: float) -> None:
+    def poll(self, now_s: float) -> None:
         """All that waited was taken."""
-        self._arrivals.look(now_s)
+        self._arrivals.poll(now_s)
 
     def close(self) -> None:
         """No more of it comes."""
@@ -263,9 +263,9 @@ class SensorStream:
             deliver(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
             deliver(drained, [each for each in self._of_own_topics if self._topic in each.topics])
 
-    def look(self, now_s: float) -> None:
+    def poll(self, now_s: float) -> None:
         """All that waited was taken."""
-        self._arrivals.look(now_s)
+        self._arrivals.poll(now_s)
 
     def close(self) -> None:
         """No more of it comes."""

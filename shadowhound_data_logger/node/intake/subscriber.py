@@ -110,7 +110,7 @@ class OtherTypes:
         """Take all that waits, and count it."""
         for topic, reader in self._readers.items():
             self._count(topic, reader)
-        self._reports.look()
+        self._reports.poll()
 
     def close(self) -> None:
         """Idempotent."""
@@ -237,7 +237,7 @@ class Subscriber:
         if publishers:
             self.is_latched = all(publisher.transient_local for publisher in publishers)
             self.has_latched = any(publisher.transient_local for publisher in publishers)
-        self._senders.look([publisher.gid for publisher in publishers], now_s)
+        self._senders.poll([publisher.gid for publisher in publishers], now_s)
         self._look_at_others(type_name, found, now_s)
         if not type_name or not self._is_available(type_name, is_published=bool(publishers)):
             return
@@ -258,7 +258,7 @@ class Subscriber:
         for reader in self._readers:
             self._take(reader, now_s)
         if self._stream is not None:
-            self._stream.look(now_s)
+            self._stream.poll(now_s)
 
     def update(self, sensor: SensorSettings, now_s: float) -> None:
         """Go on by other settings."""
@@ -430,7 +430,7 @@ class Subscriber:
         is_unnamed = taken[0].publisher is None or taken[0].number is None
         if is_unnamed and (not self._senders.gids or last_s is None or now_s - last_s > PAUSE_S):
             gids = [each.gid for each in self._publishers_of(self._chosen) if each.type == self._type]
-            self._senders.look(gids, now_s)
+            self._senders.poll(gids, now_s)
         self._stream.add(taken, self._senders, now_s, paused=self.paused)
 
 

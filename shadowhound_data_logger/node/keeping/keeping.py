@@ -12,7 +12,7 @@ from io import BytesIO
 from typing import Final
 
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import BagSettings, KeepSettings, SensorSettings
 from shadowhound_data_logger.core.model import PREVIEWS, DataObject
@@ -52,9 +52,9 @@ class Keeping:
     def mark(self, item: DataObject) -> DataObject:
         """The object, with the mark if it stays here."""
         sensor = self._sensors.get(item.sensor)
-        if sensor is None or sensor.ship != ON_REQUEST or item.metadata.get(words.MISSION_TYPE) in self._always:
+        if sensor is None or sensor.ship != ON_REQUEST or item.metadata.get(meta.MISSION_TYPE) in self._always:
             return item
-        return replace(item, metadata={**item.metadata, words.SHIP: words.ON_REQUEST})
+        return replace(item, metadata={**item.metadata, meta.SHIP: meta.ON_REQUEST})
 
     def preview(self, item: DataObject) -> DataObject | None:
         """A small picture of an object that stays here, the first of each period; None of anything else."""
@@ -70,12 +70,12 @@ class Keeping:
         if body is None:
             return None
         key = item.key.removeprefix(f'{self._robot}/').rpartition('.')[0]
-        left_out = {words.SHIP, words.COUNT, words.TOPIC, words.TYPE, words.SENSOR, 'width', 'height', 'encoding'}
+        left_out = {meta.SHIP, meta.COUNT, meta.TOPIC, meta.TYPE, meta.SENSOR, 'width', 'height', 'encoding'}
         metadata = {name: value for name, value in item.metadata.items() if name not in left_out}
         return replace(
             item, bucket=item.bucket, key=f'{self._robot}/{PREVIEWS}/{key}.jpg', body=body, content_type='image/jpeg',
             sensor=f'{item.sensor}{PREVIEWS}', topic=None, type='', samples=0, priority=PRIORITY, dedup=False, key_pattern=None,
-            metadata={**metadata, words.PREVIEW_OF: item.key},
+            metadata={**metadata, meta.PREVIEW_OF: item.key},
         )  # fmt: skip
 
     def _is_due(self, item: DataObject) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from statistics import median
 from typing import Any, Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, SECOND, Clock, utc
 from shadowhound_data_logger.core.model import DataObject
 from shadowhound_data_logger.shipping.uploader import UploadStatus
@@ -29,7 +29,7 @@ LINK: Final = '_wifi'
 class LinkTrack:
     """Samples the link while there is something to upload.
 
-    New; ``look`` once a second, on one thread; ``mbps`` from any.
+    New; ``poll`` once a second, on one thread; ``mbps`` from any.
     """
 
     def __init__(self, upload: Callable[[], UploadStatus], marks: Callable[[int], Mapping[str, str]], robot: str, clock: Clock,
@@ -50,7 +50,7 @@ class LinkTrack:
         """Megabits a second at which uploads went lately; None before the first sample."""
         return round(median(self._recent), 3) if self._recent else None
 
-    def look(self, *, is_last: bool = False) -> DataObject | None:
+    def poll(self, *, is_last: bool = False) -> DataObject | None:
         """An object of samples, when one is full or old enough, or at the end."""
         now_s, status = self._monotonic(), self._upload()
         is_away = status.state == 'store_down'
@@ -70,7 +70,7 @@ class LinkTrack:
         stamp_ns = self._clock.wall_ns()
         if not is_away:
             self._recent.append(mbps)
-        pose = self._marks(stamp_ns).get(words.POSE, '').split(' ')
+        pose = self._marks(stamp_ns).get(meta.POSE, '').split(' ')
         if stamp_ns >= EARLIEST_SANE_NS:
             x, y = (float(pose[0]), float(pose[1])) if len(pose) == 4 else (None, None)
             self._samples.append({'stamp_ns': stamp_ns, 'x': x, 'y': y, 'mbps': round(mbps, 3)})
@@ -83,5 +83,5 @@ class LinkTrack:
         return DataObject(
             bucket='sensor-data', key=f'{self._robot}/{LINK}/{utc(start_ns):%Y%m%d/%H%M%S}_wifi.json', body=body,
             content_type='application/json', sensor=LINK, topic=None, type='', samples=0, t_start_ns=start_ns, t_end_ns=end_ns,
-            priority=3, metadata={words.ROBOT: self._robot},
+            priority=3, metadata={meta.ROBOT: self._robot},
         )  # fmt: skip

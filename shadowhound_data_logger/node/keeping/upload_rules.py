@@ -56,7 +56,7 @@ class NewestMessages(Consumer):
 class UploadRules:
     """Says once a second which rules do not hold, and why.
 
-    New; ``look`` on the main thread.
+    New; ``poll`` on the main thread.
     """
 
     def __init__(self, node: Node, settings: Settings, types: MessageTypes, clock: ClockWatch,
@@ -86,11 +86,11 @@ class UploadRules:
         """The rules that do not hold: why. At first none does, because nothing is known."""
         return self._closed
 
-    def look(self) -> Mapping[str, str]:
+    def poll(self) -> Mapping[str, str]:
         """Judge them; returns ``closed``."""
         now_s, closed = time.monotonic(), {}
         for name, rule in self._rules.items():
-            holds, why = rule.judge(self, now_s)
+            holds, why = rule.evaluate(self, now_s)
             if not holds:
                 closed[name] = why
             if holds is (name in self._closed):

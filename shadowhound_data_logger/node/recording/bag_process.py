@@ -290,7 +290,7 @@ def _waits(settings: Settings, bag: str) -> bool:
 
 def _supervise(workers: Iterable[Worker]) -> None:
     for worker in workers:
-        worker.look()
+        worker.poll()
 
 
 @contextmanager

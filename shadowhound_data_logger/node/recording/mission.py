@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND, iso
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import Batch, DataObject
@@ -89,7 +89,7 @@ class MissionWatch:
         mission = self._mission
         if mission is None:
             return MissionStatus()
-        run_id, policy = self._marks.get(words.RUN_ID), self._policies.current()
+        run_id, policy = self._marks.get(meta.RUN_ID), self._policies.current()
         return MissionStatus(mission.id, run_id, mission.mission_type, iso(mission.start_ns), policy)
 
     # -- for the encoders ------------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ class MissionWatch:
                 self._leave(before)
             if found is not None:
                 self._join(found)
-        elif found is not None and words.RUN_ID not in self._marks and self._find_run(found):
+        elif found is not None and meta.RUN_ID not in self._marks and self._find_run(found):
             self._tell(self.status())
         if self._log is not None and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + WRITE_S
@@ -128,7 +128,7 @@ class MissionWatch:
 
     def _join(self, mission: ActiveMission) -> None:
         """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
-        self._marks = {words.MISSION_ID: mission.id, words.MISSION_TYPE: mission.mission_type}
+        self._marks = {meta.MISSION_ID: mission.id, meta.MISSION_TYPE: mission.mission_type}
         self._find_run(mission)
         if self._settings.join:
             node_log = NodeLog(mission, max(1, round(self._settings.period_s * SECOND)))
@@ -167,5 +167,5 @@ class MissionWatch:
     def _find_run(self, mission: ActiveMission) -> bool:
         run = mission.folder.run()
         if run is not None:
-            self._marks = {**self._marks, words.RUN_ID: run.run_id}
+            self._marks = {**self._marks, meta.RUN_ID: run.run_id}
         return run is not None

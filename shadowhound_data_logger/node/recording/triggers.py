@@ -78,7 +78,7 @@ class Inbox:
 
 
 class Judge:
-    """Watches one condition. New; ``look`` at one number after the other. One thread.
+    """Watches one condition. New; ``poll`` at one number after the other. One thread.
 
     It triggers once it has held for its time, and again only after it has not held for as long, a second at least: a number
     that trembles about its threshold makes one event.
@@ -90,7 +90,7 @@ class Judge:
         self._since_s: float | None = None
         """Since when it is as it is now: true while armed, false else; None while it is the other way round."""
 
-    def look(self, value: float, now_s: float) -> bool:
+    def poll(self, value: float, now_s: float) -> bool:
         """Whether this number, of that time by the monotonic clock, triggers. NaN triggers nothing."""
         if not math.isfinite(value):
             return False
@@ -194,7 +194,7 @@ class EventWatch:
             value = number_at(message, test.path.split('.'))
             if value is None:
                 self._tell(condition.name, f'{type_name} has no number {test.path} ({test.text})')
-            elif judge.look(value, now_s):
+            elif judge.poll(value, now_s):
                 self._trigger(condition.name, CONDITION, f'{test.text}: {value:g}', 0.0)
 
     def _follow(self) -> None:

@@ -114,7 +114,7 @@ class Front:
 class PublicNode:
     """Offers the logger's services in the front process: a ROS node with the logger's public name.
 
-    Made once the node answers; ``look`` every second.
+    Made once the node answers; ``poll`` every second.
     """
 
     def __init__(self, connection: Connection, node: Node) -> None:
@@ -138,7 +138,7 @@ class PublicNode:
         self._interface = Interface(node, self._ask)
         self._interface.open()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Follow what has changed in the node (the active mission, parameters that the command line set), and tell how it is."""
         answer = self._ask({'do': 'mission'})
         if answer['ok'] and answer['mission'] != self._mission:
@@ -226,7 +226,7 @@ def _serve(connection: Connection, arguments: Sequence[str]) -> None:
             executor.spin_once(timeout_sec=max(0.0, due_s - time.monotonic()))
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + LOOK_S
-                public.look()
+                public.poll()
     except (ExternalShutdownException, KeyboardInterrupt, RuntimeError):  # rcl raises the last one in the middle of its shutdown
         if rclpy.ok():
             raise

@@ -98,7 +98,7 @@ class Stages:
 class Status:
     """Gathers the state of all stages, and writes it to the status file.
 
-    New; ``look`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last.
+    New; ``poll`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last.
     """
 
     def __init__(self, stages: Stages, settings: Settings, clock: ClockWatch, target: str,
@@ -126,7 +126,7 @@ class Status:
     def earlier(self) -> NodeStatus | None:
         return self._past[0][2] if len(self._past) > 1 else None
 
-    def look(self, *, ended: bool = False) -> NodeStatus | None:
+    def poll(self, *, ended: bool = False) -> NodeStatus | None:
         """The current status; None if the spool cannot be read, which is logged once."""
         now_s, stages = self._monotonic(), self._stages
         try:
@@ -151,7 +151,7 @@ class Status:
             consumers={name: ConsumerStatus(*found) for name, found in stages.intake.consumer_failures().items()},
             workers={worker.name: worker.status() for worker in stages.workers},
         )  # fmt: skip
-        status = replace(status, stalls=self._watchdog.look(status, now_s))
+        status = replace(status, stalls=self._watchdog.poll(status, now_s))
         self._past.append((now_s, upload.sent_bytes, status))
         return status
 

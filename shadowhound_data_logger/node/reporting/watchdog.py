@@ -51,7 +51,7 @@ UNHEARD_S: Final = 30.0
 class Watchdog:
     """Notices what makes no progress though it should.
 
-    New; ``look`` at each status, in their order. ``request_s`` is what one request to the store may take, seconds.
+    New; ``poll`` at each status, in their order. ``request_s`` is what one request to the store may take, seconds.
 
     The keys of what it returns are topics, names of threads, ``encode`` and ``delivery``.
     """
@@ -62,7 +62,7 @@ class Watchdog:
         self._encoding, self._delivering = _Progress(), _Progress()
         self._told: Stalls = {}
 
-    def look(self, status: NodeStatus, now_s: float) -> Stalls:
+    def poll(self, status: NodeStatus, now_s: float) -> Stalls:
         """What stands still; ``now_s`` is monotonic time."""
         stuck = {name: text for name, row in status.workers.items() if (text := _hanging(name, row))}
         writes = 'spool-writer' not in stuck and not _failing(status, 'spool-writer')
@@ -84,7 +84,7 @@ class Watchdog:
     def _topics(self, status: NodeStatus, now_s: float, *, takes: bool) -> dict[str, str]:
         found = {}
         for topic, row in status.topics.items():
-            text = self._detectors.setdefault(topic, SilenceDetector(topic)).look(row, now_s)
+            text = self._detectors.setdefault(topic, SilenceDetector(topic)).poll(row, now_s)
             if text and takes:  # else all of them seem to be silent
                 found[topic] = text
         return found
@@ -156,7 +156,7 @@ class SilenceDetector:
         self._heard_s: float | None = None
         self._received = 0
 
-    def look(self, row: TopicStatus, now_s: float) -> str:
+    def poll(self, row: TopicStatus, now_s: float) -> str:
         """Return what is wrong with the topic; empty where nothing is."""
         if not row.enabled or not row.publishers:
             self._since_s = None

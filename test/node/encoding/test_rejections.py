@@ -33,7 +33,7 @@ class Minute:
 
     def wait(self, seconds: float) -> None:
         self.now_s += seconds
-        self.log.look()
+        self.log.poll()
 
 
 @pytest.fixture

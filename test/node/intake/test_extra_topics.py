@@ -65,14 +65,14 @@ class Recording:
         self.extra = ExtraTopics(around, [self.bags], {})
         self.now_s = time.monotonic()
 
-    def look(self, seconds: float = 0.0) -> set[str]:
+    def poll(self, seconds: float = 0.0) -> set[str]:
         self.now_s += seconds
         self.extra.refresh({}, (), self.now_s, paused=False)
         return {source.topic for source in self.extra.own if source.status().matched}
 
     def until(self, condition: Callable[[set[str]], object]) -> set[str]:
         end = time.monotonic() + WAIT_S
-        while not condition(found := self.look()):
+        while not condition(found := self.poll()):
             assert time.monotonic() < end, found
             time.sleep(0.02)
         return found
@@ -100,7 +100,7 @@ def test_topics_that_no_setting_names_are_few(
         recording.until(lambda found: len(found) == 3 and recording.extra.left_out == 2)
         crowd(robot, '/named')
         assert recording.until(lambda found: '/named' in found and len(found) == 4)
-        recording.look()
+        recording.poll()
     told = [record for record in caplog.records if 'not recorded' in record.message]
     assert len(told) == 1
     assert recording.bags.topics == {source.topic for source in recording.extra.own}
@@ -117,7 +117,7 @@ def test_what_nobody_publishes_any_more_gives_its_place_away(
     recording.until(lambda _: recording.extra.left_out == 1)
     robot.destroy_publisher(first)
     recording.until(lambda found: not found)
-    recording.look(module.GONE_S + 1)
+    recording.poll(module.GONE_S + 1)
     recording.until(lambda found: found == {'/crowd/b'})
     assert [source.topic for source in recording.extra.own] == ['/named', '/crowd/b']
 
@@ -133,7 +133,7 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
             recording.until(lambda found, name=name: name in found)
             robot.destroy_publisher(publisher)
             recording.until(lambda found: not found)
-            recording.look(module.GONE_S + 1)
+            recording.poll(module.GONE_S + 1)
     (again,) = crowd(robot, '/crowd/a')
     recording.until(lambda found: '/crowd/a' in found)
     assert len(recording.group.entities) <= 3, 'rclpy keeps a mark of each subscription that ever was'

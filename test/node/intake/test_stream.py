@@ -179,13 +179,13 @@ def spoken(talk: Talk, how_many: int, **fields: object) -> None:
     for _ in range(how_many):
         taken = talk.messages(1, **fields)
         talk.add(taken, taken[0].source_ns / SECOND)
-        talk.stream.look(taken[0].source_ns / SECOND)
+        talk.stream.poll(taken[0].source_ns / SECOND)
 
 
 def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
     """What is not known is None, never 0."""
     talk = Talk()
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     spoken(talk, 3, **UNNUMBERED)
     account = talk.account
     assert (account.accounting, account.missed, account.missed_estimated, account.unknown) == (RECEIVED_ONLY, None, None, 3)
@@ -194,7 +194,7 @@ def test_without_numbers_and_rhythm_nothing_is_claimed() -> None:
 def test_a_rhythm_counts_what_is_lost() -> None:
     """Once it is known, also what was lost before."""
     talk = Talk()
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     for _ in range(3):
         spoken(talk, 100, **UNNUMBERED)
         talk.messages(7)  # which nobody takes
@@ -207,7 +207,7 @@ def test_a_rhythm_counts_what_is_lost() -> None:
 def test_a_declared_rate_needs_no_learning() -> None:
     """With it even the first gap counts."""
     talk = Talk(expected_hz=10.0)
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     spoken(talk, 2, **UNNUMBERED)
     talk.messages(5)
     spoken(talk, 2, **UNNUMBERED)
@@ -217,7 +217,7 @@ def test_a_declared_rate_needs_no_learning() -> None:
 def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     """Messages that come more often refute it: their rhythm is learned."""
     talk = Talk(expected_hz=4.0)
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     spoken(talk, 500, **UNNUMBERED)
     assert (talk.account.accounting, talk.account.missed_estimated) == (ESTIMATED, 0)
     assert [record.getMessage().partition(':')[0] for record in caplog.records] == [TOPIC]
@@ -226,7 +226,7 @@ def test_a_declared_rate_that_is_wrong_is_told_once(caplog: pytest.LogCaptureFix
 def test_a_counter_that_cannot_be_read_is_told(caplog: pytest.LogCaptureFixture) -> None:
     """Stamps are used then."""
     talk = Talk(counter='data')
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     spoken(talk, 300, **UNNUMBERED)
     assert talk.account.accounting == ESTIMATED
     assert 'talk.counter cannot be used' in caplog.text
@@ -236,12 +236,12 @@ def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
     """Between one publisher and the next there is no loss; between one that went away and came back there is."""
     for successor, lost in (('b', 0), ('a', 50)):
         talk = Talk(expected_hz=10.0)
-        talk.senders.look(['a'])
+        talk.senders.poll(['a'])
         spoken(talk, 10, **UNNUMBERED)
         talk.messages(50)
         now_s = talk.messages(1)[0].source_ns / SECOND
-        talk.senders.look([], now_s - 3.0)
-        talk.senders.look([successor], now_s)
+        talk.senders.poll([], now_s - 3.0)
+        talk.senders.poll([successor], now_s)
         next(talk.numbers)
         spoken(talk, 10, **UNNUMBERED)
         assert talk.account.missed_estimated == lost + bool(lost) * 2
@@ -250,12 +250,12 @@ def test_what_another_publisher_did_not_publish_is_not_lost() -> None:
 def test_a_second_sender_leaves_the_numbers_of_the_first_alone() -> None:
     """Messages whose sender nobody knows are received, and no gap in the numbers of the one that goes on."""
     talk = Talk()
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     talk.add(talk.messages(3, publisher=None))
-    talk.senders.look(['a', 'b'])
+    talk.senders.poll(['a', 'b'])
     talk.add(talk.messages(3, publisher=None))
     assert (talk.account.accounting, talk.account.missed) == (RECEIVED_ONLY, None)
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     talk.add(talk.messages(3, publisher=None))
     account = talk.account
     assert (account.accounting, account.received, account.unknown, account.missed) == (EXACT, 9, 3, None)
@@ -276,10 +276,10 @@ def test_what_two_subscriptions_deliver_is_counted_once() -> None:
 def test_a_history_that_comes_again_when_a_second_sender_appears() -> None:
     """What was taken while one sender was known is known again by its time and number, though nobody can say whose it is."""
     talk = Talk()
-    talk.senders.look(['a'])
+    talk.senders.poll(['a'])
     taken = talk.messages(3, publisher=None)
     talk.add(taken)
-    talk.senders.look(['a', 'b'])
+    talk.senders.poll(['a', 'b'])
     talk.add([*talk.messages(1, publisher=None), *taken])
     assert talk.account.received == 4
     assert talk.kept() == [1, 2, 3, 4]

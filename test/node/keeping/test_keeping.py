@@ -13,7 +13,7 @@ from spool.making import NOON_NS, make
 
 from shadowhound_data_logger.bags.manifest import MissionOf
 from shadowhound_data_logger.bags.state import BagState
-from shadowhound_data_logger.core import metadata_words as words
+from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.model import DataObject
@@ -39,7 +39,7 @@ def picture(kind: str = 'JPEG', mode: str = 'RGB') -> bytes:
 def frame(body: bytes, content_type: str = 'image/jpeg', after_s: float = 0.0, **fields: Any) -> DataObject:
     stamp_ns = NOON_NS + round(after_s * SECOND)
     return make(body=body, content_type=content_type, t_start_ns=stamp_ns, t_end_ns=stamp_ns,
-                metadata={words.ROBOT: 'thor', words.POSE: '1 2 0 odom'}, **fields)  # fmt: skip
+                metadata={meta.ROBOT: 'thor', meta.POSE: '1 2 0 odom'}, **fields)  # fmt: skip
 
 
 @pytest.mark.parametrize(('body', 'content_type'), [
@@ -58,7 +58,7 @@ def test_a_preview_is_small_and_says_of_what(body: bytes, content_type: str) -> 
     assert max(DECODED_SIZE) <= max(Image.open(BytesIO(found.body)).size) <= max(PREVIEW_SIZE)
     assert (found.key, found.sensor) == ('thor/_previews/camera/20251018/120000_front.jpg', 'camera_previews')
     assert (found.topic, found.samples, found.is_on_request) == (None, 0, False)
-    assert found.metadata == {words.ROBOT: 'thor', words.POSE: '1 2 0 odom', words.PREVIEW_OF: kept.key}
+    assert found.metadata == {meta.ROBOT: 'thor', meta.POSE: '1 2 0 odom', meta.PREVIEW_OF: kept.key}
 
 
 def test_a_preview_a_second() -> None:
@@ -90,7 +90,7 @@ def test_what_cannot_be_shown_has_none(make_body: Callable[[], bytes], content_t
 def test_missions_of_named_types_and_events_are_sent(tmp_path: Any) -> None:
     """Whatever their sensors and bags do otherwise."""
     keeper = keeping()
-    inspection, patrol = (make(metadata={words.MISSION_TYPE: name}) for name in ('inspection', 'patrol'))
+    inspection, patrol = (make(metadata={meta.MISSION_TYPE: name}) for name in ('inspection', 'patrol'))
     assert not keeper.mark(inspection).is_on_request
     assert keeper.mark(patrol).is_on_request
     settings = Settings.load(PARAMETERS, {})

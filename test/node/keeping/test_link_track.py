@@ -34,11 +34,11 @@ class Link:
             self.clock.now_ns += SECOND
             sent = self.status.sent_bytes + bytes_a_second
             self.status = replace(self.status, state=state, in_flight=int(state == 'shipping'), sent_bytes=sent)
-            if (found := self.track.look()) is not None:
+            if (found := self.track.poll()) is not None:
                 self.made.append(found)
 
     def end(self) -> list[dict[str, Any]]:
-        last = self.track.look(is_last=True)
+        last = self.track.poll(is_last=True)
         assert last
         assert isinstance(last.body, bytes)
         samples: list[dict[str, Any]] = json.loads(last.body)['samples']
@@ -62,7 +62,7 @@ def test_a_sample_is_five_seconds_without_a_pause() -> None:
 def test_the_first_object_comes_after_a_minute_and_others_after_ten() -> None:
     """So that a pace is known soon; and nothing is made where nothing was sent."""
     link = Link()
-    assert link.track.look(is_last=True) is None
+    assert link.track.poll(is_last=True) is None
     link.send(65, 1000)
     assert link.made == []
     link.send(1, 1000)

@@ -73,10 +73,10 @@ def test_a_rule_about_a_topic_that_nobody_publishes_is_told(monkeypatch: pytest.
     rules = UploadRules(node, settings, MessageTypes([]), SimpleNamespace(is_set=True), MissionStatus)  # type: ignore[arg-type]
     for passed_s, is_told in ((0.0, False), (STALE_S - 1, False), (STALE_S, True), (STALE_S + 1, True)):
         now_s[0] = 1000.0 + passed_s
-        assert 'upload.when' in rules.look()
+        assert 'upload.when' in rules.poll()
         assert bool(rules.stuck) is is_told
     text = rules.stuck['upload.when']
     assert text == ('upload.when waits for /lowstate, which nobody publishes: start what publishes it, or change upload.when')
     publishers['/lowstate'] = 1
-    rules.look()
+    rules.poll()
     assert rules.stuck == {}

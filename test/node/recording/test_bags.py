@@ -125,11 +125,11 @@ def test_repeats_without_a_sender_are_dropped(ear: Ear) -> None:
 def test_a_bag_is_told_what_the_rhythm_says(ear: Ear) -> None:
     """What came before it was known stays unknown; what is lost after that is estimated, by the same rhythm as the sensor's."""
     senders = Senders()
-    senders.look(['a'])
+    senders.poll(['a'])
     for start in (*range(0, 300, 20), *range(340, 400, 20)):
         taken = [message._replace(number=None) for message in messages(*range(start, start + 20), publisher=None)]
         ear.stream.add(taken, senders, (start + 20) / 100, paused=False)
-        ear.stream.look((start + 20) / 100)
+        ear.stream.poll((start + 20) / 100)
     account = ear.account
     assert (account.received, account.estimated + account.unknown, account.unknown) == (360, 360, 220)
     assert (account.missed, account.missed_estimated, account.estimated_missed) == (None, None, {'transport': 40})

@@ -21,7 +21,7 @@ def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
     """The places of the values, a period apart, at which the condition triggered."""
     (condition,) = conditions([text])
     judge = Judge(condition)
-    return [place for place, value in enumerate(values) if judge.look(value, place * period_s)]
+    return [place for place, value in enumerate(values) if judge.poll(value, place * period_s)]
 
 
 @pytest.mark.parametrize(('text', 'values', 'places'), [
@@ -58,7 +58,7 @@ def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> No
         message = kind(header, 28.5, 31.0, -2.0, 10.0, 15.0, 15.0, share, 2, 1, 3, True, none, none, '', '')
         value = number_at(message, condition.test.path.split('.'))
         assert value is not None
-        told.append((judge.look(value, 10.0 * len(told)), battery_pct(message, condition.test.path.split('.'))))
+        told.append((judge.poll(value, 10.0 * len(told)), battery_pct(message, condition.test.path.split('.'))))
     assert told == [(False, 73.0), (True, 25.0), (False, None)]
 
 

@@ -117,11 +117,11 @@ class Setting:
         settings = replace(Settings.load({'robot': 'thor'}, {}), home=folder)
         self.status = Status(stages, settings, ClockWatch(self.clock, 600.0), 'a store', lambda: self.now_s)
 
-    def look(self, seconds: float = 1.0) -> NodeStatus:
+    def poll(self, seconds: float = 1.0) -> NodeStatus:
         """So much later."""
         self.now_s += seconds
         self.clock.now_ns += round(seconds * 1e9)
-        found = self.status.look()
+        found = self.status.poll()
         assert found
         return found
 
@@ -141,10 +141,10 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
 
 def test_a_topic_before_and_after_its_first_message(setting: Setting) -> None:
     """It is listed from the start; its age and whether anything was missed are unknown until something came."""
-    row = setting.look().topics['/imu']
+    row = setting.poll().topics['/imu']
     assert (row.sensor, row.publishers, row.received, row.age_s, row.missed) == ('imu', 1, 0, None, None)
     setting.receive(50)
-    row = setting.look(0.5).topics['/imu']
+    row = setting.poll(0.5).topics['/imu']
     assert (row.received, row.open, row.age_s, row.missed, row.accounting) == (50, 50, 0.5, 0, 'exact')
 
 
@@ -155,7 +155,7 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
         setting.receive(100 if second < 10 else 10, total)
         total += 100 if second < 10 else 10
         setting.uploader.told = replace(setting.uploader.told, sent_bytes=250_000 * second)
-        found = setting.look()
+        found = setting.poll()
     assert found.topics['/imu'].rate_hz == pytest.approx(10.0)
     assert found.store.mbps == pytest.approx(2.0)
     assert setting.status.earlier
@@ -165,7 +165,7 @@ def test_rates_are_those_of_the_last_seconds(setting: Setting) -> None:
 def test_what_lies_in_the_spool(setting: Setting) -> None:
     """Objects and bytes that wait, for how long, and the room there is."""
     put(setting.spool, make('thor/a.jpg', b'12345'), make('thor/b.jpg', b'123', held='clock'))
-    spool = setting.look(3.0).spool
+    spool = setting.poll(3.0).spool
     assert (spool.pending, spool.held, spool.bytes, spool.oldest_age_s) == (1, 1, 8, 3.0)
     assert spool.free_bytes
     assert spool.max_bytes == 20 << 30
@@ -175,7 +175,7 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
     """Each thread has its row: whether it lives and fails, how often it failed and died, and why."""
     worker = setting.intake.worker
     worker.failing, worker.last_error, worker.failures, worker.deaths = True, 'ValueError: x', 3, 1
-    workers = setting.look().workers
+    workers = setting.poll().workers
     assert workers['intake'] == WorkerStatus(alive=False, failing=True, failures=3, deaths=1, last_error='ValueError: x')
     others = {'encode-0', 'spool-writer', 'upload-lock', 'upload-0', 'mission', 'bag-writer', 'event-writer', 'control'}
     assert set(workers) == {'intake', *others}
@@ -184,19 +184,19 @@ def test_a_failing_worker_is_told(setting: Setting) -> None:
 def test_a_stall_is_told(setting: Setting) -> None:
     """What the watchdog finds stands in the status: here a batch that nobody takes from the queue."""
     setting.queue.put(Batch('imu', '/imu', 't', (Sample(1, b''),), 1), 5)
-    assert setting.look().stalls == {}
-    assert 'no batch was encoded for 11 s' in setting.look(11.0).stalls['encode']
+    assert setting.poll().stalls == {}
+    assert 'no batch was encoded for 11 s' in setting.poll(11.0).stalls['encode']
 
 
 def test_the_reader_finds_what_was_written(setting: Setting, tmp_path: Path) -> None:
     """The command line's reader sees a running node, with every figure, and after the last one that it has ended."""
     setting.receive(7)
-    written = setting.look()
+    written = setting.poll()
     setting.status.write(written)
     found = read(tmp_path / 'spool', 'thor', setting.clock)
     assert found.running
     assert found.node == written
-    ended = setting.status.look(ended=True)
+    ended = setting.status.poll(ended=True)
     assert ended
     setting.status.write(ended)
     assert read(tmp_path / 'spool', 'thor', setting.clock).state == 'not_running'
@@ -211,7 +211,7 @@ def test_a_disk_that_refuses_is_said_once(setting: Setting, caplog: pytest.LogCa
     blocked.mkdir()
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
-            setting.status.write(setting.look())
+            setting.status.write(setting.poll())
     (record,) = caplog.records
     assert 'the status cannot be written' in record.message
 
@@ -220,8 +220,8 @@ def test_a_spool_that_cannot_be_read_is_said_once(setting: Setting, caplog: pyte
     """Then there is no status, and what was written before stays, growing old."""
     setting.spool.usage = broken  # type: ignore[method-assign]
     with caplog.at_level(logging.WARNING):
-        assert setting.status.look() is None
-        assert setting.status.look() is None
+        assert setting.status.poll() is None
+        assert setting.status.poll() is None
     (record,) = caplog.records
     assert 'the status cannot be gathered' in record.message
 

@@ -37,30 +37,30 @@ class Watch:
         self.now_s = 1000.0
         self.heard_s: float | None = None
 
-    def look(self, seconds: float = 1.0) -> dict[str, str]:
+    def poll(self, seconds: float = 1.0) -> dict[str, str]:
         """So much later."""
         self.now_s += seconds
         self.imu['age_s'] = None if self.heard_s is None else self.now_s - self.heard_s
-        return dict(self.dog.look(parse(NodeStatus, self.status), self.now_s))
+        return dict(self.dog.poll(parse(NodeStatus, self.status), self.now_s))
 
     def hear(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
         """So many messages before each of so many looks."""
         for _ in range(times):
             self.imu['received'] += messages
             self.heard_s = self.now_s + every_s
-            assert self.look(every_s) == {}
+            assert self.poll(every_s) == {}
 
     def wait(self, seconds: int) -> dict[str, str]:
         """Look once a second; nothing may be found before the last look."""
         for _ in range(seconds - 1):
-            assert self.look() == {}
-        return self.look()
+            assert self.poll() == {}
+        return self.poll()
 
 
 @pytest.fixture
 def watch() -> Watch:
     made = Watch()
-    assert made.look() == {}
+    assert made.poll() == {}
     return made
 
 
@@ -76,8 +76,8 @@ def test_a_topic_that_stops_while_its_publisher_lives(watch: Watch, caplog: pyte
     caplog.set_level(logging.INFO)
     watch.hear(100, times=20)
     found = watch.wait(6)
-    assert found == {'/imu': 'silent for 6 s after 100 Hz, though its publisher is there; look at the program that publishes it'}
-    assert '/imu' in watch.look()
+    assert found == {'/imu': 'silent for 6 s after 100 Hz, though its publisher is there; poll at the program that publishes it'}
+    assert '/imu' in watch.poll()
     watch.hear(100)
     assert watch.wait(5) == {}
     assert [record.getMessage() for record in caplog.records] == [f'/imu: {found["/imu"]}', '/imu: working again']
@@ -135,7 +135,7 @@ def test_a_publisher_without_a_connection(watch: Watch, *, may_be_silent: bool) 
 def test_a_topic_that_nobody_can_listen_to_here(watch: Watch) -> None:
     """Told at once, with the package that is missing."""
     watch.imu |= {'matched': 0, 'unavailable': 'its message package is not installed here (x)'}
-    assert watch.look() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
+    assert watch.poll() == {'/imu': 'it cannot be subscribed to here: its message package is not installed here (x)'}
 
 
 def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
@@ -153,7 +153,7 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
     watch.hear(100, times=20)
     watch.workers['intake'] |= trouble
     for _ in range(20):
-        assert set(watch.look()) <= {'intake'}
+        assert set(watch.poll()) <= {'intake'}
 
 
 @pytest.mark.parametrize(
@@ -166,9 +166,9 @@ def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str)
     """Each thread has its own patience; for the one that holds the drain lock any length is fine."""
     stages.workers['upload-lock']['busy_s'] = 1e6
     stages.workers[name]['busy_s'] = busy_s - 1.1
-    assert stages.look() == {}
+    assert stages.poll() == {}
     stages.workers[name]['busy_s'] = busy_s
-    found = stages.look()
+    found = stages.poll()
     assert list(found) == [name]
     assert words in found[name]
 
@@ -178,12 +178,12 @@ def test_a_pool_that_encodes_nothing(stages: Watch) -> None:
     stages.queue['batches'] = 7
     for number in range(30):
         stages.queue['finished'] = number
-        assert stages.look() == {}
+        assert stages.poll() == {}
     assert 'no batch was encoded for 11 s and 7 wait: the encoders are busy' in stages.wait(11)['encode']
     stages.workers['encode-0'] |= {'failing': True, 'last_error': 'KeyError: x'}
-    assert 'the encoders fail (KeyError: x)' in stages.look()['encode']
+    assert 'the encoders fail (KeyError: x)' in stages.poll()['encode']
     stages.queue['batches'] = 0
-    assert stages.look() == {}
+    assert stages.poll() == {}
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_a_drain_that_sends_nothing(stages: Watch, store: dict[str, Any], words:
     assert '9 objects wait and nothing was sent for 66 s: ' in (text := stages.wait(66)['delivery'])
     assert words in text
     stages.workers['upload-0'] |= {'failing': True, 'last_error': 'KeyError: x'}
-    assert 'the upload threads fail (KeyError: x)' in stages.look()['delivery']
+    assert 'the upload threads fail (KeyError: x)' in stages.poll()['delivery']
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_a_disk_that_fails_is_the_one_cause(stages: Watch, trouble: dict[str, An
     stages.workers['encode-0']['busy_s'] = 100.0
     stages.workers['spool-writer'] |= trouble
     for _ in range(100):
-        assert set(stages.look()) <= {'spool-writer'}
+        assert set(stages.poll()) <= {'spool-writer'}
 
 
 @pytest.mark.parametrize(('idle_s', 'patience_s'), [(events.IDLE_S, events.PATIENCE_S), (recorder.IDLE_S, recorder.PATIENCE_S)])

@@ -1,13 +1,13 @@
-"""The words of an object's S3 metadata, each defined only here; docs/formats.md explains them.
+"""The keys of an object's S3 metadata, each defined only here; docs/formats.md explains them.
 
-Beside them an encoder's facts of the content (``width``, ``points``, ...) become metadata, under the names that it gives them.
+In addition an encoder's facts about the content (``width``, ``points``, ...) become metadata under their own names.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-# Where it comes from.
+# Origin.
 ROBOT: Final = 'robot'
 SENSOR: Final = 'sensor'
 TOPIC: Final = 'topic'
@@ -15,7 +15,7 @@ TYPE: Final = 'type'
 COUNT: Final = 'count'
 SHA256: Final = 'sha256'
 
-# The mission that it began in, and what the robot was doing then.
+# The mission during which it began, and the state of the robot at that time.
 MISSION_ID: Final = 'mission_id'
 MISSION_TYPE: Final = 'mission_type'
 RUN_ID: Final = 'run_id'
@@ -33,9 +33,9 @@ RECEIVED_START_NS: Final = 'received_start_ns'
 RECEIVED_END_NS: Final = 'received_end_ns'
 STAMP_START_NS: Final = 'stamp_start_ns'
 STAMP_END_NS: Final = 'stamp_end_ns'
-"""Of messages whose stamps were not trusted: what these were."""
+"""The stamps of messages whose stamps were not trusted."""
 BY_ARRIVAL: Final = 'by_arrival'
-"""How many of its messages are dated by their arrival."""
+"""How many messages are dated by their arrival."""
 BOOT_ID: Final = 'boot_id'
 BOOT_START_NS: Final = 'boot_start_ns'
 BOOT_END_NS: Final = 'boot_end_ns'
@@ -50,23 +50,24 @@ KEY_PATTERN: Final = 'key_pattern'
 
 # Repeats of the content before it.
 CONTENT_KEY: Final = 'content_key'
-"""Of a repeat, in the index alone: the key of the object that holds its content, in the same bucket."""
+"""Set on a repeat, in the index only: the key of the object with its content, in the same bucket."""
 REPEATS: Final = 'repeats'
 REPEATS_OF: Final = 'repeats_of'
 REPEATS_UNTIL_NS: Final = 'repeats_until_ns'
 
 # A part of the gap journal.
 GAP_VERSION: Final = 'gap_version'
-"""Up to which change of the journal in the index all is told (``spool/gaps.py``), in the last part of those of one moment."""
+"""The last change of the index's journal that this part covers (``spool/gaps.py``); in the last part of those written together.
+"""
 
-# What stays on the robot until somebody asks for it.
+# Data kept on the robot until requested.
 SHIP: Final = 'ship'
 ON_REQUEST: Final = 'on_request'
 """The one value of ``ship``."""
 THINNED: Final = 'thinned'
-"""Of what has lost messages because room ran short: one of so many is left, of the topics with pictures and clouds."""
+"""Set if messages were removed to save space: one of this many is left, on topics with images and clouds."""
 PREVIEW_OF: Final = 'preview_of'
-"""Of a preview: the key of the object that it is a small picture of, in the same bucket."""
+"""Set on a preview: the key of the original image, in the same bucket."""
 
 # A file of a bag.
 BAG: Final = 'bag'
@@ -74,6 +75,6 @@ SLICE: Final = 'slice'
 MESSAGES: Final = 'messages'
 EVENT: Final = 'event'
 CUT_OF: Final = 'cut_of'
-"""Of a bag that was cut out of kept slices for a request: the bag that those are of."""
+"""Set on a bag that was cut from kept slices for a request: their bag."""
 # A recording that was imported: the identity of the episode (datasets/imports.py).
 IMPORTED_FROM: Final = 'imported_from'
