@@ -24,16 +24,8 @@ from rosbags.typesys.base import normalize_fieldname
 from shadowhound_data_logger.core.clock import iso
 from shadowhound_data_logger.core.errors import Rejected
 from shadowhound_data_logger.core.model import Sample
-from shadowhound_data_logger.formats.cdr_statistics import BatchStatistics
 from shadowhound_data_logger.formats.payload import Job, Payload, Rejections
-from shadowhound_data_logger.formats.statistics import (
-    INFINITE,
-    NONE,
-    WITHOUT_STATISTICS,
-    FieldStatistics,
-    covers,
-    pack_statistics,
-)
+from shadowhound_data_logger.formats.statistics import INFINITE, NONE, FieldStatistics, pack_statistics
 from shadowhound_data_logger.formats.types import PLACEHOLDER, MessageTypes, nested_type
 
 if TYPE_CHECKING:
@@ -64,15 +56,13 @@ def encode_records(job: Job, rejections: Rejections) -> Payload | None:
     records = _records(job, _batch_record if batched else _single_record, kept, rejections)
     parts: list[bytes] = []
     non_finite = 0
-    are_widened = False
     while some := list(islice(records, RECORDS_PER_PART)):
-        part, missing, is_widened = _dump(some)
-        are_widened |= is_widened
+        part, missing = _dump(some)
         parts.append(part[1:-1])
         non_finite += missing
     if not kept:
         return None
-    statistics = _statistics(job, kept, parts, batched=batched, is_widened=are_widened)
+    statistics = _statistics(job, parts)
     body = b','.join(parts)
     if batched:
         body = b'%b,"samples":[%b]}' % (_batch_header(job, kept)[:-1], body)
@@ -138,55 +128,29 @@ def _vector(vector: Any) -> dict[str, float]:
 
 _SPECIAL_RECORDS: Final[Mapping[str, Callable[[Sample, Any], dict[str, Any]]]] = {ODOMETRY: _odometry}
 """Types with a special form for single records."""
-_SPECIAL_FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
-    ODOMETRY: {'pose.pose.position': 'position', 'pose.pose.orientation': 'orientation', 'twist.twist.linear': 'linear_velocity',
-               'twist.twist.angular': 'angular_velocity'},
-}  # fmt: skip
-"""The names in these records of the fields of the message."""
 
 
-def _statistics(job: Job, kept: Sequence[Sample], parts: Sequence[bytes], *, batched: bool, is_widened: bool) -> bytes:
-    """Statistics of the numbers in the JSON: from the CDR if all messages have one layout, otherwise by parsing the JSON."""
+def _statistics(job: Job, parts: Sequence[bytes]) -> bytes:
+    """Statistics of the numbers in the JSON."""
     if job.sensor.statistics == (NONE,):
         return b''
-    packed = None
-    if not is_widened:
-        of_batch = _batch_statistics(job.types, job.batch.type, job.sensor.statistics, batched)
-        packed = of_batch.compute([sample.cdr for sample in kept])
-    if packed is None:
-        found = FieldStatistics(job.sensor.statistics)
-        for part in parts:
-            found.add(orjson.loads(b'[%b]' % part))
-        packed = pack_statistics(found.result())
-    return packed
+    found = FieldStatistics(job.sensor.statistics)
+    for part in parts:
+        found.add(orjson.loads(b'[%b]' % part))
+    return pack_statistics(found.result())
 
 
-@lru_cache(maxsize=1024)
-def _batch_statistics(types: MessageTypes, type_name: str, chosen: tuple[str, ...], batched: bool) -> BatchStatistics:
-    special = None if batched else _SPECIAL_FIELDS.get(type_name)
-    names = [name for name, _ in types.fields(type_name)]
-    free = {name: _unused_name(name, _RESERVED if batched else _RESERVED_SINGLE, names) for name in names}
-
-    def named(path: str) -> str | None:
-        if special is not None:
-            return next((new + path[len(old) :] for old, new in special.items() if covers(old, path)), None)
-        name, dot, rest = path.partition('.')
-        return None if free[name] in WITHOUT_STATISTICS else f'{free[name]}{dot}{rest}'
-
-    return BatchStatistics(types, type_name, chosen, named)
-
-
-def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int, bool]:
-    """The records as a JSON list, the count of non-finite numbers, and whether ``widen`` was applied."""
+def _dump(records: list[dict[str, Any]]) -> tuple[bytes, int]:
+    """The records as a JSON list, and the count of non-finite numbers."""
     body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
-    if is_widened := _DOUBLE_ROUNDED in body:
+    if _DOUBLE_ROUNDED in body:
         records = widen(records)
         body = orjson.dumps(records, option=orjson.OPT_SERIALIZE_NUMPY)
     # Only NaN and infinities become null, but text may contain the word.
     non_finite = _count_nulls(orjson.loads(body)) if b'null' in body else 0
     if non_finite:
         body = orjson.dumps(_with_infinities(records), option=orjson.OPT_SERIALIZE_NUMPY)
-    return body, non_finite, is_widened
+    return body, non_finite
 
 
 def _with_infinities(value: Any) -> Any:

@@ -24,8 +24,8 @@ MAX_ELEMENTS: Final = 20
 MAX_DEPTH: Final = 8
 MAX_PACKED_BYTES: Final = 1 << 16
 """Maximum size of an object's packed statistics."""
-MEAN_ERROR: Final = 2.0**-22
-"""A float32 and its shortest decimal differ by at most 2^-24, relative, and the mean is stored as a float32."""
+MEAN_ERROR: Final = 2.0**-50
+"""Relative to the largest magnitude: sums are rounded, those of the parts and their total."""
 ALL: Final = ''
 INFINITE: Final = ('Infinity', '-Infinity')
 """Infinities in JSON."""
@@ -39,8 +39,7 @@ WITHOUT_STATISTICS: Final = frozenset({'stamp_ns', 'timestamp', 'header', 'non_f
 class Statistic:
     """Statistics of the finite numbers of a field in an object; None if it has none. The mean is None if the sum overflows.
 
-    The mean may differ from the mean of the decimals in the JSON, which the encoder does not parse again, by at most
-    ``max(abs(min), abs(max)) * MEAN_ERROR``.
+    The mean is exact to ``max(abs(min), abs(max)) * MEAN_ERROR``.
     """
 
     first: float | None
@@ -200,39 +199,13 @@ def pack_statistics(found: Mapping[str, Statistic]) -> bytes:
     """The statistics as JSON; empty if there are none or they exceed ``MAX_PACKED_BYTES``."""
     if ALL not in found:
         return b''
-    names = [name for name in found if name != ALL]
-    rows = [[getattr(found[name], each) for name in names] for each in _NUMBERS_PACKED]
-    part = {'fields': names, 'numbers': rows, **{each: [getattr(found[name], each) for name in names] for each in _COUNTS_PACKED}}
-    return pack_parts(found[ALL].count, found[ALL].nan_count, [part] if names else [])
-
-
-def pack_parts(messages: int, omitted: int, parts: Sequence[Mapping[str, Any]]) -> bytes:
-    """Like ``pack_statistics``, for parts of the ``fields``, each with ``numbers``: rows of first, last, mean, min and max.
-
-    A single row applies to all five; without rows, the fields have no finite numbers. ``count`` and ``nan_count`` are one
-    number for all fields of a part, or a list with a number for each.
-    """
-    packed = orjson.dumps({'messages': messages, 'omitted': omitted, 'parts': parts}, option=orjson.OPT_SERIALIZE_NUMPY)
+    packed = orjson.dumps({name: numbers_of(one) for name, one in found.items()})
     return packed if len(packed) <= MAX_PACKED_BYTES else b''
 
 
 def unpack_statistics(packed: bytes) -> dict[str, Statistic]:
     """The statistics that were packed; empty if the bytes are damaged."""
     try:
-        return dict(_unpack(orjson.loads(packed))) if packed else {}
-    except (ValueError, TypeError, LookupError, AttributeError):
+        return {str(name): Statistic(*numbers) for name, numbers in orjson.loads(packed).items()} if packed else {}
+    except (ValueError, TypeError, AttributeError):
         return {}
-
-
-def _unpack(document: Any) -> Iterator[tuple[str, Statistic]]:
-    yield ALL, object_row(int(document['messages']), int(document['omitted']))
-    for part in document['parts']:
-        names, rows = part['fields'], part['numbers'] or [[None] * len(part['fields'])]
-        rows = rows * len(_NUMBERS_PACKED) if len(rows) == 1 else rows
-        counts = [part[each] if isinstance(part[each], list) else [part[each]] * len(names) for each in _COUNTS_PACKED]
-        for name, *numbers, count, nan_count in zip(names, *rows, *counts, strict=True):
-            yield str(name), Statistic(**dict(zip(_NUMBERS_PACKED, numbers, strict=True)), count=count, nan_count=nan_count)
-
-
-_NUMBERS_PACKED: Final = ('first', 'last', 'mean', 'min', 'max')
-_COUNTS_PACKED: Final = ('count', 'nan_count')
