@@ -25,7 +25,6 @@ from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.schema import BUCKET, OBJECTS, row_of
 from shadowhound_data_logger.lake import likeness
 from shadowhound_data_logger.lake.bucket import Bucket, put_part
-from shadowhound_data_logger.lake.image_models import Vectors
 from shadowhound_data_logger.stores import open_store
 
 FIRST_NS: Final = 1_790_812_800 * SECOND
@@ -40,14 +39,9 @@ class Numbers:
 
     name, digest = 'drawn numbers', hashlib.sha256(b'drawn').hexdigest()
 
-    def embed_images(self, pictures: Any) -> Vectors:
-        raise NotImplementedError
-
-    def embed_text(self, text: str) -> Vectors:
-        raise NotImplementedError
-
 
 def measure(options: argparse.Namespace) -> Report:
+    model: Any = Numbers()
     rng = np.random.default_rng(1)
     vectors = rng.standard_normal((options.vectors, options.numbers), np.float32)
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype('<f2')
@@ -80,10 +74,10 @@ def measure(options: argparse.Namespace) -> Report:
             for start in range(0, len(rows), 4096):
                 few = enumerate(rows[start : start + 4096])
                 some = [(bytes.fromhex(str(row['sha256'])), vectors[start + place]) for place, row in few]
-                likeness.put_vectors(store, Numbers(), 'thor', '2026-10-01', some)
+                likeness.put_vectors(store, model, 'thor', '2026-10-01', some)
         progress('and asked for')
         began_s = time.perf_counter()
-        answer = likeness.like(Bucket(settings, BUCKET), Numbers(), wanted, limit=LIMIT)
+        answer = likeness.like(Bucket(settings, BUCKET), model, wanted, limit=LIMIT)
         whole_s = time.perf_counter() - began_s
         assert answer.without == 0
         assert answer.rows['key'].to_pylist()[0] == rows[1]['key']

@@ -16,6 +16,7 @@ from shadowhound_data_logger.cli.question import asking, question, quietly, repo
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.lake.findings import Findings
+    from shadowhound_data_logger.lake.image_models import OnnxPair
     from shadowhound_data_logger.lake.likeness import Embedded
 
 REASONS: Final = {
@@ -24,13 +25,11 @@ REASONS: Final = {
 }  # fmt: skip
 model_option = click.option(
     '--model', type=click.Path(path_type=Path, exists=True, file_okay=False), metavar='DIR',
-    help='Folder with the ONNX models of images and text, such as CLIP  [default: a perceptual hash, no model]',
+    help='Folder with the ONNX models of images and text, such as CLIP.',
 )  # fmt: skip
 
 
-@click.command(
-    'embed', epilog=examples('lake embed --sensor camera', 'lake embed --sensor camera --since 7d --model clip-vit-base-patch32')
-)
+@click.command('embed', epilog=examples('lake embed --model clip-vit-base-patch32 --sensor camera --since 7d'))
 @question
 @model_option
 @as_json
@@ -40,8 +39,8 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
     It embeds all images that the flags select and that have no vector of this model yet. The vectors are stored in
     sensor-data/_vectors/: run it again when there are new images, or after an interruption.
 
-    Without --model it uses the perceptual hash dHash, which finds nearly identical images. A model is a folder with
-    vision_model.onnx and, for --like-text, text_model.onnx and tokenizer.json, as Hugging Face exports CLIP and SigLIP.
+    A model is a folder with vision_model.onnx and, for --like-text, text_model.onnx and tokenizer.json, as Hugging Face
+    exports CLIP and SigLIP.
 
     Exit code 1 if images could not be read.
     """
@@ -49,10 +48,9 @@ def lake_embed(*, flags: Mapping[str, Any], model: Path | None, as_json: bool) -
     with asking():
         from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - the extra lake
         from shadowhound_data_logger.lake.bucket import default_source  # noqa: PLC0415
-        from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
         from shadowhound_data_logger.lake.names import check_names  # noqa: PLC0415
 
-        chosen, left_out = open_model(model), quietly()
+        chosen, left_out = _opened(model), quietly()
         with the_store() as store, progress('pictures', of='objects') as bar:
             source = default_source(the_store_settings())
             found = likeness.embed(store, source, chosen, findings=left_out, progress=bar, **flags)
@@ -80,9 +78,8 @@ def most_similar(source: Any, like: Path | None, text: str | None, folder: Path 
     """The rows of the most similar pictures, with their similarity; objects without a vector are reported on standard error."""
     from shadowhound_data_logger.core.untrusted import open_image  # noqa: PLC0415
     from shadowhound_data_logger.lake import likeness  # noqa: PLC0415 - the extra lake
-    from shadowhound_data_logger.lake.image_models import open_model  # noqa: PLC0415
 
-    model = open_model(folder)
+    model = _opened(folder)
     try:
         if like is not None:
             with open_image(like) as opened:
@@ -93,9 +90,14 @@ def most_similar(source: Any, like: Path | None, text: str | None, folder: Path 
         raise BadUsage(f'{like or "the text"} cannot be compared: {error}', 'a JPEG, PNG or TIFF is a picture') from error
     found = likeness.like(source, model, wanted, limit=limit, findings=left_out, **flags)
     if found.without:
-        again = 'shadowhound-data lake embed' + (f' --model {folder}' if folder else '')
-        told = (
-            f'{number(found.without)} of {counted(found.pictures, "picture")} have no vector by {model.name}: {again} makes them'
-        )
-        click.echo(told, err=True)
+        told = f'{number(found.without)} of {counted(found.pictures, "picture")} have no vector by {model.name}'
+        click.echo(f'{told}: shadowhound-data lake embed --model {folder} makes them', err=True)
     return found.rows
+
+
+def _opened(folder: Path | None) -> OnnxPair:
+    from shadowhound_data_logger.lake.image_models import LAYOUT, OnnxPair  # noqa: PLC0415 - the extra lake
+
+    if folder is None:
+        raise BadUsage('images are compared by a model', f'--model DIR: {LAYOUT}')
+    return OnnxPair.open(folder)

@@ -56,7 +56,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
         'query --topic /odom --limit 5 --format csv',
         "query --when 'imu.accelerometer.2 > 15' --since 7d --json > bumps.json",
         'query --sensor camera --ranges bumps.json',
-        'query --sensor camera --like door.jpg --limit 20 --sheet doors.jpg',
+        'query --sensor camera --like door.jpg --model clip-vit-base-patch32 --limit 20',
         'query "SELECT sensor, count(*) AS n FROM objects GROUP BY sensor" --since 7d',
     )
 )
@@ -82,7 +82,7 @@ _ORDER: Final = re.compile(r'\w+(\s+(asc|desc))?', re.IGNORECASE)
     '--pad', 'pad_s', type=click.FloatRange(0.0), default=0.0, metavar='S', help='Extend each time by S seconds at both ends.'
 )
 @click.option('--like', 'like', type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar='FILE',
-              help='Find the images most similar to this one, with vectors made by `lake embed`.')  # fmt: skip
+              help='Find the images most similar to this one, with vectors made by `lake embed`; needs --model.')  # fmt: skip
 @click.option('--like-text', metavar='TEXT', help='Find the images that best match these words; needs --model.')
 @model_option
 @click.option('--as-of', metavar='TIME', help='Use the version of the tables at this time, to the second.')

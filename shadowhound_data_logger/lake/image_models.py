@@ -1,4 +1,4 @@
-"""Embeds images and texts as vectors, with a pair of ONNX models that the user supplies, or without one by a perceptual hash.
+"""Embeds images and texts as vectors, with a pair of ONNX models that the user supplies.
 
 The layout of a model's folder is that of Hugging Face's exports of CLIP and SigLIP, such as Xenova/clip-vit-base-patch32:
 ``vision_model.onnx`` and, for queries in words, ``text_model.onnx``; next to them or one folder up ``preprocessor_config.json``
@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ IMAGE_MODELS: Final = ('vision_model.onnx', 'image.onnx', 'model.onnx')
 TEXT_MODELS: Final = ('text_model.onnx', 'text.onnx')
 FOLDERS: Final = ('.', 'onnx')
 PREPROCESSOR, TOKENIZER = 'preprocessor_config.json', 'tokenizer.json'
-DHASH: Final = 'dhash1'
 MAX_DIMENSIONS: Final = 4096
 """Numbers in a vector."""
 MAX_SIDE: Final = 2048
@@ -37,46 +36,6 @@ LAYOUT: Final = (
     'Face exports CLIP and SigLIP'
 )
 EXTRA: Final = "pip install 'shadowhound_data_logger[likeness]'"
-
-
-class ImageModel(Protocol):
-    """Computes vectors of length 1; similar images have similar vectors."""
-
-    @property
-    def name(self) -> str:
-        """The name for messages."""
-
-    @property
-    def digest(self) -> str:
-        """Identifies the model."""
-
-    def embed_images(self, pictures: Sequence[Any]) -> Vectors:
-        """Vectors (n, d) of n Pillow images. Raises LakeError, ValueError."""
-
-    def embed_text(self, text: str) -> Vectors:
-        """The vector (d,) of a text. Raises LakeError if the model has no text model."""
-
-
-class DifferenceHash:
-    """The perceptual hash dHash: whether each pixel of the image, scaled to 9 x 8 gray values, is brighter than its neighbor.
-
-    It is a vector of 64 numbers, each 1/8 or -1/8: the similarity of two is 1 - 2 h / 64 if h bits differ.
-    Source: Neal Krawetz, "Kind of Like That" (hackerfactor.com, 2013).
-    """
-
-    name = 'the perceptual hash dHash'
-    digest = DHASH
-
-    def embed_images(self, pictures: Sequence[Any]) -> Vectors:
-        from PIL import Image  # noqa: PLC0415
-
-        small = [np.asarray(each.convert('L').resize((9, 8), Image.Resampling.LANCZOS), np.int16) for each in pictures]
-        bits = np.stack(small)[:, :, 1:] > np.stack(small)[:, :, :-1]
-        found: Vectors = np.where(bits.reshape(len(small), 64), np.float32(0.125), np.float32(-0.125))
-        return found
-
-    def embed_text(self, text: str) -> Vectors:  # noqa: ARG002
-        raise LakeError('a query in words requires a text model', remedy=f'--model DIR: {LAYOUT}')
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +72,7 @@ class _Preparation:
 
 @dataclass(slots=True)
 class OnnxPair:
-    """A vision model and, if present, its text model. Not thread-safe."""
+    """A vision model and, if present, its text model; similar images have similar vectors. Not thread-safe."""
 
     folder: Path
     _files: dict[str, Path]
@@ -123,6 +82,7 @@ class OnnxPair:
 
     @property
     def name(self) -> str:
+        """The name for messages."""
         return f'the model {self.folder.name} ({self.digest[:12]})'
 
     @classmethod
@@ -143,6 +103,7 @@ class OnnxPair:
         return cls(folder, files, digest.hexdigest())
 
     def embed_images(self, pictures: Sequence[Any]) -> Vectors:
+        """Vectors (n, d), of length 1, of n Pillow images. Raises LakeError, ValueError."""
         session = self._session('image')
         preparation = self._preparation or self._prepare(session)
         self._preparation = preparation
@@ -153,6 +114,7 @@ class OnnxPair:
         return _unit(np.concatenate([self._run('image', {name: piece}) for piece in pieces]), self.name)
 
     def embed_text(self, text: str) -> Vectors:
+        """The vector (d,) of a text. Raises LakeError if there is no text model."""
         if 'text' not in self._files or 'tokenizer' not in self._files:
             raise LakeError(f'{self.folder} has no text model', remedy=f'for queries in words --model is {LAYOUT}')
         try:
@@ -219,11 +181,6 @@ class OnnxPair:
                 f'{wanted} of {self._files[role]} has the shape {found.shape}, expected (n, up to {MAX_DIMENSIONS:,})'
             )
         return found
-
-
-def open_model(folder: Path | None) -> ImageModel:
-    """Open the model in a folder, or without a folder the perceptual hash. Raises LakeError."""
-    return OnnxPair.open(folder) if folder is not None else DifferenceHash()
 
 
 def _find(folder: Path, names: Sequence[str]) -> Path | None:

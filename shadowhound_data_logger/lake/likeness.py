@@ -31,7 +31,7 @@ from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES, is_path, op
 from shadowhound_data_logger.lake import query
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.image_models import MAX_DIMENSIONS, ImageModel, Vectors
+from shadowhound_data_logger.lake.image_models import MAX_DIMENSIONS, OnnxPair, Vectors
 from shadowhound_data_logger.lake.pictures import IMAGES
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -74,7 +74,7 @@ class Likeness:
     """How many of the images have no vector of this model."""
 
 
-def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Findings | None = None,
+def embed(store: ObjectStore, source: Bucket, model: OnnxPair, *, findings: Findings | None = None,
           progress: ProgressListener | None = None, **flags: Any) -> Embedded:  # fmt: skip
     """Compute the missing vectors of all images that the flags select (``query.objects``).
 
@@ -112,7 +112,7 @@ def embed(store: ObjectStore, source: Bucket, model: ImageModel, *, findings: Fi
     return found
 
 
-def like(source: Bucket, model: ImageModel, wanted: Vectors, *, limit: int, findings: Findings | None = None,
+def like(source: Bucket, model: OnnxPair, wanted: Vectors, *, limit: int, findings: Findings | None = None,
          **flags: Any) -> Likeness:  # fmt: skip
     """The images that the flags select, by the similarity of their vectors to a given one (d,). Raises LakeError, StoreError."""
     findings = Findings() if findings is None else findings
@@ -186,7 +186,7 @@ def _opened(
             progress.have(len(some))
 
 
-def _one_by_one(model: ImageModel, some: Sequence[tuple[Mapping[str, Any], Any]], found: Embedded) -> list[Any]:
+def _one_by_one(model: OnnxPair, some: Sequence[tuple[Mapping[str, Any], Any]], found: Embedded) -> list[Any]:
     """Embed images one by one, so that an invalid one does not affect the others; None for an invalid one."""
     made: list[Any] = []
     for _, picture in some:
@@ -199,7 +199,7 @@ def _one_by_one(model: ImageModel, some: Sequence[tuple[Mapping[str, Any], Any]]
 
 
 def put_vectors(
-    store: ObjectStore, model: ImageModel, robot: str, date: str, rows: Sequence[tuple[bytes, NDArray[np.float16]]]
+    store: ObjectStore, model: OnnxPair, robot: str, date: str, rows: Sequence[tuple[bytes, NDArray[np.float16]]]
 ) -> None:
     """Upload a file with vectors of one model and the SHA-256 of their images; returns when it is stored. Raises StoreError."""
     digests = b''.join(digest for digest, _ in rows)
@@ -215,7 +215,7 @@ def put_vectors(
     put_part(store, f'{_prefix(model, robot)}date={date}/{robot}_{name}.parquet', robot, out.getvalue(), len(rows))
 
 
-def _prefix(model: ImageModel, robot: str) -> str:
+def _prefix(model: OnnxPair, robot: str) -> str:
     return f'{FOLDER}/{model.digest[:16]}/{robot}/'
 
 
@@ -232,7 +232,7 @@ class _VectorPart:
     vectors: NDArray[np.float16]
 
 
-def _parts(source: Bucket, model: ImageModel, rows: pa.Table, findings: Findings) -> Iterator[_VectorPart]:
+def _parts(source: Bucket, model: OnnxPair, rows: pa.Table, findings: Findings) -> Iterator[_VectorPart]:
     """All files of vectors for the robots and days of these rows. Raises StoreError."""
     days = set(
         zip(rows['robot'].to_pylist(), (f'{utc(each or 0):%Y-%m-%d}' for each in rows['t_start_ns'].to_pylist()), strict=True)
@@ -261,7 +261,7 @@ def _parts(source: Bucket, model: ImageModel, rows: pa.Table, findings: Findings
                 yield _checked(part, entry.key, findings)
 
 
-def _decoded(body: bytes, model: ImageModel) -> _VectorPart:
+def _decoded(body: bytes, model: OnnxPair) -> _VectorPart:
     """Raises ValueError, or various errors of pyarrow, for an invalid file."""
     file = pq.ParquetFile(io.BytesIO(body))
     schema, metadata = file.schema_arrow, file.metadata.metadata or {}

@@ -68,23 +68,17 @@ def test_embed_then_ask(home: Path) -> None:
 
 def test_a_sensor_that_does_not_exist_is_wrong_usage(home: Path) -> None:
     """The nearest names are suggested."""
-    found = run(home, 'embed', '--sensor', 'camra')
+    found = run(home, 'embed', '--model', str(home / 'colors'), '--sensor', 'camra')
     assert isinstance(found.exception, BadUsage)
     assert found.exception.remedy == "is it 'camera'?"
 
 
-def test_without_a_model(home: Path) -> None:
-    assert '2 vectors made by the perceptual hash dHash' in run(home, 'embed').output
-    rows = json.loads(run(home, 'query', '--like', str(home / 'red.png'), '--json', '--until', '2026-10-28T12:00:02').output)
-    assert [row['likeness'] for row in rows] == [1.0, 1.0]
-
-
 @pytest.mark.parametrize(('arguments', 'says'), [
-    (['--like-text', 'door'], 'a query in words requires a text model'),
+    (['--like-text', 'door'], 'images are compared by a model'),
     (['--like', 'red.png', '--like-text', 'door'], 'asks for pictures'), (['--model', '.'], 'asks for pictures'),
     (['--like', 'red.png', '--order', 'bytes'], 'asks for pictures'),
     (['--like', 'red.png', '--model', '.'], 'has no image model'),
-    (['--like', 'notes.txt'], 'cannot be compared'),
+    (['--like', 'notes.txt', '--model', 'colors'], 'cannot be compared'),
 ])  # fmt: skip
 def test_what_is_no_question(home: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], says: str) -> None:
     monkeypatch.chdir(home)

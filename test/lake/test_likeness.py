@@ -29,7 +29,7 @@ from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.lake import likeness
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.image_models import DifferenceHash, OnnxPair, open_model
+from shadowhound_data_logger.lake.image_models import OnnxPair
 from shadowhound_data_logger.lake.likeness import embed, like, nearest
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
@@ -124,30 +124,6 @@ def test_pictures_that_are_none_are_counted_by_reason(lake: Lake, pair: Path) ->
     found = embed(lake.store, lake.source, OnnxPair.open(pair))
     assert found.made == 4
     assert dict(found.refused) == {'unreadable': 2, 'changed': 1, 'missing': 1}, 'the model makes a zero of a black picture'
-
-
-def test_without_a_model_it_is_the_perceptual_hash(lake: Lake) -> None:
-    model = open_model(None)
-    ramp = Image.linear_gradient('L').rotate(90).resize((80, 60)).convert('RGB')
-    out = io.BytesIO()
-    ramp.save(out, 'JPEG', quality=60)
-    lake.add('ramp', out.getvalue(), NOON_NS + 200 * SECOND)
-    assert embed(lake.store, lake.source, model).made == 5
-    wanted = model.embed_images([ramp.resize((320, 240))])[0]
-    rows = like(lake.source, model, wanted, limit=1).rows.to_pylist()
-    assert rows[0]['key'] == lake.keys['ramp']
-    assert rows[0]['likeness'] > 0.9
-    with pytest.raises(LakeError, match='requires a text model'):
-        model.embed_text('door')
-
-
-def test_the_hash_is_the_published_one() -> None:
-    """A pixel that is brighter than the one to its left is a one."""
-    pixels = np.zeros((8, 9), np.uint8)
-    pixels[:, 4] = 200
-    found = DifferenceHash().embed_images([Image.fromarray(pixels).convert('RGB')])[0].reshape(8, 8)
-    assert (found[:, 3] == 0.125).all()
-    assert (np.delete(found, 3, axis=1) == -0.125).all()
 
 
 @pytest.mark.parametrize(
