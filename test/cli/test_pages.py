@@ -9,9 +9,7 @@ from pathlib import Path
 from click.testing import CliRunner
 from ruamel.yaml import YAML
 
-from shadowhound_data_logger.cli.common import MEANINGS, ExitCode
-from shadowhound_data_logger.cli.main import cli
-from shadowhound_data_logger.cli.pages import (
+from docs.pages import (
     ADVANCED,
     DOCS,
     EXAMPLE,
@@ -23,6 +21,8 @@ from shadowhound_data_logger.cli.pages import (
     main,
     parameters,
 )
+from shadowhound_data_logger.cli.common import MEANINGS, ExitCode
+from shadowhound_data_logger.cli.main import cli
 from shadowhound_data_logger.core.config import DEFAULT_SENSORS, Settings, default_parameters
 
 PACKAGE = Path(__file__).parents[2] / 'shadowhound_data_logger'

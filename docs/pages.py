@@ -1,4 +1,4 @@
-"""``python -m shadowhound_data_logger.cli.pages``: docs/parameters.md and docs/commands.md, generated from the code.
+"""``python -m docs.pages``: docs/parameters.md and docs/commands.md, generated from the code.
 
 A test compares the pages with what this writes, and the environment variables with those that the code reads.
 """
@@ -17,7 +17,7 @@ from shadowhound_data_logger.cli.main import SECTIONS as VERBS
 from shadowhound_data_logger.core.config import Settings
 from shadowhound_data_logger.core.options import DEFAULT_SENSORS, GIBI, GROUPS, MEBI, SensorSettings
 
-DOCS: Final = Path(__file__).parents[2] / 'docs'
+DOCS: Final = Path(__file__).parent
 COLUMNS: Final = ('parameter', 'default', 'allowed', 'live', '')
 HEAD: Final = """\
 # Parameters
