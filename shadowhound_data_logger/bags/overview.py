@@ -66,9 +66,12 @@ class _Facts:
     remark: str = ''
 
 
-def bag_overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0) -> list[BagRow]:
-    """All bags of a robot that started at ``since_ns`` or later, newest last. Raises StoreError, SpoolError."""
-    remote = {bag.name: bag for bag in find_bags(store, robot)}
+def bag_overview(store: ObjectStore, robot: str, home: Path, *, since_ns: int = 0, is_local: bool = False) -> list[BagRow]:
+    """All bags of a robot that started at ``since_ns`` or later, newest last; ``is_local``: only those on this machine.
+
+    Raises StoreError, SpoolError.
+    """
+    remote = {} if is_local else {bag.name: bag for bag in find_bags(store, robot)}
     local: dict[str, list[UnsentFile]] = {}
     for file in local_files(home, robot).values():
         local.setdefault(file.bag, []).append(file)

@@ -50,7 +50,6 @@ from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.errors import BagDamaged, BagError, NameRefused, StoreUnavailable
 from shadowhound_data_logger.core.keys import MAX_BAG_BYTES, check_name
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 STORE_THREADS: Final = 8
 LOCAL_REMEDY: Final = 'shadowhound-data bag verify DIR --deep shows what is damaged'
@@ -155,7 +154,7 @@ def bag_list(*, since: str, robot: str | None, as_json: bool) -> ExitCode:
         try:
             rows = bag_overview(store, robot, the_home(), since_ns=begin_ns)
         except StoreUnavailable as error:
-            rows, away = bag_overview(MemoryStore(name='no store'), robot, the_home(), since_ns=begin_ns), str(error)
+            rows, away = bag_overview(store, robot, the_home(), since_ns=begin_ns, is_local=True), str(error)
             click.echo(f'The store cannot be reached, so this is what is on this machine: {away}', err=True)
     if as_json:
         print_json([with_dates(asdict(row)) for row in rows])

@@ -1,4 +1,4 @@
-"""Stores for objects: S3, a folder, or memory; with one Protocol (``base.py``) and one table of errors (``s3_errors.py``).
+"""Stores for objects: S3 or a folder, with one Protocol (``base.py``) and one table of errors (``s3_errors.py``).
 
 ``bandwidth.py`` limits the upload rate, ``core/retry.py`` retries, ``download.py`` downloads objects to files.
 """

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from ruamel.yaml import YAML
 from shadowhound_tower.embedded import Tower
+from stores.memory import MemoryStore
 from stores.spooled import QUICK
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder, cut_remote
@@ -28,7 +29,6 @@ from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 KINDS = [
     (StoragePlugin.MCAP, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.STORAGE),

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, by_rosbags, messages_of, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.fetch import fetch
 from shadowhound_data_logger.bags.naming import BUCKET
@@ -24,7 +25,6 @@ from shadowhound_data_logger.core.errors import BagDamaged, BagError, StoreUnava
 from shadowhound_data_logger.core.progress import ProgressListener
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 class Counting(MemoryStore):

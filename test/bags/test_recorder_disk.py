@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from bags.recording import ROBOT, Desk, desk, journaled, manifest, missing, numbers, start, write_out
 from clocks import Clocks
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.overview import bag_overview
@@ -20,7 +21,6 @@ from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.formats.rows.parts import read_rows
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool import ledger
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def test_a_disk_without_room_costs_what_comes_meanwhile(tmp_path: Path) -> None:

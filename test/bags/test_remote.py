@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, T0, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.info import info_folder, info_of
 from shadowhound_data_logger.bags.naming import BUCKET
@@ -17,7 +18,6 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def row(store: MemoryStore | DirectoryStore, home: Path, name: str = NAME) -> BagRow:

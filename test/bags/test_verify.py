@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from bags.real_bags import NAME, put_item, stored, write_ours, write_rosbags
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.naming import BUCKET
 from shadowhound_data_logger.bags.remote import find_bag
@@ -18,7 +19,6 @@ from shadowhound_data_logger.bags.verify import VerifiedBag, verify_folder, veri
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import BagError
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 FIRST = f'{NAME}_0.mcap'
 

@@ -12,6 +12,7 @@ from bags.recording import ROBOT, STRING, Desk, desk, manifest, mission, numbers
 from bags.test_recorder import kill, lose_index
 from clocks import NOON_NS, Clocks
 from mcap.reader import make_reader
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.naming import slice_number
 from shadowhound_data_logger.bags.overview import bag_overview
@@ -21,7 +22,6 @@ from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.keys import unsynced
 from shadowhound_data_logger.core.model import Taken
 from shadowhound_data_logger.spool.topic_account import BAG
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 UNSET = 'recording_unsynced_this-boot_00000060'
 

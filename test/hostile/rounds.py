@@ -28,6 +28,7 @@ from lake.making import NOON_NS, row
 from mcap.opcode import Opcode
 from PIL import Image
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.cut import Choice, cut_folder
 from shadowhound_data_logger.bags.description import describe_metadata
@@ -55,7 +56,6 @@ from shadowhound_data_logger.lake.summaries import uploaded
 from shadowhound_data_logger.lake.tables import narrow
 from shadowhound_data_logger.lake.track import NEEDED, Track
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 if sys.version_info >= (3, 14):
     from compression import zstd

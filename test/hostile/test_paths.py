@@ -10,6 +10,7 @@ import pytest
 from bags.real_bags import NAME, put_item, stored, write_ours
 from hostile import bad_parts
 from lake.making import NOON_NS, add_part, folder_store, row
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger import lake
 from shadowhound_data_logger.bags.fetch import fetch
@@ -24,7 +25,6 @@ from shadowhound_data_logger.formats.rows import parts, schema
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.prefetch import Place
 from shadowhound_data_logger.stores import open_store
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 OUT = ['../secret.jpg', '/etc/passwd', 'a/../../secret.jpg', 'a//b', 'a/./b', '', '.', '..', 'a/', '/', 'a\0b', 'a\x1bb', 'a\nb',
        'x' * 256, 'a/' * 600, '\ud800']  # fmt: skip

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spool.making import NOON_NS, FakeClock, make, receive, rows
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.bags.kept import KeptCut
 from shadowhound_data_logger.core import metadata_keys as meta
@@ -18,7 +19,6 @@ from shadowhound_data_logger.core.mailbox import MAILBOX_BUCKET, KeptFilter, Pul
 from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObject, State
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 KEEP = KeepSettings(poll_s=10.0)
 

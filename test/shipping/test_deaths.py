@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 from shipping.fakes import FakeSpool, until
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.model import Put, SpooledObject, State
 from shadowhound_data_logger.shipping.uploader import Uploader
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 class Deadly(MemoryStore):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from shipping.test_with_spool import data_object
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
@@ -14,7 +15,6 @@ from shadowhound_data_logger.core.model import Put, SpooledObject
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.spool.writer import SpoolWriter
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 class Ordered(MemoryStore):

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from shipping.fakes import until
 from shipping.test_with_spool import Draining, data_object, draining, store
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.model import EVENTS_WHEN, UPLOAD_WHEN, DataObject, State, waits_for
 from shadowhound_data_logger.spool.index import Index
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 __all__ = ['draining', 'store']
 MANY = 300

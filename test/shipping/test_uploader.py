@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from shipping.fakes import FakeSpool, until
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.core.errors import (
@@ -25,7 +26,6 @@ from shadowhound_data_logger.core.model import Put, SpooledObject, State
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 SETTINGS = UploadSettings(threads=3, backoff_s=0.1)
 Start = Callable[..., Uploader]

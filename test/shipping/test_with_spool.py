@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from shipping.fakes import until
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.clock import SystemClock
 from shadowhound_data_logger.core.config import SpoolSettings, UploadSettings
@@ -13,7 +14,6 @@ from shadowhound_data_logger.core.model import DataObject, Outcome, SpooledObjec
 from shadowhound_data_logger.shipping.uploader import Uploader
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 SETTINGS = UploadSettings(threads=3, backoff_s=0.1)
 

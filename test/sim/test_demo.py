@@ -25,6 +25,7 @@ from shadowhound_sim.demo_audit import DemoAudit, audit
 from shadowhound_sim.demo_run import Record, SpoolReading, StoreOutage
 from shipping.fakes import until
 from spool.making import FakeClock, make, new_spool, settle
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.config import CatalogSettings
 from shadowhound_data_logger.core.model import DataObject, SpooledObject, State
@@ -32,7 +33,6 @@ from shadowhound_data_logger.formats.rows.parts import encode
 from shadowhound_data_logger.formats.rows.schema import row_of
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 CAMERA, IMU, RAW = '/camera/compressed', '/imu', '/camera/image_raw'

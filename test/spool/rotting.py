@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from spool.making import BUCKET, READY, abandon, make, new_spool, put, receive, rows, settle
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.errors import ObjectRefused
 from shadowhound_data_logger.core.model import Outcome, State
 from shadowhound_data_logger.spool import ledger
 from shadowhound_data_logger.spool.spool import Spool
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 Damage = Callable[[random.Random, Path], None]
 

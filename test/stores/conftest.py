@@ -11,12 +11,12 @@ import pytest
 from botocore.exceptions import ClientError
 from shadowhound_tower.embedded import Tower
 from stores.asking import settings_for
+from stores.memory import MemoryStore
 from stores.spooled import MOTO, QUICK, Spool
 
 from shadowhound_data_logger.core.config import StoreSettings, UploadSettings
 from shadowhound_data_logger.stores import open_reader, open_store
 from shadowhound_data_logger.stores.base import ObjectStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.stores.s3 import S3Store
 
 STORES = ('memory', 'directory', MOTO, pytest.param('seaweed', marks=pytest.mark.seaweedfs),

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from spool.making import make, new_spool, put, settle
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.errors import AccessDenied, CredentialsRejected, StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject, State
@@ -19,7 +20,6 @@ from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.spool import Spool
 from shadowhound_data_logger.stores.base import Content, ObjectStore
 from shadowhound_data_logger.stores.directory import DirectoryStore
-from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 

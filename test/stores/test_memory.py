@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from stores.memory import MemoryStore
 from stores.spooled import Spool
 
 from shadowhound_data_logger.core.errors import StoreUnavailable
 from shadowhound_data_logger.core.model import Put
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 
 def test_it_fails_as_told_and_recovers(spool: Spool, bucket: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from stores.memory import MemoryStore
 from stores.spooled import Spool
 
 from shadowhound_data_logger.core.errors import ObjectRefused, StoreUnavailable
@@ -15,7 +16,6 @@ from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.stores.base import Content, ObjectStore
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
 from shadowhound_data_logger.stores.download import TRIES, download
-from shadowhound_data_logger.stores.memory import MemoryStore
 
 CONTENT = os.urandom(2 * CHUNK_BYTES + 17)
 KEY = 'thor/rosbags/patrol/patrol_0.mcap'

@@ -12,6 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from stores.asking import settings_for
 from stores.fake_s3 import refused, resetting
+from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.errors import ObjectRefused, SettingError, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo
@@ -21,7 +22,6 @@ from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.base import Content
 from shadowhound_data_logger.stores.content import CHUNK_BYTES
 from shadowhound_data_logger.stores.download import download
-from shadowhound_data_logger.stores.memory import MemoryStore
 from shadowhound_data_logger.stores.s3 import S3Store
 from shadowhound_data_logger.stores.s3_obstore import ObstoreStore
 

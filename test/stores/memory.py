@@ -1,4 +1,4 @@
-"""A store in memory for tests, which behaves like the others and fails on request."""
+"""A store in memory, which behaves like the others and fails on request."""
 
 from __future__ import annotations
 
