@@ -37,15 +37,6 @@ _USTAR_SECONDS: Final = 8**11 - 1
 """Eleven octal digits."""
 
 
-def _empty_header() -> bytes:
-    entry = tarfile.TarInfo()
-    entry.mode = _MODE
-    return entry.tobuf(tarfile.USTAR_FORMAT)
-
-
-_EMPTY_HEADER: Final = _empty_header()
-
-
 class ArchiveFile(NamedTuple):
     """One file of an archive."""
 
@@ -110,20 +101,14 @@ def _description(job: Job, sample: Sample, file: Payload, *, has_header: bool) -
 
 def pack_tar(members: Iterable[ArchiveFile]) -> bytes:
     """An uncompressed POSIX tar (ustar), which every reader supports; a file's time is its message's."""
-    parts: list[bytes] = []
-    for member in members:
-        seconds = min(max(member.stamp_ns // SECOND, 0), _USTAR_SECONDS)
-        parts += (_header(member.name, len(member.body), seconds), member.body, bytes(-len(member.body) % tarfile.BLOCKSIZE))
-    return b''.join((*parts, bytes(2 * tarfile.BLOCKSIZE)))
-
-
-def _header(name: str, size: int, seconds: int) -> bytes:
-    """The header that ``tarfile`` would write, in a quarter of the time: fills name, size, time and checksum into a template."""
-    block = bytearray(_EMPTY_HEADER)
-    block[: len(name)] = name.encode('ascii')
-    block[124:148] = b'%011o\0%011o\0' % (size, seconds)
-    block[148:156] = b'%06o\0 ' % (sum(block) - sum(block[148:156]) + 8 * ord(' '))
-    return bytes(block)
+    file = BytesIO()
+    with tarfile.open(fileobj=file, mode='w', format=tarfile.USTAR_FORMAT) as packed:
+        for member in members:
+            entry = tarfile.TarInfo(member.name)
+            entry.size, entry.mode = len(member.body), _MODE
+            entry.mtime = min(max(member.stamp_ns // SECOND, 0), _USTAR_SECONDS)
+            packed.addfile(entry, BytesIO(member.body))
+    return file.getvalue()
 
 
 def pack_zip(members: Iterable[ArchiveFile]) -> bytes:
