@@ -46,7 +46,8 @@ LOOK_S = 2.0
 @click.command(
     epilog=examples(
         'live', 'live --bind 0.0.0.0', 'live --bind 0.0.0.0 --tls tower.crt tower.key',
-        'live --rtsp 8554', 'live --robot thor --robot-url http://thor:8765/ --robot-token thor.token',
+        'live --rtsp 8554', 'live --alert-url https://ntfy.sh/TOPIC',
+        'live --robot thor --robot-url http://thor:8765/ --robot-token thor.token',
     )
 )  # fmt: skip
 @click.option('--bind', default='127.0.0.1', show_default=True, metavar='ADDRESS', help='Address to listen on.')
@@ -69,6 +70,13 @@ LOOK_S = 2.0
               help=f'Serve the cameras over RTSP too, at port {RTSP_PORT} or another; 0 takes a free one.')  # fmt: skip
 @click.option('--tiles', default='', metavar='URL',
               help='Show places on map tiles from here, such as https://tile.example/{z}/{x}/{y}.png.')  # fmt: skip
+@click.option('--alert-url', metavar='URL', envvar='SHADOWHOUND_ALERT_URL',
+              help='Send alerts to this webhook or ntfy topic. A URL with a token belongs into the variable '
+                   'SHADOWHOUND_ALERT_URL.')  # fmt: skip
+@click.option('--alert-silent', type=click.FloatRange(0.1, 1000.0), default=1.0, show_default=True, metavar='HOURS',
+              help='Alert if nothing from a robot arrives for longer.')  # fmt: skip
+@click.option('--alert-lost', type=click.IntRange(0), default=1000, show_default=True, metavar='MESSAGES',
+              help='Alert if more messages of a robot are missing on one day.')  # fmt: skip
 @click.option('--new-tokens', is_flag=True, help='Make new tokens: all viewers must sign in again.')
 @click.option('--robot-url', metavar='URL', help="Relay the live view from this robot's own page.")
 @click.option('--robot-token', type=click.Path(path_type=Path, dir_okay=False), metavar='FILE',
@@ -78,8 +86,9 @@ LOOK_S = 2.0
 @spool_folder
 @as_json
 def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[str, ...],  # noqa: PLR0913 - one an option
-         uploads_mbps: float, rtsp: int | None, tiles: str, new_tokens: bool, robot_url: str | None,
-         robot_token: Path | None, robot: str | None, spool: Path | None, as_json: bool) -> ExitCode:  # fmt: skip
+         uploads_mbps: float, rtsp: int | None, tiles: str, alert_url: str | None, alert_silent: float, alert_lost: int,
+         new_tokens: bool, robot_url: str | None, robot_token: Path | None, robot: str | None, spool: Path | None,
+         as_json: bool) -> ExitCode:  # fmt: skip
     """Serve a web page that shows the robot and its data.
 
     It shows in a browser what the robot sees now, its data, what is missing, and what was recorded at any earlier moment. On
@@ -91,6 +100,7 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     """
     try:
         from shadowhound_data_logger.live.access import RTSP_FILE, make_tokens  # noqa: PLC0415 - loaded by this verb alone
+        from shadowhound_data_logger.live.alerts import AlertSettings  # noqa: PLC0415 - aiohttp
         from shadowhound_data_logger.live.rtsp import USER  # noqa: PLC0415 - the same
         from shadowhound_data_logger.live.server import LiveSettings  # noqa: PLC0415 - aiohttp
     except ImportError as error:
@@ -98,10 +108,11 @@ def live(*, bind: str, port: int, tls: tuple[Path, Path] | None, names: tuple[st
     folder = the_spool(spool)
     tokens = the_home() / 'live'
     paths = make_tokens(tokens, anew=new_tokens)
-    check_urls(folder, robot_url, rtsp, tiles)
+    check_urls(folder, robot_url, rtsp, tiles, alert_url)
     given = LiveSettings(
         spool=folder, robot=robot or '', tokens=tokens, bind=bind, port=port, names=names, certificate=tls or None, rtsp=rtsp,
         uploads_mbps=uploads_mbps, robot_url=robot_url or '', robot_token=robot_token, tiles=tiles,
+        alerts=AlertSettings(url=alert_url, silent_s=3600 * alert_silent, lost=alert_lost) if alert_url else None,
     )  # fmt: skip
     is_robot = spool is not None or rtsp is not None
     settings = as_it_is(given, is_robot=is_robot)
@@ -176,8 +187,10 @@ async def changed(served: LiveSettings, poll: Callable[[], LiveSettings], stop: 
                 return found
 
 
-def check_urls(folder: Path, robot_url: str | None, rtsp: int | None, tiles: str) -> None:
+def check_urls(folder: Path, robot_url: str | None, rtsp: int | None, tiles: str, alert_url: str | None) -> None:
     """Raises BadUsage."""
+    if alert_url and (urlsplit(alert_url).scheme not in ('http', 'https') or not urlsplit(alert_url).hostname):
+        raise BadUsage('--alert-url is not a URL such as https://ntfy.sh/TOPIC')  # it may contain a token
     if robot_url is not None:
         if rtsp is not None:
             raise BadUsage(

@@ -20,6 +20,7 @@ from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import robots
 from shadowhound_data_logger.lake.tables import answer
 from shadowhound_data_logger.lake.views import dates, views
+from shadowhound_data_logger.spool.retention import NO_ROOM
 
 DAY_NS: Final = 24 * 3600 * SECOND
 RECENT_DAYS: Final = 7
@@ -51,6 +52,10 @@ class RobotRow:
     lost: Counter[str] = field(default_factory=Counter)
     """Cause -> messages since midnight (UTC)."""
     harmful: int = 0
+    no_room: int = 0
+    """Messages of today that were deleted because the disk or the spool was full."""
+    quarantined: int = 0
+    """Messages of today that are in quarantine."""
 
     def state(self, now_ns: int) -> tuple[str, str]:
         """How much it needs a look, and why."""
@@ -70,7 +75,8 @@ class RobotRow:
                  (('last', self.last_ns), ('known', self.known_ns), ('mission_at', self.mission_ns))}  # fmt: skip
         return {'robot': self.robot, 'state': state, 'why': why, 'last_date': self.last_date, 'mission': self.mission,
                 'mission_type': self.mission_type, 'lost': sum(self.lost.values()),
-                'causes': [list(pair) for pair in self.lost.most_common(3)], **times}  # fmt: skip
+                'causes': [list(pair) for pair in self.lost.most_common(3)], 'no_room': self.no_room,
+                'quarantined': self.quarantined, **times}  # fmt: skip
 
 
 def overview(source: Bucket, findings: Findings, now_ns: int | None = None) -> list[RobotRow]:
@@ -108,6 +114,8 @@ def _add(found: Mapping[str, RobotRow], each: Mapping[str, Any], midnight_ns: in
     elif each['to_ns'] >= midnight_ns and each['count'] and each['cause'] != journal.OTHER_TYPE:
         row.lost[each['cause'] or each['kind'] or '?'] += each['count']
         row.harmful += each['count'] if each['kind'] in HARMFUL else 0
+        row.no_room += each['count'] if each['cause'] == NO_ROOM else 0
+        row.quarantined += each['count'] if each['kind'] == 'quarantined' else 0
 
 
 _LAST: Final = (

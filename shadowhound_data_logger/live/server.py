@@ -14,6 +14,7 @@ import socket
 import ssl
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -25,18 +26,22 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from shadowhound_data_logger.core.clock import SystemClock
+from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.live.access import Access, OwnNames, is_loopback, make_tokens, rtsp_password
 from shadowhound_data_logger.live.acts import Acts
+from shadowhound_data_logger.live.alerts import Alerts, AlertSettings, Condition, conditions_of_fleet, conditions_of_robot
 from shadowhound_data_logger.live.answers import REQUEST_S, problem
 from shadowhound_data_logger.live.auth import MAX_BODY, Auth, Handler
 from shadowhound_data_logger.live.cameras import Cameras
 from shadowhound_data_logger.live.cuts import Cuts
 from shadowhound_data_logger.live.figures import SpoolFigures
-from shadowhound_data_logger.live.history_process import HistoryProcess
+from shadowhound_data_logger.live.history_process import HistoryProcess, PastUnavailable
 from shadowhound_data_logger.live.kinds import LiveItem
 from shadowhound_data_logger.live.past_routes import PastRoutes
 from shadowhound_data_logger.live.relay import Relay
 from shadowhound_data_logger.live.viewers import Graph, Viewers
+from shadowhound_data_logger.spool.gaps import OBJECTS
+from shadowhound_data_logger.spool.topic_account import WRONG_TYPE
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.live.topics import Topics
@@ -84,6 +89,8 @@ class LiveSettings:
     """What the page is waiting for, in words; empty: nothing."""
     uploads_mbps: float = 4.0
     """What uploads are limited to while somebody watches over the network; 0: they are not limited."""
+    alerts: AlertSettings | None = None
+    """Where alerts are sent; None: nowhere."""
 
 
 class LiveServer:
@@ -109,6 +116,7 @@ class LiveServer:
         )
         self.cuts = Cuts(self.auth, settings.tokens, None if settings.is_of_store else settings.spool)
         self.acts = Acts(self.auth, self.past, self._pool, settings.spool, settings.robot, is_of_store=settings.is_of_store)
+        self._alerts = settings.alerts and Alerts(settings.alerts, settings.tokens / 'alerts.json', self._conditions)
         self._topics: Topics | None = None
         self._relay: Relay | None = None
         self._runner: web.AppRunner | None = None
@@ -143,6 +151,8 @@ class LiveServer:
         self._tickers = [asyncio.create_task(each) for each in (self._tick(), self._end_unknown())]
         for ticker in self._tickers:
             ticker.add_done_callback(_tell_failure)
+        if self._alerts is not None:
+            self._alerts.open()
         if self._settings.rtsp is not None:
             await self.cameras.open_rtsp(self._settings.bind, self._settings.rtsp, rtsp_password(self._settings.tokens))
             self.cameras.serve(self.viewers.camera_topics)
@@ -152,6 +162,8 @@ class LiveServer:
         for ticker in self._tickers:
             ticker.cancel()
         await asyncio.gather(*self._tickers, return_exceptions=True)
+        if self._alerts is not None:
+            await self._alerts.close()
         self.viewers.end(lambda _: True)
         if self._listening is not None:
             self._listening.close()
@@ -252,6 +264,27 @@ class LiveServer:
         """``at`` is when their ages were correct: the ledger may take a while."""
         at_ms = round(time.monotonic() * 1e3, 1)
         return LiveItem('', 'figures', head={'at': at_ms, 'figures': self._figures.now(with_ledger=with_ledger)})
+
+    async def _conditions(self) -> list[Condition]:
+        """What alerts are about: of all robots of a store, or of this robot."""
+        alerts = self._settings.alerts
+        assert alerts is not None
+        if self._settings.is_of_store:
+            head, _ = await self.past.history.ask({'do': 'fleet'})
+            if 'error' in head:
+                raise PastUnavailable(str(head['error']))
+            return list(conditions_of_fleet(head['fleet'], alerts, time.time()))
+        async with self._reading:
+            return await self._loop.run_in_executor(self._pool, partial(self._conditions_here, alerts))
+
+    def _conditions_here(self, alerts: AlertSettings) -> list[Condition]:
+        figures = self._figures.now(with_ledger=False)
+        lost = None
+        with suppress(DataLoggerError):  # without a spool
+            gaps = self._figures.gaps()
+            sink, cause, count = (gaps['columns'].index(name) for name in ('sink', 'cause', 'count'))
+            lost = sum(gap[count] for gap in gaps['gaps'] if gap[sink] == OBJECTS and gap[cause] != WRONG_TYPE)
+        return list(conditions_of_robot(figures, lost, self._settings.spool.parent / 'policies', alerts))
 
     # -- connections and files -------------------------------------------------------------------------------------
 
