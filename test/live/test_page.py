@@ -1042,7 +1042,7 @@ def test_an_operator_asks_a_robot_for_what_it_keeps(browser: Browser, tmp_path: 
             ask, said = page.locator('[data-act=pull]'), page.locator('.pull')
             holds(page, "document.querySelectorAll('rect.kept').length === 1 && document.querySelector('[data-offer]')")
             assert ask.count() == 0
-            assert 'an operator may ask for them' in said.inner_text()
+            assert 'an operator can request them' in said.inner_text()
             press(page.get_by_role('button', name='Sign in', exact=True))
             page.locator('dialog input[name=token]').fill((tmp_path / 'live' / 'operator.token').read_text().strip())
             press(page.locator('dialog button.primary'))

@@ -1,5 +1,5 @@
 // The live page: what the robot sees now, its data, and what is missing.
-import { batch, html, render, useRef, useState } from './vendor/preact.js';
+import { batch, html, render, signal, useRef, useState } from './vendor/preact.js';
 import { Cards, Controls, Findings, Glance, TopicTable } from './data.js';
 import { Link } from './link.js';
 import { fromAddress, toAddress } from './moments.js';
@@ -15,7 +15,7 @@ import { Video } from './video.js';
 
 // For whoever measures: how late items were when they came and when they were drawn, ms.
 const stats = (window.shadowhound = {
-  came: {}, drawn: {}, count: {}, wrong: 0, link: null, robot: () => transforms.robot(),
+  came: {}, drawn: {}, count: {}, wrong: 0, link: null, robot: () => transforms.robot(), view: () => views.cloud?.camera.position.toArray(),
   ages: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, stats.link.now() - at])), at: () => Object.fromEntries([...seen].map(([kind, { at }]) => [kind, at])),
 });
 Plot.rings = ringOf;
@@ -217,6 +217,14 @@ function Guarded({ of, children }) {
   return this.broken === of ? html`<p class="banner bad">The robot says what cannot be shown.</p>` : children;
 }
 
+// On a touch screen a tap on a figure shows its definition, as a mouse does over it.
+const hint = signal('');
+const noHover = matchMedia('(hover: none)');
+document.addEventListener('click', (event) => {
+  const of = noHover.matches && !event.target.closest('button, a, input, select, summary') && event.target.closest('dt, dd, th, td, p, span, b, small')?.closest('[title]');
+  hint.value = of && of.title !== hint.value ? of.title : '';
+});
+
 function App() {
   const box = useRef(null);
   const who = session.value;
@@ -237,6 +245,7 @@ function App() {
         <div class="stack"><${Controls} session=${who} figures=${told} onSignIn=${open} /><${Findings} figures=${told} /></div></div></${Guarded}>` : html`<p class="empty">…</p>`}</section>`}
       <section id="gaps" aria-label="Gaps"><h2>What is missing</h2><${Timeline} session=${who} /></section>
     </main>
+    ${hint.value && html`<p class="hint" role="status">${hint.value}</p>`}
     <dialog ref=${box}><${SignIn} box=${box} onDone=${done} /></dialog>`;
 }
 

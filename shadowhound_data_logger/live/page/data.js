@@ -10,7 +10,7 @@ const COLUMNS = [
   ['received', 'Received', 'Messages that the node received since it first ran'], ['stored', 'Stored', 'Messages that are in objects, delivered or waiting'],
   ['missed', 'Missed', 'Messages that were published and did not reach the node; ~ is an estimate'], ['age', 'Age', 'Seconds since the newest message'],
 ];
-const MARKS = { good: ['●', 'as it should be'], watch: ['▲', 'needs a look'], bad: ['■', 'something is wrong'], none: ['○', 'nobody publishes this now'], idle: ['◌', 'published, and not logged'] };
+const MARKS = { good: ['●', 'as it should be'], watch: ['▲', 'needs a look'], bad: ['■', 'something is wrong'], none: ['○', 'no publisher now'], idle: ['◌', 'published, and not logged'] };
 const MOST_ROWS = 100;
 const MOST_FINDINGS = 10;
 const SEARCHED = 12; // more rows than these get a search box
@@ -57,7 +57,7 @@ export function TopicTable({ figures, now }) {
   const [wanted, setWanted] = useState('');
   const [isAll, setIsAll] = useState(false);
   const rows = allTopics(figures);
-  if (!rows.length) return html`<div class="panel"><p class="empty">No topic has been heard yet.</p></div>`;
+  if (!rows.length) return html`<div class="panel"><p class="empty">No topic has a message yet.</p></div>`;
   const words = wanted.toLowerCase().split(/\s+/).filter(Boolean);
   const found = rows.filter(({ topic, type }) => words.every((word) => `${topic} ${type}`.toLowerCase().includes(word)));
   const shown = isAll ? found : found.slice(0, MOST_ROWS);
@@ -80,22 +80,23 @@ export function TopicTable({ figures, now }) {
         const isOpen = inspected.value === row.topic;
         return [html`<tr key=${row.topic} class=${row.publishers === 0 ? 'silent' : ''}><td><${Mark} kind=${kind} why=${why} /></td>
           <td><button type="button" class="topic" aria-expanded=${isOpen} data-inspect=${row.topic} title="Show the newest message" onClick=${() => { inspected.value = isOpen ? null : row.topic; }}><b>${row.topic}</b></button>
-            <small>${row.publishers === 0 ? 'nobody publishes this · ' : row.isLogged ? `${row.sensor || '–'} · ` : 'not logged · '}<span title=${row.type}>${row.type.split('/').at(-1)}</span></small>
-            ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps">${row.stamps}</small>`}</td>
-          ${COLUMNS.map(([name]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name}>${cell(row, name)}</td>`)}</tr>`,
+            <small>${row.publishers === 0 ? 'no publisher · ' : row.isLogged ? `${row.sensor || '–'} · ` : 'not logged · '}<span title=${row.type}>${row.type.split('/').at(-1)}</span></small>
+            ${row.stamps && html`<small class="stamps" data-topic=${row.topic} data-field="stamps" title="How the stamps of its messages differ from the times at which they arrived">${row.stamps}</small>`}</td>
+          ${COLUMNS.map(([name, , what]) => html`<td class=${`n ${name === 'missed' && (row.missed || row.missed_estimated) && unseen(row.topic) !== 0 ? 'lossy' : ''}`} data-topic=${row.topic} data-field=${name} title=${what}>${cell(row, name)}</td>`)}</tr>`,
         isOpen && html`<tr key=${`${row.topic}#`} class="inspected"><td></td><td colspan=${COLUMNS.length + 1}><${Message} key=${row.topic} topic=${row.topic} /></td></tr>`];
       })}</tbody></table></div>
     ${found.length > shown.length && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${found.length}</button>`}
-    ${!found.length && html`<p class="empty">No topic matches.</p>`}${untold > 0 && html`<p class="note">The robot has ${untold} topics more, which are not told: most of them have no publisher.</p>`}</div>`;
+    ${!found.length && html`<p class="empty">No topic matches.</p>`}${untold > 0 && html`<p class="note">${untold} more topics are not listed: most of them have no publisher.</p>`}</div>`;
 }
 
 function Bar({ part, whole, label }) {
   const share = whole ? Math.min(1, part / whole) : 0;
-  return html`<div class="bar" role="meter" aria-valuenow=${Math.round(share * 100)} aria-valuemin="0" aria-valuemax="100" aria-label=${label}>
+  return html`<div class="bar" role="meter" aria-valuenow=${Math.round(share * 100)} aria-valuemin="0" aria-valuemax="100" aria-label=${label} title=${label}>
     <i class=${share > 0.9 ? 'bad' : share > 0.7 ? 'watch' : ''} style=${{ width: `${share * 100}%` }}></i></div>`;
 }
 
-const T = ({ children, what }) => html`<dt title=${what}>${children}</dt>`;
+// A name with its figure; both have the definition as a tooltip.
+const Row = ({ name, what, field, children }) => html`<dt title=${what}>${name}</dt><dd title=${what} data-field=${field}>${children}</dd>`;
 
 // When all that waits will be there, in words.
 function arrival(waiting, store) {
@@ -112,19 +113,20 @@ export function Cards({ figures }) {
   const rules = Object.entries(store?.waits_for ?? {});
   const storeState = store?.state ? store.state.replaceAll('_', ' ') : 'no node runs';
   const isFine = ['idle', 'shipping', 'not_draining', 'waiting'].includes(store?.state);
+  const sending = store?.mbps ? html`${store.mbps.toFixed(1)} Mbit/s${store.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}` : 'nothing now';
   return html`<div class="cards">
-    <div class="panel card"><h3>Delivery</h3><p class="big" title="What the node does with objects that are ready: sending, waiting for a rule, or trying again"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
-      <dl><${T} what="The store that objects are sent to">to</${T}><dd>${store?.target || '–'}</dd><${T} what="The rate of uploads now">sends</${T}><dd>${store?.mbps ? `${store.mbps.toFixed(1)} Mbit/s` : 'nothing now'}${store?.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}</dd>
-      <${T} what="Objects that the store has confirmed, since the node first ran">delivered</${T}><dd><span data-field="delivered">${digits(objects?.delivered)}</span> objects</dd></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${name}>waits for ${why}</p>`)}</div>
-    <div class="panel card"><h3>Waiting</h3><p class="big" title="Objects on the robot’s disk that are not delivered yet">${digits(waiting)} <small>objects</small></p>
-      <dl><${T} what="Their bytes on disk">size</${T}><dd>${volume(bytes)}</dd><${T} what="When all of them will be in the store, at the rate of the last seconds">delivered in</${T}><dd data-field="left">${arrival(waiting, store)}</dd>
-      <${T} what="How long the oldest of them has been waiting">oldest</${T}><dd>${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</dd></dl></div>
-    <div class="panel card"><h3>Spool</h3><p class="big" title="What the folder for objects on the robot’s disk contains now">${volume(spool?.bytes)}</p>
-      <${Bar} part=${spool?.bytes ?? 0} whole=${spool?.max_bytes} label="how full the spool is" />
-      <dl><${T} what="spool.max_bytes: when it is reached, the least important objects are deleted, and the ledger lists them">of at most</${T}><dd>${volume(spool?.max_bytes)}</dd><${T} what="Free space of the disk that the spool is on">disk has free</${T}><dd>${volume(spool?.free_bytes)}</dd><${T} what="Objects that the store refuses; they stay on the robot, with the reason">quarantined</${T}><dd>${digits(spool?.quarantined)}</dd></dl></div>
-    <div class="panel card"><h3>Queue</h3><p class="big" title="Messages in memory that are not encoded yet">${digits(queue?.messages)} <small>messages</small></p>
-      <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="how full the queue is" />
-      <dl><${T} what="Their bytes">in memory</${T}><dd>${volume(queue?.bytes)}</dd><${T} what="The mission that is running">mission</${T}><dd>${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</dd>${figures.mission?.policy ? html`<${T} what="The policy that this mission runs">policy</${T}><dd data-field="policy">${figures.mission.policy}</dd>` : ''}<${T} what="The bag that is being recorded">bag</${T}><dd>${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</dd></dl></div>
+    <div class="panel card"><h3>Delivery to the store</h3><p class="big" data-field="store" title="What the node does with objects that are ready: sending, waiting for a rule, or trying again"><${Mark} kind=${isFine ? 'good' : store?.state ? 'bad' : 'none'} why=${storeState} /> ${storeState}</p>
+      <dl><${Row} name="to" field="target" what="The store that objects are sent to">${store?.target || '–'}</${Row}><${Row} name="sends" field="mbps" what="The rate of uploads now, and its limit">${sending}</${Row}>
+      <${Row} name="delivered" what="Objects that the store has confirmed since the node first ran"><span data-field="delivered">${digits(objects?.delivered)}</span> objects</${Row}></dl>${store?.last_error && !isFine ? html`<p class="note bad">${store.last_error}</p>` : ''}${rules.map(([name, why]) => html`<p class="note watch" data-field="waits-for" title=${`The setting ${name} delays uploads`}>waits for ${why}</p>`)}</div>
+    <div class="panel card"><h3>Waiting for delivery</h3><p class="big" data-field="waiting" title="Objects on the robot’s disk that the store does not have yet">${digits(waiting)} <small>objects</small></p>
+      <dl><${Row} name="size" field="waiting-bytes" what="The bytes of the objects that wait">${volume(bytes)}</${Row}><${Row} name="delivered in" field="left" what="When all of them will be in the store, at the rate of the last seconds">${arrival(waiting, store)}</${Row}>
+      <${Row} name="oldest" field="oldest" what="How long the oldest of them has been waiting">${spool?.oldest_age_s ? span(spool.oldest_age_s) : '–'}</${Row}></dl></div>
+    <div class="panel card"><h3>Robot’s disk (spool)</h3><p class="big" data-field="spool-bytes" title="Bytes of all objects on the robot’s disk: those that wait, and those that are kept">${volume(spool?.bytes)}</p>
+      <${Bar} part=${spool?.bytes ?? 0} whole=${spool?.max_bytes} label="How full the spool is" />
+      <dl><${Row} name="limit" field="spool-limit" what="spool.max_bytes: when it is reached, the least important objects are deleted, and the ledger lists them">${volume(spool?.max_bytes)}</${Row}><${Row} name="disk has free" field="free" what="Free space on the disk that the spool is on">${volume(spool?.free_bytes)}</${Row}><${Row} name="in quarantine" field="quarantined" what="Objects that the store refused; they stay on the robot, with the reason: shadowhound-data spool list">${digits(spool?.quarantined)}</${Row}></dl></div>
+    <div class="panel card"><h3>Memory (queue)</h3><p class="big" data-field="queue" title="Messages in memory that are not encoded and not on the disk yet">${digits(queue?.messages)} <small>messages</small></p>
+      <${Bar} part=${queue?.messages ?? 0} whole=${queue?.max_messages} label="How full the queue is" />
+      <dl><${Row} name="size" field="queue-bytes" what="The bytes of these messages">${volume(queue?.bytes)}</${Row}><${Row} name="mission" field="mission" what="The mission that is running">${figures.mission?.mission_id || figures.mission?.active?.mission_id || 'none'}</${Row}>${figures.mission?.policy ? html`<${Row} name="policy" field="policy" what="The policy that this mission runs">${figures.mission.policy}</${Row}>` : ''}<${Row} name="bag" field="bag" what="The bag that is being recorded">${figures.bag?.name || figures.bag?.bag || figures.bag?.state || 'none'}</${Row}></dl></div>
   </div>`;
 }
 
@@ -150,11 +152,11 @@ export function Findings({ figures }) {
   const [isAll, setIsAll] = useState(false);
   const { state: asked, results, error } = doctor.value;
   const wrong = results.filter((each) => ['warning', 'error'].includes(each.severity));
-  return html`<div class="panel"><div class="panel-head"><h3>Findings</h3><button type="button" onClick=${examine} disabled=${asked === 'asking'}>${asked === 'asking' ? 'The doctor looks…' : 'Ask the doctor'}</button></div>
+  return html`<div class="panel"><div class="panel-head"><h3>Findings</h3><button type="button" title="Checks the robot, its node, its network and its store; takes up to a minute" onClick=${examine} disabled=${asked === 'asking'}>${asked === 'asking' ? 'The doctor is checking…' : 'Run the doctor'}</button></div>
     ${figures.findings.length ? html`<ul class="findings">${figures.findings.slice(0, isAll ? undefined : MOST_FINDINGS).map((text) => html`<li><${Mark} kind="watch" why="finding" /><span>${text}</span></li>`)}</ul>${!isAll && figures.findings.length > MOST_FINDINGS && html`<button type="button" onClick=${() => setIsAll(true)}>Show all ${figures.findings.length}</button>`}`
-      : html`<p class="empty good">The node has nothing to complain about.</p>`}
+      : html`<p class="empty good">Nothing needs attention.</p>`}
     ${asked === 'told' && html`<div class="doctor" aria-live="polite"><h4>The doctor</h4>
-      ${error ? html`<p class="note bad">${error}</p>` : !wrong.length ? html`<p class="good">${results.length} checks, nothing is wrong.</p>`
+      ${error ? html`<p class="note bad">${error}</p>` : !wrong.length ? html`<p class="good">${results.length} checks, no problem found.</p>`
       : html`<ul class="findings">${wrong.map((each) => html`<li><${Mark} kind=${each.severity === 'error' && !isLate(each) ? 'bad' : 'watch'} why=${isLate(each) ? 'not known: the check did not end in time' : each.severity} />
         <span><b>${isLate(each) ? `Not known (${each.check.split('.')[0]}): ${each.seen}` : each.seen}</b>${each.cause ? html`<br />${each.cause}` : ''}${each.remedy ? html`<br /><code>${each.remedy}</code>` : ''}</span></li>`)}</ul>`}</div>`}
   </div>`;
@@ -183,24 +185,29 @@ export function Glance({ session, figures, onSignIn }) {
   const last = answers.value[0];
   const save = () => (session.role === 'operator' ? act(session, 'event', { name: 'manual' }) : onSignIn());
   return html`<div class="glance"><button type="button" class="primary" disabled=${Boolean(busy.value)} onClick=${save} data-glance="save" title="Keeps what the robot recorded around this moment, at its full rate">Save this moment</button>
-    <span><b>${digits(waiting)}</b> waiting</span><span>${arrival(waiting, store)}</span><a href="#data" class=${findings ? 'watch' : 'good'}>${findings ? `${findings} ${findings === 1 ? 'finding' : 'findings'}` : 'no findings'}</a>
+    <span title="Objects on the robot’s disk that the store does not have yet"><b>${digits(waiting)}</b> waiting</span>${waiting > 0 && html`<span title="When all of them will be in the store">delivered in ${arrival(waiting, store)}</span>`}<a title="What needs attention" href="#data" class=${findings ? 'watch' : 'good'}>${findings ? `${findings} ${findings === 1 ? 'finding' : 'findings'}` : 'no findings'}</a>
     ${last && html`<small class=${last.ok ? '' : 'bad'} role="status">${last.text}</small>`}</div>`;
 }
+
+const ACTS = {
+  'bag start': 'Record all topics of the settings into a bag, until you stop it', 'bag split': 'Close this file of the bag and continue in a new one', 'bag stop': 'End the bag; its files are uploaded',
+  flush: 'Close the batches that are open now, so that their objects are sent', pause: 'Stop storing messages; they are counted as lost (paused)', resume: 'Store messages again',
+};
 
 export function Controls({ session, figures, onSignIn }) {
   const [name, setName] = useState('');
   const [note, setNote] = useState('');
   if (session.role !== 'operator') {
-    return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3></div><p class="empty">You may watch. To trigger events and record bags, sign in with the operator’s token.</p>
+    return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3></div><p class="empty">You can watch. To trigger events and record bags, sign in with the operator’s token.</p>
       <button type="button" class="primary" onClick=${onSignIn}>Sign in as operator</button></div>`;
   }
-  const button = (do_, label, kind = '') => html`<button type="button" class=${kind} disabled=${Boolean(busy.value)} onClick=${() => act(session, do_)} data-act=${do_}>${busy.value === do_ ? '…' : label}</button>`;
+  const button = (do_, label, kind = '') => html`<button type="button" class=${kind} disabled=${Boolean(busy.value)} onClick=${() => act(session, do_)} data-act=${do_} title=${ACTS[do_]}>${busy.value === do_ ? '…' : label}</button>`;
   return html`<div class="panel controls"><div class="panel-head"><h3>Missions, bags, events</h3><span class="unit">you are an operator</span></div>
     <form class="row" onSubmit=${(event) => { event.preventDefault(); act(session, 'event', { name: name || 'manual', ...(note ? { note } : {}) }); }}>
       <input aria-label="Name of the event" placeholder="what happened" maxlength="100" value=${name} onInput=${(event) => setName(event.target.value)} />
       <input aria-label="Note" placeholder="a note" maxlength="1000" value=${note} onInput=${(event) => setNote(event.target.value)} />
-      <button class="primary" disabled=${Boolean(busy.value)} data-act="event">${busy.value === 'event' ? '…' : 'Save this moment'}</button></form>
-    <div class="row"><span class="row-name">Bag</span>${button('bag start', 'Begin')}${button('bag split', 'Split')}${button('bag stop', 'End')}</div>
+      <button class="primary" disabled=${Boolean(busy.value)} data-act="event" title="Keeps what the robot recorded around this moment, at its full rate">${busy.value === 'event' ? '…' : 'Save this moment'}</button></form>
+    <div class="row"><span class="row-name">Bag</span>${button('bag start', 'Start')}${button('bag split', 'Split')}${button('bag stop', 'Stop')}</div>
     <div class="row"><span class="row-name">Node</span>${button('flush', 'Flush')}${figures.paused ? button('resume', 'Resume', 'primary') : button('pause', 'Pause')}</div>
     <ol class="answers" aria-live="polite">${answers.value.map((each) => html`<li class=${each.ok ? '' : 'bad'}><time>${each.at}</time> <b>${each.do}</b> ${each.text}</li>`)}</ol></div>`;
 }

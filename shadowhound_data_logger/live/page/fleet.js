@@ -2,7 +2,7 @@
 import { html, useEffect, useState } from './vendor/preact.js';
 import { Mark } from './data.js';
 import { fleet, openRobot } from './past.js';
-import { digits, moment, span } from './words.js';
+import { digits, meaning, moment, span } from './words.js';
 
 const EVERY_MS = 60000;
 const unknown = (robot) => ({ robot, state: 'none', why: '…', last: null, last_date: '…', mission: '', mission_at: null, lost: null, causes: [], known: null });
@@ -26,11 +26,11 @@ export function Fleet({ chosen, names }) {
   const now = Date.now();
   const ago = (ms) => (ms === null ? '–' : `${span(Math.max(0, now - ms) / 1000)} ago`);
   return html`<div class="panel fleet"><div class="panel-head"><h3>Robots</h3><span class="unit">what needs a look is first</span></div><div class="scroll"><table>
-    <thead><tr><th><span class="visually-hidden">State</span></th><th>Robot</th><th title="When the newest message in the store came to the robot">Last contact</th><th>Last mission</th>
-      <th class="n" title="Messages that are known to be lost since midnight, UTC">Missing today</th><th title="Up to here the robot has told what is missing. What is newer still waits on the robot.">Known until</th></tr></thead>
+    <thead><tr><th><span class="visually-hidden">State</span></th><th>Robot</th><th title="When the newest message in the store came to the robot">Last contact</th><th title="The last mission in the store, and when it started">Last mission</th>
+      <th class="n" title="Messages that are known to be lost since midnight, UTC">Missing today</th><th title="Up to here the robot has reported what is missing. What is newer still waits on the robot.">Known until</th></tr></thead>
     <tbody>${(rows ?? names.map(unknown)).map((row) => html`<tr key=${row.robot} class=${row.robot === chosen ? 'shown' : ''} data-robot=${row.robot} data-state=${rows ? row.state : 'unknown'}><td><${Mark} kind=${row.state} why=${row.why} /></td>
       <td><button type="button" class="link" onClick=${() => openRobot(row.robot)}>${row.robot}</button><small> ${row.state === 'good' ? '' : row.why}</small></td>
-      <td title=${row.last === null ? '' : moment(row.last)}>${row.last === null ? row.last_date || 'never' : ago(row.last)}</td>
-      <td>${row.mission || '–'}${row.mission_at === null ? '' : html` <small>${ago(row.mission_at)}</small>`}</td>
-      <td class=${`n ${row.lost ? 'lossy' : ''}`} data-field="lost" title=${row.causes.map(([cause, count]) => `${cause}: ${count}`).join(', ')}>${digits(row.lost)}</td><td title=${row.known === null ? '' : moment(row.known)}>${ago(row.known)}</td></tr>`)}</tbody></table></div></div>`;
+      <td class="figure" title=${`When the newest message in the store came to the robot${row.last === null ? '' : `: ${moment(row.last)}`}`}>${row.last === null ? row.last_date || 'never' : ago(row.last)}</td>
+      <td class="figure" title="The last mission in the store, and when it started">${row.mission || '–'}${row.mission_at === null ? '' : html` <small>${ago(row.mission_at)}</small>`}</td>
+      <td class=${`n ${row.lost ? 'lossy' : ''}`} data-field="lost" title=${`Messages that are known to be lost since midnight, UTC${row.causes.map(([cause, count], place) => `${place ? ', ' : ': '}${meaning(cause)} ${count}`).join('')}`}>${digits(row.lost)}</td><td class="figure" title=${`Up to here the robot has reported what is missing${row.known === null ? '' : `: ${moment(row.known)}`}`}>${ago(row.known)}</td></tr>`)}</tbody></table></div></div>`;
 }

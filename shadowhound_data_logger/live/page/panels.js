@@ -202,6 +202,12 @@ export function Plan() {
   return html`<${Panel} title="Path" kind=${kind} className="plan" choice=${kind === 'odom'} tools=${html`<${FullScreen} />`}><div class="stage"><canvas ref=${canvas} role="img" aria-label="Where the robot went, on its map or on the floor plan that its lidar makes"></canvas>${nothing && html`<${Why} kind="odom" />`}</div></${Panel}>`;
 }
 
+const DEFINITIONS = {
+  'rpy.x': 'Rotation about the axis that points forward', 'rpy.y': 'Rotation about the axis that points left; positive: nose down', 'rpy.z': 'Rotation about the vertical axis, counterclockwise; it continues beyond 180°',
+  'accel.x': 'Acceleration forward, as the IMU measures it', 'accel.y': 'Acceleration to the left, as the IMU measures it', 'accel.z': 'Acceleration upward, as the IMU measures it; gravity is included',
+  battery: 'Charge of the battery, as the robot reports it', volts: 'Voltage of the battery', body: 'Temperature of the robot’s main board', motor: 'Temperature of the warmest motor', cells: 'Temperature of the warmest cell of the battery',
+};
+
 // -- plots ---------------------------------------------------------------------------------------------------------------------
 
 export function Chart({ title, kind, lines, options, className = '', figure }) {
@@ -226,8 +232,8 @@ export function Chart({ title, kind, lines, options, className = '', figure }) {
   const last = ringOf(kind).last();
   const told = ringOf(kind).names;
   return html`<${Panel} title=${title} kind=${kind} className=${`chart ${className}`}><div class="legend small">
-    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span draggable="true" title="Drag it onto another plot to compare" onDragStart=${(event) => drag(event, { kind, name, label, factor, unit: options.units?.[place] ?? options.unit })}><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
-    ${!lines && html`<span>${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div><${Why} kind=${kind} /></${Panel}>`;
+    ${(lines ?? []).map(([name, label, factor], place) => (!told.length || told.includes(name)) && html`<span draggable="true" title=${`${DEFINITIONS[name] ?? name}. Drag it onto another plot to compare.`} onDragStart=${(event) => drag(event, { kind, name, label, factor, unit: options.units?.[place] ?? options.unit })}><i class=${`stroke line-${place + 1}`}></i>${label} <b>${last[name] === undefined ? '–' : (last[name] * factor).toFixed(options.digits ?? 1)}</b>${options.unit ? ` ${options.units?.[place] ?? options.unit}` : ''}</span>`)}
+    ${!lines && html`<span title="Angles of all joints, as the robot publishes them">${ringOf(kind).names.length} ${figure}</span>`}</div><div class="plot" ref=${box}></div><${Why} kind=${kind} /></${Panel}>`;
 }
 
 // A number of a topic, by its path, as the operator chose it in a message.
@@ -259,7 +265,7 @@ export function NumberPlot({ of }) {
   const why = problems.value[of] || (!past.value && topics.value.length && !(topics.value.find(([name]) => name === topic)?.[3] > 0) ? `Nobody publishes ${topic} now.` : '');
   return html`<section class="panel view chart number" aria-label=${`${path} of ${topic}`} data-plot=${of}><div class="panel-head"><h3 title=${`${topic} ${path}`}>${path} <small>${topic}</small></h3>
     <button type="button" class="icon" onClick=${end} aria-label=${`Close the plot of ${path}`} title="Close">×</button>${!why && html`<${Age} kind="field" of=${of} />`}</div>
-    <div class="legend small"><span><i class="stroke line-1"></i><b data-value>${value === undefined ? '–' : Number.isFinite(value) ? String(Number(value.toPrecision(6))) : String(value)}</b></span></div>
+    <div class="legend small"><span><i class="stroke line-1"></i><b data-value title=${`${path} of ${topic}, the newest value`}>${value === undefined ? '–' : Number.isFinite(value) ? String(Number(value.toPrecision(6))) : String(value)}</b></span></div>
     <div class="plot" ref=${box}></div>${why && html`<p class="why" data-why=${of}>${why}</p>`}</section>`;
 }
 
@@ -285,8 +291,8 @@ export function Gps() {
   const { lat, lat_rest, lon, lon_rest, altitude, status, error } = ringOf('fix').last();
   const has = Number.isFinite(lat) && Number.isFinite(lon);
   return html`<${Panel} title="GPS" kind="fix" className="plan gps" tools=${html`<${FullScreen} />`}><div class="legend small">
-    <span>latitude <b data-field="lat">${has ? (lat + lat_rest).toFixed(7) : '–'}</b></span><span>longitude <b data-field="lon">${has ? (lon + lon_rest).toFixed(7) : '–'}</b></span>
-    <span>altitude <b>${Number.isFinite(altitude) ? altitude.toFixed(1) : '–'}</b> m</span><span>${status === undefined ? '' : FIXES[status] ?? `status ${status}`}${Number.isFinite(error) ? ` ±${error.toFixed(1)} m` : ''}</span></div>
+    <span>latitude <b data-field="lat" title="Degrees north, WGS 84">${has ? (lat + lat_rest).toFixed(7) : '–'}</b></span><span>longitude <b data-field="lon" title="Degrees east, WGS 84">${has ? (lon + lon_rest).toFixed(7) : '–'}</b></span>
+    <span title="Above the WGS 84 ellipsoid">altitude <b>${Number.isFinite(altitude) ? altitude.toFixed(1) : '–'}</b> m</span><span>${status === undefined ? '' : FIXES[status] ?? `status ${status}`}${Number.isFinite(error) ? ` ±${error.toFixed(1)} m` : ''}</span></div>
     <div class="stage"><canvas ref=${canvas} role="img" aria-label="Where the robot went by GPS, north up"></canvas>${session.value.tiles && html`<small class="attribution">map: ${new URL(session.value.tiles.replaceAll(/[{}]/g, '')).host}</small>`}</div><${Why} kind="fix" /></${Panel}>`;
 }
 

@@ -20,7 +20,7 @@ function Request({ each, mbps, mayCancel, cancel }) {
   const isOpen = OPEN.includes(each.state);
   const time = each.from === undefined ? '' : `${moment(each.from)} for ${span((each.to - each.from) / 1000)}`;
   return html`<li class=${['refused', 'expired'].includes(each.state) ? 'bad' : ''} data-request=${each.id} data-state=${each.state}><b>${each.state === 'active' ? 'sending' : each.state}</b> ${each.sensor} ${time}
-    ${each.state !== 'asked' && html`: <span data-field="sent">${digits(each.sent)}</span> of ${digits(each.objects)} objects, ${volume(each.sent_bytes)} of ${volume(each.bytes)}`}
+    ${each.state !== 'asked' && html`: <span data-field="sent" title="Objects that were sent so far">${digits(each.sent)}</span> of ${digits(each.objects)} objects, ${volume(each.sent_bytes)} of ${volume(each.bytes)}`}
     ${isOpen && left > 0 && mbps ? `, the rest in ${span((left * 8e-6) / mbps)}` : ''}${each.why ? `: ${each.why}` : ''} <span class="unit">by ${each.by}</span>
     ${isOpen && mayCancel && html` <button type="button" onClick=${() => cancel(each.id)}>Cancel</button>`}</li>`;
 }
@@ -74,10 +74,10 @@ export function Pull({ session, robot, selected }) {
   const lost = Object.entries(found?.lost ?? {});
   return html`<div class="pull"><div class="panel-head"><h3>Kept on the robot</h3><span class="unit">${clock(from)} for ${span((to - from) / 1000)}</span></div>
     ${found && html`<div class="row"><select aria-label="Sensor" value=${chosen} onChange=${(event) => setSensor(event.target.value)}>${sensors.map((name) => html`<option>${name}</option>`)}</select>
-      <span data-offer=${found.objects}>${digits(found.objects)} objects, ${volume(found.bytes)}${found.seconds === null ? '' : `, ${span(found.seconds)} at ${found.mbps.toFixed(1)} Mbit/s`}</span>
+      <span data-offer=${found.objects} title="What the robot keeps of this sensor in this time, and how long sending it takes">${digits(found.objects)} objects, ${volume(found.bytes)}${found.seconds === null ? '' : `, ${span(found.seconds)} at ${found.mbps.toFixed(1)} Mbit/s`}</span>
       ${lost.length > 0 && html`<span class="note bad">${lost.map(([reason, count]) => `${count} lost (${reason})`).join(', ')}</span>`}
-      ${mayAct ? html`<button type="button" class="primary" data-act="pull" title="They are sent to the store" disabled=${!found.objects} onClick=${() => post({ sensor: chosen, from, to }, `asked ${robot} for them`)}>Ask for them</button>`
-        : html`<span class="unit">an operator may ask for them</span>`}</div>`}
+      ${mayAct ? html`<button type="button" class="primary" data-act="pull" title="They are sent to the store" disabled=${!found.objects} onClick=${() => post({ sensor: chosen, from, to }, `requested from ${robot}`)}>Request them</button>`
+        : html`<span class="unit">an operator can request them</span>`}</div>`}
     ${said[1] && html`<p class=${`note ${said[0]}`} role="status">${said[1]}</p>`}
-    <ol class="answers requests" aria-live="polite">${asked.requests.map((each) => html`<${Request} key=${each.id} each=${each} mbps=${asked.mbps} mayCancel=${mayAct} cancel=${(id) => post({ cancel: id }, 'taken back')} />`)}</ol></div>`;
+    <ol class="answers requests" aria-live="polite">${asked.requests.map((each) => html`<${Request} key=${each.id} each=${each} mbps=${asked.mbps} mayCancel=${mayAct} cancel=${(id) => post({ cancel: id }, 'canceled')} />`)}</ol></div>`;
 }

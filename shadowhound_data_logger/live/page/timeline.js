@@ -22,6 +22,7 @@ const DAY = 1440 * MINUTE;
 const AROUND_MS = 5000; // of a moment, on either side
 const CLICK_PX = 4; // what moves less is no drag
 const STEPS = [1, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 10800].map((seconds) => seconds * 1000);
+const MARKED = { mission: 'A mission, from its start to its end', bag: 'A bag that was recorded', event: 'An event, at the time of its trigger', label: 'A label that an operator added' };
 const exact = (ms) => new Date(ms).toISOString().slice(11, 21);
 const named = (found) => (found?.gaps ?? []).map((row) => Object.fromEntries(found.columns.map((name, place) => [name, row[place]])));
 
@@ -174,7 +175,7 @@ function LabelForm({ session, robot, selected, clear }) {
     try {
       const answer = await fetch('/api/label', { method: 'POST', headers: { 'Content-Type': 'application/json', 'X-CSRF-Token': session.csrf }, body: JSON.stringify({ robot, label, note, from, to }) });
       const content = await answer.json();
-      setSaid(answer.ok ? ['good', `labelled ${label}`] : ['bad', content.error]);
+      setSaid(answer.ok ? ['good', `labeled ${label}`] : ['bad', content.error]);
       if (!answer.ok) return;
       setLabel('');
       setNote('');
@@ -475,12 +476,12 @@ export function Timeline({ session }) {
     </div>
     ${selected && html`<${Selected} selected=${selected} clear=${clear} />`}
     <div class="legend">
-      ${isPast && html`<span><i class="swatch recorded"></i>recorded</span>`}
-      ${kept.length > 0 && html`<span><i class="swatch kept"></i>kept on the robot</span>`}
+      ${isPast && html`<span title="Objects of this topic are stored or wait for the store"><i class="swatch recorded"></i>recorded</span>`}
+      ${kept.length > 0 && html`<span title="Only the robot has it; an operator can request it"><i class="swatch kept"></i>kept on the robot</span>`}
       <span title="The robot has accounted for every message of this time"><i class="swatch known"></i>nothing else is missing</span><span title="The robot has not reported that far, or was off"><i class="swatch unknown"></i>not known yet</span>
       ${deliveries.length > 0 && html`<span title="It reached the store more than half a minute after it was recorded"><i class="swatch late"></i>delivered late</span><span title="It is on the robot and waits for the store"><i class="swatch waits"></i>waits</span>`}
       ${[...seen.values()].map((each) => html`<span title=${meaning(each.cause)}><${Swatch} cause=${each.cause} />${each.kind}: ${each.cause.replaceAll('_', ' ')} <b>${digits(each.messages)}</b></span>`)}
-      ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
+      ${['mission', 'bag', 'event', 'label'].filter((kind) => marks.some((mark) => mark.kind === kind)).map((kind) => html`<span title=${MARKED[kind]}><i class=${`swatch of-${kind}`}></i>${kind}</span>`)}
       ${found && !gaps.length && topics.length > 0 && html`<span class="good">no gap is known in this time</span>`}
       ${topics.length > 0 && html`<span class="unit">${isPast ? 'click: that moment · wheel: zoom · drag: move · shift-drag: select' : 'click on a time to see it again'}</span>`}
     </div>
