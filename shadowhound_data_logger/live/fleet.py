@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from shadowhound_data_logger.core.clock import SECOND, utc
+from shadowhound_data_logger.core.untrusted import visible
 from shadowhound_data_logger.formats.rows.gaps import GAP, GAPS
 from shadowhound_data_logger.formats.rows.schema import OBJECTS, UNDATED
 from shadowhound_data_logger.lake import gaps as journal
@@ -29,6 +30,7 @@ SILENT_NS: Final = DAY_NS
 BEHIND_NS: Final = 600 * SECOND
 """A robot whose account of losses is further behind its newest object has more to tell."""
 MAX_ROBOTS: Final = 2000
+MAX_TEXT: Final = 160
 BAD, WATCH, SILENT, GOOD = 'bad', 'watch', 'none', 'good'
 ORDER: Final = (BAD, WATCH, GOOD, SILENT)
 """What needs a look comes first; a robot that is off is the last."""
@@ -73,9 +75,9 @@ class RobotRow:
         state, why = self.state(now_ns)
         times = {name: round(at_ns / 1e6) if at_ns else None for name, at_ns in
                  (('last', self.last_ns), ('known', self.known_ns), ('mission_at', self.mission_ns))}  # fmt: skip
-        return {'robot': self.robot, 'state': state, 'why': why, 'last_date': self.last_date, 'mission': self.mission,
-                'mission_type': self.mission_type, 'lost': sum(self.lost.values()),
-                'causes': [list(pair) for pair in self.lost.most_common(3)], 'no_room': self.no_room,
+        return {'robot': self.robot, 'state': state, 'why': why, 'last_date': self.last_date, 'mission': _text(self.mission),
+                'mission_type': _text(self.mission_type), 'lost': sum(self.lost.values()),
+                'causes': [[_text(cause), count] for cause, count in self.lost.most_common(3)], 'no_room': self.no_room,
                 'quarantined': self.quarantined, **times}  # fmt: skip
 
 
@@ -116,6 +118,11 @@ def _add(found: Mapping[str, RobotRow], each: Mapping[str, Any], midnight_ns: in
         row.harmful += each['count'] if each['kind'] in HARMFUL else 0
         row.no_room += each['count'] if each['cause'] == NO_ROOM else 0
         row.quarantined += each['count'] if each['kind'] == 'quarantined' else 0
+
+
+def _text(text: str) -> str:
+    """For a page: bounded, and without control characters."""
+    return visible(text[:MAX_TEXT])
 
 
 _LAST: Final = (

@@ -110,3 +110,39 @@ def test_the_table_of_robots(browser: Browser, home: Path, monkeypatch: pytest.M
         page.close()
     finally:
         served.close()
+
+
+NAMES = ('\u202egnp.exe', '\x1b]0;title\x07\x00', 'mission ' * 1250, '\u05d0\u05d1 \u0627\u0628', f'"><{HOSTILE}', '${7*7}')
+"""Of missions: text that turns the direction or moves a cursor, 10 kB, words from right to left, code."""
+
+
+@pytest.mark.long('a Chromium')
+@pytest.mark.skipif(CHROMIUM is None, reason='no Chromium is installed here: apt install chromium')
+def test_hostile_names_of_missions(browser: Browser, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the table of robots, on the timeline and in the choice of a mission they are text on one line, cut where it is long."""
+    now_ns = time.time_ns() - 60 * SECOND
+    with closing(open_store(folder_store(home), UploadSettings())) as store:
+        for place, name in enumerate(NAMES):
+            of_timeline = row('camera', now_ns + place * SECOND, 'thor', mission_id=name, mission_type=name)
+            of_table = row('camera', now_ns, f'r{place}', mission_id=name, mission_type=name)
+            add_part(store, [of_timeline], f'a{place}', home / 'tmp')
+            add_part(store, [of_table], 'a', home / 'tmp')
+    settings = LiveSettings(spool=home / 'none', robot='thor', tokens=home / 'live', port=0, is_of_store=True)
+    served = Served(settings, monkeypatch)
+    try:
+        page = opened(browser, served.server.url)
+        holds(page, f'document.querySelectorAll("[data-mark=mission]").length === {len(NAMES)}')
+        holds(page, f'document.querySelectorAll("tr[data-state]:not([data-state=unknown])").length === {len(NAMES) + 1}')
+        shown = page.locator('[data-mark=mission]').evaluate_all('all => all.map(one => one.dataset.name)')
+        assert all(name.isprintable() and len(name) < 500 for name in shown)
+        assert {NAMES[3], NAMES[4], NAMES[5]} <= set(shown)
+        assert all(each.isprintable() for each in page.locator('body').inner_text().split())
+        page.get_by_label('Mission', exact=True).select_option('2')
+        page.evaluate('document.querySelectorAll("details").forEach(each => { each.open = true; })')
+        for width in (1280, 390):
+            fits(page, width)
+        assert page.evaluate('[window.attacked ?? null, document.querySelectorAll("img[src=x]").length]') == [None, 0]
+        assert page.wrong == []  # type: ignore[attr-defined]
+        page.close()
+    finally:
+        served.close()
