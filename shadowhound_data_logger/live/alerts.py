@@ -122,10 +122,11 @@ def _quarantine(robot: str, count: int) -> Condition:
 
 def _disk(robot: str, spool: Mapping[str, Any]) -> Condition:
     free, reserve, used, most = (spool.get(name) for name in ('free_bytes', 'min_free_bytes', 'bytes', 'max_bytes'))
-    known = free is not None and reserve is not None
-    is_short = (known and free < reserve) or bool(most and used is not None and used > FULL_SHARE * most)
+    is_short = None if free is None or reserve is None else free < reserve
+    if most and used is not None and used > FULL_SHARE * most:
+        is_short = True
     text = 'the disk or the spool is nearly full; when it is full, the least important objects are deleted'
-    return Condition(robot, DISK, is_short if known else None, text)
+    return Condition(robot, DISK, is_short, text)
 
 
 def _hours(seconds: float) -> str:

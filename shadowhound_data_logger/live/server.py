@@ -116,7 +116,9 @@ class LiveServer:
         )
         self.cuts = Cuts(self.auth, settings.tokens, None if settings.is_of_store else settings.spool)
         self.acts = Acts(self.auth, self.past, self._pool, settings.spool, settings.robot, is_of_store=settings.is_of_store)
-        self._alerts = settings.alerts and Alerts(settings.alerts, settings.tokens / 'alerts.json', self._conditions)
+        self._alerts = (
+            None if settings.alerts is None else Alerts(settings.alerts, settings.tokens / 'alerts.json', self._conditions)
+        )
         self._topics: Topics | None = None
         self._relay: Relay | None = None
         self._runner: web.AppRunner | None = None
