@@ -10,6 +10,7 @@ records (``node/recording/bag_process.py``), so neither rclpy nor its signal han
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -17,7 +18,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from shadowhound_data_logger.core.config import default_robot, home
 from shadowhound_data_logger.core.errors import BagError
+from shadowhound_data_logger.spool.local_robot import local_robot
 
 PROGRAM: Final = 'shadowhound_data_logger.node.recording.bag_process'
 DEADLINE_S: Final = 60.0
@@ -66,9 +69,14 @@ def record_and_upload_rosbag(mission_name: str, duration_s: int) -> Recorded:
     return found
 
 
-def record(name: str, duration_s: float, *, topics: Sequence[str] = (), regex: str = '', robot: str = 'thor',
+def record(name: str, duration_s: float, *, topics: Sequence[str] = (), regex: str = '', robot: str = '',
            deadline_s: float = DEADLINE_S) -> Recorded:  # fmt: skip
-    """Like ``record_and_upload_rosbag``, for these topics and those that match ``regex``. SIGINT ends it. Raises BagError."""
+    """Like ``record_and_upload_rosbag``, for these topics and those that match ``regex``. SIGINT ends it.
+
+    ``robot`` is by default the robot of this machine, as for a node without that parameter. Raises BagError, and SettingError
+    where nodes of several robots share this machine.
+    """
+    robot = robot or local_robot(os.environ, home(os.environ) / 'spool') or default_robot(os.environ)
     command = [sys.executable, '-m', PROGRAM, f'--duration={duration_s}', f'--deadline={deadline_s}', f'--robot={robot}']
     command += [f'--topic={topic}' for topic in topics] + ([f'--regex={regex}'] if regex else []) + ['--', name]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:

@@ -112,8 +112,8 @@ def doctor(  # noqa: PLR0913 - one for each option
     else:
         for part in report(results, fixed, context, took_s, verbose=verbose):
             console().print(part)
-        if role is None and context.role is not Role.THOR:
-            guessed = f'This machine was taken for {context.role.value}: --role thor also checks ROS, the disk and the spool.'
+        if role is None and context.role is not Role.ROBOT:
+            guessed = f'This machine was taken for {context.role.value}: --role robot also checks ROS, the disk and the spool.'
             console().print(plain(f'\n{guessed}', 'dim'))
     return exit_code(finding=left)
 
@@ -179,7 +179,7 @@ def report(results: Sequence[Result], fixed: Sequence[tuple[Result, str]], conte
 
 def _verdict(findings: Sequence[Result], context: Context, took_s: float) -> Text:
     """``3 findings: 1 error, 2 warnings``, and the machine."""
-    where = plain(f'  {context.role.value}, robot {context.settings.robot}, {took_s:.1f} s', 'dim')
+    where = plain(f'  role {context.role.value}, robot {context.settings.robot}, {took_s:.1f} s', 'dim')
     if not findings:
         return Text.assemble(('Nothing is wrong', 'bold green'), where)
     counts = Counter(result.severity for result in findings)

@@ -21,12 +21,15 @@ from shadowhound_data_logger.core.config import DEFAULT_SENSORS, SensorSettings,
 from shadowhound_data_logger.core.errors import DataLoggerError
 from shadowhound_data_logger.core.keys import is_name, printable
 from shadowhound_data_logger.core.model import Batch, Sample
+from shadowhound_data_logger.core.ros_arguments import NODE
 from shadowhound_data_logger.core.type_rules import not_logged, sensor_for
 from shadowhound_data_logger.ros.endpoints import alternatives
 
 if TYPE_CHECKING:
     from shadowhound_data_logger.doctor.ros_watch import WatchedTopic
+    from shadowhound_data_logger.ros.endpoints import Endpoint
 
+LOGGER_NODES: Final = frozenset({NODE, 'shadowhound_policy'})
 LATCHED_S: Final = 3600.0
 """What is stored on a change is assumed to change once in so long."""
 
@@ -116,7 +119,8 @@ def _proposals(seconds: float, namespace: str, robot: str) -> list[Proposal]:
     with ros_watch.node(namespace=namespace) as node:
         named = {node.resolve_topic_name(topic): (sensor, topic, types) for sensor in defaults
                  for topic, types in zip(sensor.topics, sensor.types, strict=False)}  # fmt: skip
-        found = ros_watch.published(node, within=namespace)
+        published = ros_watch.published(node, within=namespace)
+        found = {topic: others for topic, each in published.items() if (others := [one for one in each if not _is_loggers(one)])}
         heard = ros_watch.listen(node, found, seconds, {})
     graph = {one.topic: (one.type,) for one in heard}
     proposals: list[Proposal] = []
@@ -141,6 +145,11 @@ def _proposals(seconds: float, namespace: str, robot: str) -> list[Proposal]:
             )
         )
     return proposals
+
+
+def _is_loggers(publisher: Endpoint) -> bool:
+    """Whether a node of this package publishes it."""
+    return publisher.node.rpartition('/')[2] in LOGGER_NODES
 
 
 def _sensor(one: WatchedTopic, named: Mapping[str, tuple[SensorSettings, str, str]], graph: Mapping[str, Sequence[str]],

@@ -182,10 +182,16 @@ def page(found: LedgerPage) -> list[RenderableType]:
 
 
 def topics_table(found: LedgerPage) -> RenderableType:
-    """One row per topic; a dash is a figure that the middleware does not provide."""
-    if not found['topics']:
+    """One row per topic with messages; a dash is a figure that the middleware does not provide."""
+    heard = {topic: row for topic, row in found['topics'].items() if not _is_silent(row)}
+    if not heard:
         return Text(f'No message of {_whose(found)} has been received yet.')
-    return _table(f'Messages of {_whose(found)}', found['topics'])
+    return _table(f'Messages of {_whose(found)}', heard)
+
+
+def _is_silent(row: TopicFigures) -> bool:
+    """Whether no message of a topic has ever been received."""
+    return row['accounting'] is None and not row['received']
 
 
 def _whose(found: LedgerPage) -> str:
@@ -242,10 +248,10 @@ def notes(found: LedgerPage) -> list[str]:
         if elsewhere:
             lines.append(f'{topic}: of {row["stored"]:,} stored, {_listed(elsewhere)}')
         lines += [f'{topic}: {_other_type(name, other)}' for name, other in row['other_types'].items()]
-        if not row['received']:
-            lines.append(f'{topic}: not one message of it was received')
-        elif row['accounting'] in ACCOUNTING:
+        if row['accounting'] in ACCOUNTING:
             lines.append(f'{topic}: {ACCOUNTING[row["accounting"]]}')
+    if silent := [topic for topic, row in found['topics'].items() if _is_silent(row)]:
+        lines.append(f'no message was received of {", ".join(silent)}')
     lines += [f'{topic}: not logged: {why}' for topic, why in found['not_logged'].items()]
     return [*lines, *clock_notes(found['clock'])]
 

@@ -29,7 +29,7 @@ from shadowhound_data_logger.doctor import (
     versions,
 )
 from shadowhound_data_logger.doctor.context import from_child
-from shadowhound_data_logger.doctor.model import THOR, TOWER, Check
+from shadowhound_data_logger.doctor.model import ROBOT, SERVER, Check
 
 CHECKS: Final = (
     Check(name='versions', run=versions.check),
@@ -41,14 +41,14 @@ CHECKS: Final = (
     Check(name='s3', run=s3.check, deadline_s=8.0, after=('network.s3',)),
     Check(name='seaweedfs', run=seaweedfs.check, after=('network.s3',)),
     Check(name='mlflow', run=mlflow.check, deadline_s=8.0, after=('network.mlflow',)),
-    Check(name='tower', run=network.check_tower, roles=TOWER),
-    Check(name='ros.environment', run=ros_environment.check, roles=THOR),
-    Check(name='ros', run=ros.check, roles=THOR, deadline_s=11.5, isolated=True),
-    Check(name='sockets', run=sockets.check, roles=THOR),
-    Check(name='disk', run=disk.check, roles=THOR, deadline_s=8.0, isolated=True),
-    Check(name='spool', run=spool.check, roles=THOR, deadline_s=6.0, after=('s3',)),
-    Check(name='missions', run=missions.check, roles=THOR),
-    Check(name='policies', run=policies.check, roles=THOR),
+    Check(name='tower', run=network.check_tower, roles=SERVER),
+    Check(name='ros.environment', run=ros_environment.check, roles=ROBOT),
+    Check(name='ros', run=ros.check, roles=ROBOT, deadline_s=11.5, isolated=True),
+    Check(name='sockets', run=sockets.check, roles=ROBOT),
+    Check(name='disk', run=disk.check, roles=ROBOT, deadline_s=8.0, isolated=True),
+    Check(name='spool', run=spool.check, roles=ROBOT, deadline_s=6.0, after=('s3',)),
+    Check(name='missions', run=missions.check, roles=ROBOT),
+    Check(name='policies', run=policies.check, roles=ROBOT),
 )
 
 

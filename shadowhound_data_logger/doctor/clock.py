@@ -30,7 +30,7 @@ def check(context: Context) -> Iterator[Result]:
         return
     yield ok('clock.set', time.strftime('it is %Y-%m-%d %H:%M:%S UTC', time.gmtime()))
     yield _synchronized()
-    if context.role is Role.THOR:
+    if context.role is Role.ROBOT:
         known = clock_record.read(context.settings.spool_path, context.settings.robot)
         if known.steps:
             yield info(

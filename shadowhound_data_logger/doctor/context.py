@@ -75,10 +75,10 @@ def guess(environ: Mapping[str, str], spool: Path, root: Path) -> Role:
     """A machine with a spool is Thor, one whose S3 or MLflow port is open is Tower; otherwise Thor if it has ROS, else Spark."""
     has_ros = bool(environ.get('ROS_DISTRO')) or find_spec('rclpy') is not None
     if has_ros and (spool / 'index.db').exists():
-        return Role.THOR
+        return Role.ROBOT
     if Path('tower/.env').is_file() or _serves(environ, root):
-        return Role.TOWER
-    return Role.THOR if has_ros else Role.SPARK
+        return Role.SERVER
+    return Role.ROBOT if has_ros else Role.WORKSTATION
 
 
 def _serves(environ: Mapping[str, str], root: Path) -> bool:

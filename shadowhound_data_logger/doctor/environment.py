@@ -44,7 +44,7 @@ def check(context: Context) -> Iterator[Result]:
     yield from _store(context)
     yield from _tracking(context)
     yield from _proxies(context)
-    if context.role is Role.THOR:
+    if context.role is Role.ROBOT:
         yield from _node(context)
 
 

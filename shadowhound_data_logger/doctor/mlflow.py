@@ -53,7 +53,7 @@ def check(context: Context) -> Iterator[Result]:
         yield from _missions(missions, found)
         if found is not None and found.get('lifecycle_stage') == 'deleted':
             return
-        if found is None or context.role is Role.SPARK:
+        if found is None or context.role is Role.WORKSTATION:
             missions = f'{PROBE}_{rest.user}' if rest.user else PROBE
             found = _own(rest, missions)
         rest.tag(found['experiment_id'], 'shadowhound.doctor', iso(time.time_ns()))
@@ -209,7 +209,7 @@ def _direct(location: str, context: Context) -> Iterator[Result]:
             requests.put(item, s3_put.BODY, conditional=False)
             b''.join(requests.content(url.netloc, key))
     except StoreError as problem:
-        whose = 'this robot' if context.role is Role.THOR else 'this machine'
+        whose = 'this robot' if context.role is Role.ROBOT else 'this machine'
         result = from_error('mlflow.artifacts', problem, f'{whose} writes the artifacts of missions directly to {location}')
         yield replace(result, remedy=result.remedy or f'aws --endpoint-url {endpoint} s3 ls s3://{url.netloc}/')
         return

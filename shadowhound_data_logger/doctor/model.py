@@ -15,17 +15,17 @@ from shadowhound_data_logger.core.errors import DataLoggerError, SettingError
 class Role(str, Enum):
     """The role of this machine."""
 
-    THOR = 'thor'
-    """The robot: it logs, has a spool, and can neither list nor delete on Tower."""
-    TOWER = 'tower'
-    """The servers."""
-    SPARK = 'spark'
+    ROBOT = 'robot'
+    """Logs, has a spool, and can neither list nor delete on the server."""
+    SERVER = 'server'
+    """Runs the S3 store and MLflow."""
+    WORKSTATION = 'workstation'
     """Reads the store, and trains."""
 
 
 EVERYWHERE: Final = frozenset(Role)
-THOR: Final = frozenset({Role.THOR})
-TOWER: Final = frozenset({Role.TOWER})
+ROBOT: Final = frozenset({Role.ROBOT})
+SERVER: Final = frozenset({Role.SERVER})
 
 
 class Severity(str, Enum):

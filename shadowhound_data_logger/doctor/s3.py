@@ -158,12 +158,12 @@ def _clock(date: str) -> Iterator[Result]:
 
 
 def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
-    if context.role is Role.SPARK:
+    if context.role is Role.WORKSTATION:
         yield from _read(requests, context)
         yield from race_mailboxes(requests)
         return
     missing: set[str] = set()
-    if context.role is Role.TOWER:
+    if context.role is Role.SERVER:
         for result in _buckets(requests):
             missing |= set(result.fix[1:])
             yield result
@@ -179,7 +179,7 @@ def _use(requests: S3Requests, context: Context) -> Iterator[Result]:
     latency = _latency(requests, written[0], context.settings.robot)
     yield latency
     yield from s3_put.promises(requests, written[0], context.settings.robot, latency.data['latency_s'])
-    if context.role is Role.TOWER:
+    if context.role is Role.SERVER:
         yield from _delete(requests, written[0], context.settings.robot)
         yield from race_creates(requests, written[0], context.settings.robot)
         yield from race_mailboxes(requests)
@@ -190,7 +190,7 @@ def _buckets(requests: S3Requests) -> Iterator[Result]:
     try:
         there = requests.buckets()
     except AccessDenied as problem:
-        yield from_error('s3.buckets', problem, "these are not Tower's own keys; --role thor checks a robot's keys")
+        yield from_error('s3.buckets', problem, "these are not Tower's own keys; --role robot checks a robot's keys")
         return
     for name in TOWER_BUCKETS:
         if name not in there:

@@ -50,7 +50,7 @@ def check(context: Context) -> Iterator[Result]:
     if find_spec('grpc') is None:
         yield info(NAME, "not checked: it needs grpcio (pip install 'shadowhound_data_logger[tower]')")
         return
-    hosts = [service.host, *([LOOPBACK] if context.role is Role.TOWER and not service.is_local else [])]
+    hosts = [service.host, *([LOOPBACK] if context.role is Role.SERVER and not service.is_local else [])]
     asked = [(host, probe) for host in hosts for probe in probes(service.port)]
     with ThreadPoolExecutor(len(asked)) as pool:
         answered = pool.map(lambda one: answers_without_keys(one[0], one[1].port, one[1].method), asked)

@@ -34,7 +34,7 @@ def check(context: Context) -> Iterator[Result]:
         known = 'the package is made for it too, but ' if distro in NOT_TESTED else ''
         yield info('versions.ros', f'ROS 2 {distro}', f'{known}tested are {", ".join(sorted(DISTROS))}')
     yield from _packages(python, distro)
-    if context.role is Role.THOR:
+    if context.role is Role.ROBOT:
         yield from _node(context)
 
 

@@ -82,7 +82,7 @@ def test_other_topics_and_nothing(home: Path) -> None:
 def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
     """Kill -9 while it records: the next recording makes it whole and says what may be missing."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
-    child = subprocess.Popen([sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'cut_off'])
+    child = subprocess.Popen([sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'cut_off'])
     end = time.monotonic() + 60
     while not any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')):
         assert time.monotonic() < end
@@ -101,7 +101,7 @@ def test_a_kill_leaves_a_bag_that_the_next_one_ships(home: Path) -> None:
 def test_the_spools_index_is_damaged_meanwhile(home: Path) -> None:
     """The bag is completed and another one follows; both are in the store, and the call returns the last one."""
     program = 'shadowhound_data_logger.node.recording.bag_process'
-    command = [sys.executable, '-m', program, '--duration=60', '--topic=/odom', 'patrol']
+    command = [sys.executable, '-m', program, '--robot=thor', '--duration=60', '--topic=/odom', 'patrol']
     with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
         until(lambda: any(path.stat().st_size > 4096 for path in (home / 'records').rglob('*.open')), 'it records')
         for name in 'index.db', 'index.db-wal', 'index.db-shm':  # of one alone SQLite reads nothing for a while

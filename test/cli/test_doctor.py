@@ -47,10 +47,10 @@ def run(folder: Path, *arguments: str, **environ: str | None) -> Result:
 def test_findings_come_after_the_verdict(found: list[model.Result], tmp_path: Path) -> None:
     """Errors before warnings, each with what was seen, why, and a command that is in one line."""
     found += [FINE, ODD, SAID, BAD]
-    answer = run(tmp_path, '--role', 'thor')
+    answer = run(tmp_path, '--role', 'robot')
     assert answer.return_value == 1
     lines = [line.rstrip() for line in answer.stdout.splitlines()]
-    assert lines[0].startswith('2 findings: 1 error, 1 warning  thor, robot thor, ')
+    assert lines[0].startswith('2 findings: 1 error, 1 warning  role robot, robot thor, ')
     assert lines[2:5] == ['some.thing  seen [bold]so?[31m', '    the cause', f'    -> {BAD.remedy}']
     assert lines[6] == 'some.other  an oddity'
     assert 'some.info: good to know' in lines
@@ -70,11 +70,11 @@ def test_nothing_wrong(found: list[model.Result], tmp_path: Path) -> None:
 def test_json(found: list[model.Result], tmp_path: Path) -> None:
     """One document, whatever was found."""
     found += [FINE, BAD]
-    answer = run(tmp_path, '--json', '--role', 'spark', SHADOWHOUND_ROBOT='tachi')
+    answer = run(tmp_path, '--json', '--role', 'workstation', SHADOWHOUND_ROBOT='tachi')
     said: dict[str, Any] = json.loads(answer.stdout)
     assert answer.return_value == 1
     assert {**said, 'took_s': 0, 'results': []} == {
-        'role': 'spark', 'robot': 'tachi', 'ok': False, 'took_s': 0, 'findings': 1, 'results': [], 'fixed': [],
+        'role': 'workstation', 'robot': 'tachi', 'ok': False, 'took_s': 0, 'findings': 1, 'results': [], 'fixed': [],
     }  # fmt: skip
     assert said['results'][1] == {
         'check': 'some.thing', 'severity': 'error', 'seen': BAD.seen, 'cause': 'the cause', 'remedy': BAD.remedy,
@@ -128,7 +128,7 @@ def test_fix_narrows_a_mode_and_nothing_else(tmp_path: Path) -> None:
     path.parent.mkdir()
     path.write_text('[default]\naws_access_key_id = a\naws_secret_access_key = b\n')
     path.chmod(0o644)
-    asked = ('--role', 'thor', '--only', 'secrets')
+    asked = ('--role', 'robot', '--only', 'secrets')
     assert run(tmp_path, *asked).return_value == 1
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
     answer = run(tmp_path, *asked, '--fix')
@@ -144,7 +144,7 @@ def test_fix_creates_buckets_where_the_keys_allow_it(tmp_path: Path, seaweed: To
     """And says why not where they do not."""
     name = f'b{tmp_path.name.replace("_", "-")[:40]}'
     (tmp_path / 'a.yaml').write_text(f'/**:\n  ros__parameters:\n    sensors: [imu]\n    imu: {{bucket: {name}}}\n')
-    asked = ('--role', 'thor', '--only', 's3', '--params-file', str(tmp_path / 'a.yaml'), '--fix')
+    asked = ('--role', 'robot', '--only', 's3', '--params-file', str(tmp_path / 'a.yaml'), '--fix')
     few = run(tmp_path, *asked, **seaweed.environment('limited'))
     assert few.return_value == 1
     many = run(tmp_path, *asked, **seaweed.environment())

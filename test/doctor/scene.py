@@ -45,7 +45,7 @@ class Scene:
     stack: ExitStack
     environ: dict[str, str] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=lambda: {'spool.min_free_bytes': 0, 'spool.max_bytes': 1 << 20})
-    role: Role = Role.THOR
+    role: Role = Role.ROBOT
     namespace: str = '/'
     root: Path = Path('/')
 

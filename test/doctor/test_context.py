@@ -29,30 +29,30 @@ def test_ros_and_a_spool_are_thor(scene: Scene) -> None:
     scene.spool.mkdir(parents=True)
     (scene.spool / 'index.db').touch()
     scene.listen('00000000:2328')
-    assert guessed(scene) is Role.THOR
+    assert guessed(scene) is Role.ROBOT
 
 
 def test_servers_are_tower(scene: Scene, tmp_path: Path) -> None:
     """One that listens on a port of the guide or of the variables, or what the compose file is started with."""
     scene.listen('00000000:2328')
-    assert guessed(scene) is Role.TOWER
+    assert guessed(scene) is Role.SERVER
     scene.listen('00000000:2329')
-    assert guessed(scene) is not Role.TOWER
+    assert guessed(scene) is not Role.SERVER
     scene.environ['AWS_ENDPOINT_URL'] = 'http://localhost:9001'
-    assert guessed(scene) is Role.TOWER
+    assert guessed(scene) is Role.SERVER
     scene.listen()
     (tmp_path / 'tower').mkdir()
     (tmp_path / 'tower/.env').touch()
-    assert guessed(scene) is Role.TOWER
+    assert guessed(scene) is Role.SERVER
 
 
 def test_the_rest_is_by_ros(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot on its first day, and somebody's desk."""
     scene.environ['ROS_DISTRO'] = 'humble'
-    assert guessed(scene) is Role.THOR
+    assert guessed(scene) is Role.ROBOT
     del scene.environ['ROS_DISTRO']
     monkeypatch.setattr(context, 'find_spec', lambda _: None)
-    assert guessed(scene) is Role.SPARK
+    assert guessed(scene) is Role.WORKSTATION
 
 
 def test_what_is_refused_is_told_and_left_out(scene: Scene) -> None:

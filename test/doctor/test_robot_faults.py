@@ -164,7 +164,7 @@ def other_shell(scene: Scene) -> None:
 
 
 def deaf_tower(scene: Scene) -> None:
-    scene.role = Role.TOWER
+    scene.role = Role.SERVER
     scene.environ['AWS_ENDPOINT_URL'] = scene.environ['MLFLOW_TRACKING_URI'] = 'http://127.0.0.1:9000'
     scene.listen('0100007F:2328')
 

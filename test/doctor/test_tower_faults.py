@@ -83,21 +83,21 @@ def rest(tower: Tower, path: str, **body: Any) -> Any:
 
 def test_a_healthy_tower_gives_no_finding(robot: Scene, servers: Tower) -> None:
     """Not with the robot's few rights, not for Tower's own keys, and not for one who reads."""
-    for role in (Role.THOR, Role.THOR, Role.TOWER, Role.SPARK):
+    for role in (Role.ROBOT, Role.ROBOT, Role.SERVER, Role.WORKSTATION):
         robot.role = role
-        user = {Role.TOWER: 'tower', Role.SPARK: 'spark'}.get(role, 'thor')
+        user = {Role.SERVER: 'tower', Role.WORKSTATION: 'spark'}.get(role, 'thor')
         robot.environ |= servers.environment(user) | servers.tracking(user)
         results = robot.ask(*NETWORK, *SERVICES, 'environment', 'secrets')
         assert [result for result in results if result.is_finding] == []
         asked = {result.check for result in results if result.severity is Severity.OK}
-        assert ('s3.delete' in asked) is (role is Role.TOWER)
-        assert ('s3.condition' in asked) is (role is not Role.SPARK)
+        assert ('s3.delete' in asked) is (role is Role.SERVER)
+        assert ('s3.condition' in asked) is (role is not Role.WORKSTATION)
         assert {'s3.signature', 's3.clock', 'mlflow.health', 'mlflow.experiment', 'mlflow.artifacts'} <= asked
 
 
 def test_probe_objects_do_not_pile_up(robot: Scene, servers: Tower) -> None:
     """However often the robot asks, there is one in each bucket; Tower's own is deleted again."""
-    for role, user in ((Role.THOR, 'thor'), (Role.THOR, 'thor'), (Role.TOWER, 'tower')):
+    for role, user in ((Role.ROBOT, 'thor'), (Role.ROBOT, 'thor'), (Role.SERVER, 'tower')):
         robot.role = role
         robot.environ |= servers.environment(user)
         assert robot.findings('s3') == []
@@ -271,7 +271,7 @@ def test_minio_is_told_and_no_finding(robot: Scene, monkeypatch: pytest.MonkeyPa
 
 def test_what_is_missing_on_tower(robot: Scene, servers: Tower) -> None:
     """Its own keys see all buckets; those of the guide that are not there are named, and can be made."""
-    robot.role = Role.TOWER
+    robot.role = Role.SERVER
     robot.environ |= servers.environment('tower')
     admin = S3Client(servers.store_settings(), UploadSettings())
     admin.open()

@@ -60,6 +60,8 @@ def test_its_file_logs_the_robot(shared: Processes, publishers: dict[str, Publis
     for name in SENT:
         if name != 'led':
             publishers[name].matched(f'{NS}/{name}')
+    names = [row['topic'] for row in json.loads(init(shared, '--duration', '1', '--json').stdout)['topics']]
+    assert set(names) == {f'{NS}/{name}' for name in SENT}, 'topics of the logger itself are not proposed'
     publish(publishers)
     for name, (_, rate_hz, latched) in SENT.items():
         if name != 'led' and not latched:

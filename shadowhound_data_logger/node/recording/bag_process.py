@@ -135,7 +135,7 @@ def main() -> int:
 def _arguments(given: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser.add_argument('name')
-    parser.add_argument('--robot', default='thor')
+    parser.add_argument('--robot', required=True)
     parser.add_argument('--duration', type=float, required=True)
     parser.add_argument('--deadline', type=float, default=60.0)
     parser.add_argument('--topic', action='append', default=[])
