@@ -60,12 +60,15 @@ class ExportFile:
     labels: bool = False
     validation: float = 0.0
     validation_label: str = ''
+    robot_type: str = ''
     arm: str = ''
     arm_clock: str = ''
     task: bool = False
 
     def options(self, folder: Path, *, allow_gaps: bool = False) -> ExportOptions:
         """Paths are relative to ``folder``. Raises LakeError, SettingError, ValueError."""
+        if self.robot_type:
+            check_name(self.robot_type, 'robot_type')
         if self.arm:
             check_name(self.arm, 'arm')
         if self.fps != AUTO and (not isinstance(self.fps, int) or isinstance(self.fps, bool)):
@@ -77,7 +80,7 @@ class ExportFile:
             action=self.action if isinstance(self.action, str) else _part(self.action, 'action', MAPPED),
             by=self.by, resample=self.resample, max_age_s=self.max_age_s, max_gap_s=self.max_gap_s, max_stale=self.max_stale,
             codec=self.codec, is_lossless=self.lossless, layout=self.layout, labels=self.labels, validation=self.validation,
-            validation_label=self.validation_label, arm=self.arm, allow_gaps=allow_gaps,
+            validation_label=self.validation_label, robot_type=self.robot_type, arm=self.arm, allow_gaps=allow_gaps,
             clock_pairs=tuple((int(robot), int(arm)) for robot, arm in pairs),
         )  # fmt: skip
 

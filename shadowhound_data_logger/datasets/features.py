@@ -105,6 +105,8 @@ class ExportOptions:
     max_stale: float = 0.05
     allow_gaps: bool = False
     validation: float = 0.0
+    robot_type: str = ''
+    """``robot_type`` of the dataset; empty: ``go2`` for the robot ``thor``, otherwise the name of its first robot."""
     arm: str = ''
     """The namespace of an arm's topics, and the robot name of its recordings if it has a separate machine."""
     labels: bool = False

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shadowhound_data_logger.core.config import DEFAULT_ROBOT
 from shadowhound_data_logger.core.durable_files import fingerprint, replacing, sync
 from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.datasets.episodes import (
@@ -163,7 +164,7 @@ class Lerobot:
         """
         features = features_of(episode, options)
         if self.info is None:
-            self.info = _empty_info(episode, features, is_shared=options.layout == SHARED)
+            self.info = _empty_info(episode, features, options)
         if (other := different(self.info['features'], features)) or self.info['fps'] != episode['fps']:
             raise LakeError(f'its {other or "frames a second"} differ from those of the episodes before it')
         number = int(self.rows[-1]['data/file_index'] + CHUNK * self.rows[-1]['data/chunk_index'] + 1) if self.rows else 0
@@ -436,13 +437,14 @@ def _times(key: str, first: int, frames: int, fps: int) -> EpisodeRow:
     return {f'videos/{key}/from_timestamp': first / fps, f'videos/{key}/to_timestamp': (first + frames) / fps}
 
 
-def _empty_info(episode: Mapping[str, Any], features: Mapping[str, Any], *, is_shared: bool) -> dict[str, Any]:
+def _empty_info(episode: Mapping[str, Any], features: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
+    robot_type = options.robot_type or ('go2' if episode['robot'] == DEFAULT_ROBOT else episode['robot'])
     has_video = any(feature['dtype'] == 'video' for feature in features.values())
     return {
         'codebase_version': VERSION, 'fps': episode['fps'], 'features': json.loads(json.dumps(features)), 'total_episodes': 0,
         'total_frames': 0, 'total_tasks': 0, 'chunks_size': CHUNK, 'data_files_size_in_mb': 100,
-        'video_files_size_in_mb': ANY_SIZE_MB if is_shared else 200,
-        'data_path': DATA, 'video_path': VIDEO if has_video else None, 'robot_type': 'go2', 'splits': {},
+        'video_files_size_in_mb': ANY_SIZE_MB if options.layout == SHARED else 200,
+        'data_path': DATA, 'video_path': VIDEO if has_video else None, 'robot_type': robot_type, 'splits': {},
     }  # fmt: skip
 
 

@@ -95,6 +95,7 @@ def values(made: Lerobot, *columns: str) -> list[Any]:
 def test_a_wheeled_base(tmp_path: Path) -> None:
     """Its numbers are those of the messages at or before each tick, and ``info.json`` says from which topic they are."""
     made = exported(recorded(tmp_path, BASE), EXAMPLES / 'export_base.yaml')
+    assert made.info['robot_type'] == 'turtlebot4'
     features = made.info['features']
     assert features['observation.state']['names'] == ['x', 'y', 'x.vel', 'theta.vel']
     assert features['observation.state']['info']['units'] == ['m', 'm', 'm/s', 'rad/s']

@@ -1,4 +1,6 @@
-"""Robots without any settings: a drone in a namespace, an arm, and a Unitree with its own topics on Cyclone DDS."""
+"""Robots without any settings: a drone in a namespace, an arm, and a Unitree with its own topics on Cyclone DDS.
+
+Each walks for some seconds as a mission, which is then exported as a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +18,10 @@ import numpy as np
 import pytest
 import simplejpeg
 from e2e.processes import COMMANDS, Node, Processes, Publisher, until
+from missions.server import complete
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from shadowhound_data_logger import MissionDataLogger
 from shadowhound_data_logger.core.type_rules import RULES, is_of_unitree
 
 pytestmark = pytest.mark.long('robots of their own')
@@ -72,8 +77,15 @@ class Robot:
     """A robot with some topics, and the logger beside it."""
 
     def __init__(
-        self, processes: Processes, topics: Mapping[str, Sent], *arguments: str, robot: str, cyclone: bool = False
+        self,
+        processes: Processes,
+        topics: Mapping[str, Sent],
+        *arguments: str,
+        robot: str,
+        mission: str = '',
+        cyclone: bool = False,
     ) -> None:
+        """``mission``: the robot's name in the mission that it walks; empty: it walks without one."""
         self.topics = topics
         self._publisher: Publisher = processes.publisher(cyclone=cyclone)
         for topic, sent in topics.items():
@@ -83,7 +95,14 @@ class Robot:
         for topic, sent in topics.items():
             if sent.sensor:
                 self._publisher.matched(topic)
-        self.sent = self._walk()
+        if mission:
+            with closing(MissionDataLogger(home=self.node.home, robot=mission)) as logger:
+                logger.start_mission('walk', 'around the block')
+                self.sent = self._walk()
+                logger.end_mission(True, 0.0, 0.0)
+                until(lambda: complete(self.node.home), lambda: f'the mission is sent: {logger.flush(0.0)}')
+        else:
+            self.sent = self._walk()
 
     def _walk(self) -> dict[str, int]:
         sent = dict.fromkeys(self.topics, 0)
@@ -113,6 +132,18 @@ class Robot:
                 assert account['stored'] > 0, topic
                 assert account['received'] == account['stored'] + account['skipped'], topic
         return ledger
+
+    def export(self, processes: Processes, folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+        """The features of a dataset of the mission, in ``folder``; it has a frame for each period of its length."""
+        path = folder.with_suffix('.yaml')
+        path.write_text(json.dumps(config))
+        answer = self.ask(
+            processes, 'export', 'lerobot', folder.name, '--to', str(folder), '--config', str(path), '--mission-type', 'walk'
+        )
+        info: dict[str, Any] = json.loads((folder / 'meta/info.json').read_bytes())
+        assert info['total_episodes'] == 1, answer
+        assert abs(info['total_frames'] / info['fps'] - ROUNDS * ROUND_S) < 2.0, answer
+        return dict(info['features'])
 
     def ask(self, processes: Processes, *arguments: str) -> Any:
         """The JSON of a verb, about the folder that is the store."""
@@ -164,7 +195,7 @@ def test_a_drone(processes: Processes, tmp_path: Path) -> None:
             '/drone1/camera/image': Sent('sensor_msgs/msg/Image', IMAGE, 5, 'drone1_camera_image'),
             '/drone1/rangefinder': Sent('sensor_msgs/msg/Range', {'range': 3.0}, 1, 'drone1_rangefinder'),
         },
-        '-r', '__ns:=/drone1', robot='',
+        '-r', '__ns:=/drone1', robot='', mission='drone1',
     )  # fmt: skip
     robot.finish()
     rows = robot.ask(processes, 'query', '--sensor', 'drone1_camera_image', '--near-gps', '-36.8486,174.7633,50')
@@ -178,9 +209,15 @@ def test_a_drone(processes: Processes, tmp_path: Path) -> None:
                       '--to', str(tmp_path / 'data'))  # fmt: skip
     assert found
     assert len(list((tmp_path / 'data').rglob('*.jpg'))) == len(rows)
+    features = robot.export(processes, tmp_path / 'flights', {
+        'images': {'down': '/drone1/camera/image'}, 'fps': 1, 'max_stale': 0.5,
+        'state': [{'topic': '/drone1/global_position/fix', 'fields': ['latitude', 'longitude', 'altitude']}],
+        'action': {'topic': '/drone1/local_position/odom', 'fields': ['twist.twist.linear.x'], 'names': ['x.vel']},
+    })  # fmt: skip
+    assert features['observation.state']['names'] == ['latitude', 'longitude', 'altitude']
 
 
-def test_an_arm(processes: Processes) -> None:
+def test_an_arm(processes: Processes, tmp_path: Path) -> None:
     """Joints, the camera at its wrist, its description and its commands; it has no place."""
     robot = Robot(
         processes,
@@ -193,7 +230,7 @@ def test_an_arm(processes: Processes) -> None:
             '/gripper/grasped': Sent('std_msgs/msg/Bool', {'data': True}, 5, 'gripper_grasped'),
             '/colors': Sent('std_msgs/msg/ColorRGBA', {}, 1),
         },
-        robot='ur5',
+        robot='ur5', mission='ur5',
     )  # fmt: skip
     ledger = robot.finish()
     assert '/colors' not in ledger['topics']
@@ -202,10 +239,17 @@ def test_an_arm(processes: Processes) -> None:
     assert {row['sensor'] for row in topics} >= {each.sensor for each in robot.topics.values() if each.sensor}
     assert {row['sensor']: row['messages'] for row in topics}['joints'] == ROUNDS
     assert {row['x'] for row in robot.ask(processes, 'query', '--sensor', 'wrench')} == {None}
+    features = robot.export(processes, tmp_path / 'picks', {
+        'images': {'wrist': '/wrist/image_raw'}, 'fps': 1, 'state': [{'topic': '/joint_states', 'fields': ['position']}],
+        'action': {'topic': '/wrench', 'fields': ['wrench.force.z'], 'names': ['force']},
+    })  # fmt: skip
+    assert features['observation.state']['names'] == ['shoulder.pos']
+    assert json.loads((tmp_path / 'picks/meta/info.json').read_bytes())['robot_type'] == 'ur5'
+    assert features['observation.images.wrist']['shape'][:2] == [4, 4]
 
 
 @pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')
-def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
+def test_a_unitree_with_its_own_topics(processes: Processes, tmp_path: Path) -> None:
     """Through Cyclone DDS, without the driver: the sensors of a Go2 are taken from them, and the battery is known.
 
     Messages of unitree_go need the package; without it the log says how to build it, and all else is stored.
@@ -228,11 +272,13 @@ def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
             '/frontvideostream': Sent('unitree_go/msg/Go2FrontVideoData', {'video720p': np.arange(9, dtype=np.uint8)}, 1,
                                       of_package('frontvideostream')),
         },
-        robot='go2', cyclone=True,
+        robot='go2', mission='go2', cyclone=True,
     )  # fmt: skip
     robot.finish()
     rows = robot.ask(processes, 'query', '--robot', 'go2')
     assert {row['sensor'] for row in rows} >= {each.sensor for each in robot.topics.values() if each.sensor}
+    features = robot.export(processes, tmp_path / 'walks', {'images': {}, 'fps': 5, 'action': 'odometry', 'state': ['pose', 'imu']})
+    assert 'yaw' in features['observation.state']['names'], features
     if has_package:
         assert 77.0 in {row['battery_pct'] for row in rows if row['sensor'] == 'lidar'}
     else:
