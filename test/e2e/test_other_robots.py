@@ -1,6 +1,7 @@
 """Robots without any settings: a drone in a namespace, an arm, and a Unitree with its own topics on Cyclone DDS.
 
-Each walks for some seconds as a mission, which is then exported as a LeRobot dataset."""
+Each walks for some seconds as a mission, which is then exported as a LeRobot dataset.
+"""
 
 from __future__ import annotations
 
@@ -277,7 +278,9 @@ def test_a_unitree_with_its_own_topics(processes: Processes, tmp_path: Path) -> 
     robot.finish()
     rows = robot.ask(processes, 'query', '--robot', 'go2')
     assert {row['sensor'] for row in rows} >= {each.sensor for each in robot.topics.values() if each.sensor}
-    features = robot.export(processes, tmp_path / 'walks', {'images': {}, 'fps': 5, 'action': 'odometry', 'state': ['pose', 'imu']})
+    features = robot.export(
+        processes, tmp_path / 'walks', {'images': {}, 'fps': 5, 'action': 'odometry', 'state': ['pose', 'imu']}
+    )
     assert 'yaw' in features['observation.state']['names'], features
     if has_package:
         assert 77.0 in {row['battery_pct'] for row in rows if row['sensor'] == 'lidar'}
