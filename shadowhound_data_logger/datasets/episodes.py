@@ -58,6 +58,8 @@ BATCH: Final = 128
 """Rows with pictures that are written at a time."""
 AHEAD: Final = 4
 """Pictures that are decoded before they are encoded."""
+OF_JOINTS: Final = frozenset({'position', 'velocity', 'effort'})
+"""Lists of a JointState with a number per joint."""
 EPISODE: Final = 'episode_mission'
 """The column with the mission of a row: statements about gaps have their own ``mission_id``."""
 SOURCE_SCHEMA: Final = pa.schema([
@@ -305,7 +307,7 @@ def _names_of_fields(part: StatePart, joints: Sequence[str], width: int) -> tupl
     if part.names:
         text = f'{part.sensor} has {width} numbers in {", ".join(part.fields)}, and {len(part.names)} names are given'
         raise LakeError(text, remedy='correct names in the file of --config')
-    if len(part.fields) == width:
+    if len(part.fields) == width and not (joints and part.fields[0] in OF_JOINTS):
         return part.fields
     last = 'pos' if part.fields == ('position',) else part.fields[0]
     if len(joints) == width:

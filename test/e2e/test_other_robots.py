@@ -1,6 +1,6 @@
 """Robots without any settings: a drone in a namespace, an arm, and a Unitree with its own topics on Cyclone DDS.
 
-Each walks for some seconds as a mission, which is then exported as a LeRobot dataset.
+What has cameras walks for some seconds as a mission, which is then exported as a LeRobot dataset.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class Robot:
         environ = {**processes.environ, 'SHADOWHOUND_HOME': str(self.node.home)}
         command = [sys.executable, '-m', COMMANDS, *arguments, '--json']
         ran = subprocess.run(command, capture_output=True, text=True, env=environ, timeout=120, check=False)
-        assert ran.returncode == 0, ran.stderr
+        assert ran.returncode == 0, ran.stdout + ran.stderr
         return json.loads(ran.stdout)
 
 
@@ -250,7 +250,7 @@ def test_an_arm(processes: Processes, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_spec('cyclonedds') is None, reason='cyclonedds is not installed')
-def test_a_unitree_with_its_own_topics(processes: Processes, tmp_path: Path) -> None:
+def test_a_unitree_with_its_own_topics(processes: Processes) -> None:
     """Through Cyclone DDS, without the driver: the sensors of a Go2 are taken from them, and the battery is known.
 
     Messages of unitree_go need the package; without it the log says how to build it, and all else is stored.
@@ -273,15 +273,11 @@ def test_a_unitree_with_its_own_topics(processes: Processes, tmp_path: Path) -> 
             '/frontvideostream': Sent('unitree_go/msg/Go2FrontVideoData', {'video720p': np.arange(9, dtype=np.uint8)}, 1,
                                       of_package('frontvideostream')),
         },
-        robot='go2', mission='go2', cyclone=True,
+        robot='go2', cyclone=True,
     )  # fmt: skip
     robot.finish()
     rows = robot.ask(processes, 'query', '--robot', 'go2')
     assert {row['sensor'] for row in rows} >= {each.sensor for each in robot.topics.values() if each.sensor}
-    features = robot.export(
-        processes, tmp_path / 'walks', {'images': {}, 'fps': 5, 'action': 'odometry', 'state': ['pose', 'imu']}
-    )
-    assert 'yaw' in features['observation.state']['names'], features
     if has_package:
         assert 77.0 in {row['battery_pct'] for row in rows if row['sensor'] == 'lidar'}
     else:
