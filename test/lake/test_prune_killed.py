@@ -55,7 +55,7 @@ class Counting(Front):
 
 def command(tower: Tower, *arguments: str, url: str = '') -> subprocess.Popen[str]:
     environ = {**os.environ, **tower.environment(), **({'AWS_ENDPOINT_URL': url} if url else {})}
-    return subprocess.Popen([*MAIN, *arguments, '--robot', ROBOT], env=environ, text=True, stdout=subprocess.PIPE,
+    return subprocess.Popen([*MAIN, *arguments], env=environ, text=True, stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE)  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tm
     def there() -> set[str]:
         return {info.key for info in source.list(f'{ROBOT}/') if info.key in rows}
 
-    prune = ('lake', 'prune', '--keep', f'camera {KEPT_DAYS}d', '--yes')
+    prune = ('lake', 'prune', '--keep', f'camera {KEPT_DAYS}d', '--yes', '--robot', ROBOT)
     with Counting(seaweed.endpoint_url) as front:
         for kill in range(KILLS):
             front.limit = front.deleted + 1 + chance.randrange(A_DAY)
@@ -99,7 +99,7 @@ def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tm
                 until(lambda: front.deleted >= front.limit and front.is_quiet, f'the prune {kill} deletes')
                 process.send_signal(signal.SIGKILL)
     assert 0 < len(rows) - len(there()) < len(going), 'it was killed in the middle of its work'
-    reader = command(seaweed, 'fetch', '--since', f'{KEPT_DAYS - 1}d', '--to', str(tmp_path / 'fetched'))
+    reader = command(seaweed, 'fetch', '--robot', ROBOT, '--since', f'{KEPT_DAYS - 1}d', '--to', str(tmp_path / 'fetched'))
     ended([reader, command(seaweed, *prune), command(seaweed, *prune), command(seaweed, 'lake', 'ingest')])
     ended([command(seaweed, *prune)])
     assert rows.keys() - there() == going
@@ -110,6 +110,6 @@ def test_killed_beside_readers_a_compaction_and_another_prune(seaweed: Tower, tm
         assert fetched[key].read_bytes() == content(rows[key]['sensor'], rows[key]['t_start_ns'])
     told = Counter(each['key'] for each in forgotten(source, ROBOT, Findings()).to_pylist())
     assert told == Counter(dict.fromkeys(going, 1))
-    (asked,) = ended([command(seaweed, 'query', '--since', '20d', '--json')])
+    (asked,) = ended([command(seaweed, 'query', '--robot', ROBOT, '--since', '20d', '--json')])
     answer: list[dict[str, Any]] = json.loads(asked)
     assert {each['key'] for each in answer} == there()

@@ -55,7 +55,7 @@ def test_the_way_of_a_policy(tower: Tower, tmp_path: Path, monkeypatch: pytest.M
     assert run(thor, 'sync', '--json')['done'] == 'activated'
     of_another = {'Bucket': 'lerobot', 'Key': f'policies/go2/{name}_v2/model.onnx'}
     client.put_object(Body=b'of a publication that was cut off', **of_another)
-    for version, remedy in (('1', '--version 2'), ('2', 'cut off')):
+    for version, remedy in (('1', '--version 2'), ('2', 'interrupted')):
         packed(f'other_{version}', 0.7, '--version', version)
         with pytest.raises(PolicyError, match=f'already has a different {name}@{version}') as raised:
             run(spark, 'publish', str(tmp_path / f'other_{version}'))
