@@ -50,8 +50,20 @@ def test_what_it_starts_is_there(service: dict[str, str]) -> None:
     """The shell's script parses; the executable and the files that it names are installed under these names."""
     text = script(service)
     named = re.findall(r'\$C/([\w.]+)', text)
-    assert sorted(named) == ['fastdds_shm.xml', 'go2.yaml']
+    assert named == ['fastdds_shm.xml']
     assert all((UNIT.parent / name).is_file() for name in named)
+
+
+@pytest.mark.parametrize(('environ', 'arguments'), [
+    ({}, ['--ros-args']),
+    ({'SHADOWHOUND_PARAMETERS': '/etc/a robot.yaml'}, ['--ros-args', '--params-file', '/etc/a robot.yaml']),
+])  # fmt: skip
+def test_the_node_reads_the_file_that_is_set(service: dict[str, str], environ: dict[str, str], arguments: list[str]) -> None:
+    """Without one it has the defaults, which suit any robot."""
+    words = script(service).rpartition('/sensor_logger_node"')[2]
+    given = {'PATH': os.environ['PATH'], **environ}
+    ran = subprocess.run(['bash', '-c', f"printf '%s\\n' {words}"], env=given, capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines() == arguments
 
 
 def test_the_smoke_run_of_policies_can_make_its_sandbox() -> None:

@@ -20,7 +20,7 @@ from shadowhound_data_logger.core.rules import read_rule
 
 FIXED: Final = 'Read at the start: change the parameter file and start the node again.'
 MAX_INT: Final = (1 << 63) - 1
-ROBOT: Final = "Leads every key; where it is empty, SHADOWHOUND_ROBOT, else the node's namespace, else thor."
+ROBOT: Final = 'The first part of every key. If empty: SHADOWHOUND_ROBOT, the namespace, thor for a Go2, or the host name.'
 SENSORS: Final = 'The sensors there are, by name.'
 Described = dict[str, Any]
 """A parameter: name, value, description, constraints, read_only, and low and high, which are None where it has no range."""
