@@ -120,7 +120,9 @@ class Cuts:
             return problem(503, said.get('error', 'nothing was cut'))
         self._pieces[name] = _Piece(files[0], time.monotonic())
         asyncio.get_running_loop().call_later(KEPT_S + 1, self._forget)
-        return answer({'path': f'/cut/{name}.mcap', 'bytes': said['bytes'], 'messages': said['messages'], 'kept_s': KEPT_S})
+        seconds = (said['t_end_ns'] - said['t_start_ns']) / SECOND
+        return answer({'path': f'/cut/{name}.mcap', 'bytes': said['bytes'], 'messages': said['messages'], 'seconds': seconds,
+                       'kept_s': KEPT_S})  # fmt: skip
 
     async def _run(self, robot: str, source: str, begin_ms: int, end_ms: int, out: Path) -> dict[str, Any]:
         """What ``bag cut --json`` reports, or ``error``."""

@@ -144,7 +144,7 @@ def test_a_gap_is_shown_and_told_in_words(page: Page) -> None:
     page.mouse.click(gap['x'] + gap['width'] / 2, gap['y'] + 4)
     moment_is(page, 3000)
     words = page.locator('[data-gap=transport]').inner_text()
-    assert '/imu: 5 messages never reached the node, 12:00:03 to 12:00:04 UTC (1.0 s).' in words.replace('\n', ' ')
+    assert '/imu: 5 messages did not reach the node, 12:00:03 to 12:00:04 UTC (1.0 s).' in words.replace('\n', ' ')
     assert 'Why: Lost on the way to the node' in words
     assert 'net.core.rmem_max' in words
     press(page.get_by_role('button', name='Next gap'))
@@ -163,6 +163,29 @@ def test_a_gap_is_shown_and_told_in_words(page: Page) -> None:
 
 
 @in_chromium
+@pytest.mark.parametrize(
+    ('steps_s', 'breaks'),
+    [
+        ([0.2] * 5 + [3.0] + [0.2] * 5, [6]), ([1.0] * 5 + [0.2] * 9, []), ([1.0] * 5 + [0.2] * 5 + [1.0] + [0.2] * 4, [11]),
+        ([0.2] * 4 + [3.0, 3.0] + [0.2] * 4, [5, 6]), ([3.0] + [0.1] * 5, [1]), ([0.1] * 5 + [3.0], [6]), ([3.0], []),
+    ],
+)  # fmt: skip
+def test_a_line_breaks_where_data_is_missing(page: Page, steps_s: list[float], breaks: list[int]) -> None:
+    """Not where messages of objects, one per second, are followed by those of a bag."""
+    found = page.evaluate(
+        """async (steps) => {
+            const { Ring } = await import('/plots.js');
+            const ring = new Ring(60);
+            ring.names = ['x'];
+            ring.columns = [steps.reduce((times, step) => [...times, times.at(-1) + step], [0])];
+            return ring.breaks();
+        }""",
+        steps_s,
+    )
+    assert found == breaks
+
+
+@in_chromium
 def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_path: Path) -> None:
     """By shift and drag, and by keys; the piece is an MCAP file with the messages of that time, which other viewers may open."""
     dragged(page, 2000, 21_500, 'Shift')
@@ -175,6 +198,7 @@ def test_a_selection_offers_its_commands_and_a_piece_of_the_bag(page: Page, tmp_
     assert f'--since {since}' in page.locator('[data-command=query]').inner_text()
     press(page.locator(f'[data-cut="{BAG}"]'))
     page.locator('[data-piece]').wait_for()
+    assert 'of the 20 s: the rest is not in the closed files of the bag' in page.locator('.download').inner_text()
     with page.expect_download() as download:
         page.locator('[data-piece]').evaluate('link => link.click()')
     download.value.save_as(tmp_path / 'piece.mcap')

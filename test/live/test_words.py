@@ -109,7 +109,7 @@ def test_a_phone(browser: Browser, robot: Served) -> None:
 
     One finger on the 3D view scrolls the page; two turn the view and do not scroll. The page can be installed.
     """
-    context = browser.new_context(viewport={'width': 390, 'height': 844}, has_touch=True, is_mobile=True)
+    context = browser.new_context(viewport={'width': 390, 'height': 844}, has_touch=True, is_mobile=True, reduced_motion='reduce')
     page = context.new_page()
     page.goto(robot.server.url)
     holds(page, 'shadowhound.count.fix > 3')

@@ -101,17 +101,19 @@ const Row = ({ name, what, field, children }) => html`<dt title=${what}>${name}<
 // When all that waits will be there, in words.
 function arrival(waiting, store) {
   if (waiting === 0) return 'nothing waits';
-  if (store?.left_s !== null && store?.left_s !== undefined) return span(store.left_s);
+  if (store?.left_s !== null && store?.left_s !== undefined) return store.left_s < 1 ? 'less than a second' : span(store.left_s);
   if (Object.keys(store?.waits_for ?? {}).length) return 'once a rule holds';
   return { idle: 'about to be sent', shipping: 'not known yet', store_down: 'once the store can be reached', paused: 'once the error is corrected', not_draining: 'another process sends it' }[store?.state] ?? 'once the node runs';
 }
+
+const DELIVERY = { idle: 'nothing to send', shipping: 'sending', store_down: 'the store is unreachable', paused: 'stopped by an error', not_draining: 'another process sends', waiting: 'waiting for a rule' };
 
 export function Cards({ figures }) {
   const { queue, spool, store, objects } = figures;
   const waiting = spool?.pending ?? objects?.pending ?? 0;
   const bytes = waiting ? figures.bytes?.pending : 0;
   const rules = Object.entries(store?.waits_for ?? {});
-  const storeState = store?.state ? store.state.replaceAll('_', ' ') : 'no node runs';
+  const storeState = store?.state ? DELIVERY[store.state] ?? store.state.replaceAll('_', ' ') : 'no node runs';
   const isFine = ['idle', 'shipping', 'not_draining', 'waiting'].includes(store?.state);
   const sending = store?.mbps ? html`${store.mbps.toFixed(1)} Mbit/s${store.max_mbps ? html` <small>of at most ${store.max_mbps}</small>` : ''}` : 'nothing now';
   return html`<div class="cards">
@@ -185,7 +187,7 @@ export function Glance({ session, figures, onSignIn }) {
   const last = answers.value[0];
   const save = () => (session.role === 'operator' ? act(session, 'event', { name: 'manual' }) : onSignIn());
   return html`<div class="glance"><button type="button" class="primary" disabled=${Boolean(busy.value)} onClick=${save} data-glance="save" title="Keeps what the robot recorded around this moment, at its full rate">Save this moment</button>
-    <span title="Objects on the robot’s disk that the store does not have yet"><b>${digits(waiting)}</b> waiting</span>${waiting > 0 && html`<span title="When all of them will be in the store">delivered in ${arrival(waiting, store)}</span>`}<a title="What needs attention" href="#data" class=${findings ? 'watch' : 'good'}>${findings ? `${findings} ${findings === 1 ? 'finding' : 'findings'}` : 'no findings'}</a>
+    <span title="Objects on the robot’s disk that the store does not have yet"><b>${digits(waiting)}</b> waiting</span>${waiting > 0 && html`<span title="When all of them will be in the store">${store?.left_s === null || store?.left_s === undefined ? '' : 'delivered in '}${arrival(waiting, store)}</span>`}<a title="What needs attention" href="#data" class=${findings ? 'watch' : 'good'}>${findings ? `${findings} ${findings === 1 ? 'finding' : 'findings'}` : 'no findings'}</a>
     ${last && html`<small class=${last.ok ? '' : 'bad'} role="status">${last.text}</small>`}</div>`;
 }
 

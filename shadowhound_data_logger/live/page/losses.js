@@ -4,6 +4,7 @@ import { clock, digits, meaning, moment, span } from './words.js';
 
 const DAY_MS = 86400000;
 const EVERY_MS = 15000;
+const MOST_NAMED = 12;
 export const losses = signal(null); // { since, now, topics: Map(topic -> messages), gaps }; null while it is unknown
 
 const name = (robot) => `shadowhound.seen.${robot}`;
@@ -49,8 +50,9 @@ export function Losses({ robot, show }) {
   };
   const ago = now - since > DAY_MS ? `since ${moment(since).slice(0, 16)}` : `since ${clock(since, false)} (${span((now - since) / 1000)} ago)`;
   if (!gaps.length) return html`<p class="losses good" data-losses="0">Nothing was lost ${ago}.</p>`;
+  const names = [...topics.keys()].sort((one, other) => topics.get(other) - topics.get(one));
   const causes = [...new Set(gaps.map((gap) => gap.cause))];
   const messages = gaps.reduce((sum, gap) => sum + gap.count, 0);
-  return html`<div class="losses" role="status" data-losses=${messages}><p><b>${digits(messages)} message${messages === 1 ? '' : 's'} lost</b> ${ago}: on ${[...topics.keys()].slice(0, 3).join(', ')}${topics.size > 3 ? ` and ${topics.size - 3} more topics` : ''}. ${causes.slice(0, 3).map(meaning).join('; ')}.</p>
+  return html`<div class="losses" role="status" data-losses=${messages}><p><b>${digits(messages)} message${messages === 1 ? '' : 's'} lost</b> ${ago}: on ${names.slice(0, MOST_NAMED).map((topic, place) => html`${place ? ', ' : ''}<button type="button" class="link" data-lost=${topic} title="Show its first gap: when, and why" onClick=${() => show(gaps.find((gap) => gap.topic === topic))}>${topic}</button> (${digits(topics.get(topic))})`)}${names.length > MOST_NAMED ? ` and ${names.length - MOST_NAMED} more topics` : ''}. ${causes.slice(0, 3).map(meaning).join('; ')}.</p>
     <p class="row"><button type="button" onClick=${() => show(gaps[0])}>Show the first</button><button type="button" onClick=${acknowledge} title="They stay on the timeline and in the totals, and are no alarm any more in this browser">I have seen them</button></p></div>`;
 }

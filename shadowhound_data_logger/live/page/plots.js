@@ -92,8 +92,12 @@ export class Ring {
     const times = this.columns[0] ?? [];
     if (times.length < 3) return [];
     const steps = times.slice(1).map((time, place) => time - times[place]);
-    const usual = [...steps].sort((a, b) => a - b)[steps.length >> 1];
-    return steps.flatMap((step, place) => (step > Math.max(LEAST_BREAK_S, 4 * usual) ? [place + 1] : []));
+    // What is usual is the median of the neighboring steps: a bag has more messages than objects.
+    const usual = (place) => {
+      const near = steps.slice(Math.max(0, place - 2), place + 3).sort((a, b) => a - b);
+      return near[(near.length - 1) >> 1];
+    };
+    return steps.flatMap((step, place) => (step > LEAST_BREAK_S && step > 4 * usual(place) ? [place + 1] : []));
   }
 
   last() {

@@ -101,7 +101,7 @@ function Piece({ session, robot, bag, size, from, to }) {
     }
   };
   const address = made && new URL(made.path, location.href).href;
-  return html`<p class="download" data-bag=${bag}><span class="row-name">bag</span><span>${bag} <span class="unit">${made ? html`${digits(made.messages)} messages, ${volume(made.bytes)}; the links work for 15 minutes` : `the files of this time have ${volume(size)}`}</span>
+  return html`<p class="download" data-bag=${bag}><span class="row-name">bag</span><span>${bag} <span class="unit">${made ? html`${digits(made.messages)} messages, ${volume(made.bytes)}, ${span(made.seconds)}${made.seconds < (to - from) / 1000 - 2 ? ` of the ${span((to - from) / 1000)}: the rest is not in the closed files of the bag` : ''}; the links work for 15 minutes` : `the files of this time have ${volume(size)}`}</span>
       ${state && state !== 'cutting…' && html` <span class="note bad" role="alert">${state}</span>`}</span>
     ${made ? html`<span class="links"><a class="button" data-piece href=${made.path} download>Download MCAP</a>${VIEWERS.map(([name, link]) => html`<a class="button" data-viewer=${name} target="_blank" rel="noopener" href=${link + encodeURIComponent(address)}>${name}</a>`)}</span>`
       : html`<button type="button" data-cut=${bag} disabled=${state === 'cutting…'} onClick=${cut}>${state === 'cutting…' ? state : 'Cut as MCAP'}</button>`}</p>`;

@@ -34,18 +34,18 @@ export const moment = (ms) => `${new Date(ms).toISOString().slice(0, 10)} ${new 
 
 // Of each cause what it means, and how gaps of it look: a hue, and what is drawn in it. No two look the same.
 const CAUSES = {
-  transport: ['Lost on the way to the node', 'red', 'solid'], silence: ['None came for long', 'sky', 'solid'], restart: ['The node was not running', 'purple', 'solid'],
+  transport: ['Lost on the way to the node', 'red', 'solid'], silence: ['No message for longer than usual', 'sky', 'solid'], restart: ['The node was not running', 'purple', 'solid'],
   paused: ['The node was paused', 'blue', 'solid'], queue_full: ['The queue was full', 'yellow', 'solid'], no_room: ['The disk was full', 'brown', 'solid'],
-  damaged: ['The file in the spool was damaged', 'ink', 'solid'], keep_limit: ['More was kept than keep.max_bytes allows', 'pink', 'solid'], unknown: ['Of unknown cause', 'gray', 'solid'],
-  ring_full: ['The ring of events was full', 'yellow', 'bands'], unwritable: ['The disk took nothing', 'brown', 'bands'], shutdown: ['The node ended before they were stored', 'purple', 'bands'],
-  stopped: ['The bag had ended', 'purple', 'stripes'], keep_days: ['They were kept for long enough', 'pink', 'bands'], thinned: ['Room ran short: others of that time are kept', 'pink', 'stripes'],
+  damaged: ['The file in the spool was damaged', 'ink', 'solid'], keep_limit: ['More was kept than keep.max_bytes allows', 'pink', 'solid'], unknown: ['Unknown cause', 'gray', 'solid'],
+  ring_full: ['The ring of events was full', 'yellow', 'bands'], unwritable: ['The disk could not be written', 'brown', 'bands'], shutdown: ['The node stopped before they were stored', 'purple', 'bands'],
+  stopped: ['The bag had ended', 'purple', 'stripes'], keep_days: ['They were kept for long enough', 'pink', 'bands'], thinned: ['Space ran short: others of that time are kept', 'pink', 'stripes'],
   retention: ['Removed from the store by a rule', 'pink', 'dots'], sampler_failed: ['The node failed to sort them', 'red', 'bands'], encoder_failed: ['The node failed to encode them', 'red', 'stripes'],
   unsafe_key: ['Their key cannot be stored', 'red', 'dots'], wrong_type: ['Messages of another type', 'blue', 'bands'], unknown_type: ['The type is not known to the node', 'blue', 'stripes'],
-  unknown_field: ['The type has no such field', 'blue', 'dots'], surplus: ['The format holds one message', 'blue', 'checks'], malformed: ['The messages were broken', 'sky', 'bands'],
-  size_mismatch: ['Their sizes contradict one another', 'sky', 'stripes'], too_large: ['The pictures were too large', 'sky', 'dots'], empty: ['They held nothing', 'sky', 'checks'],
+  unknown_field: ['The type has no such field', 'blue', 'dots'], surplus: ['The format holds one message', 'blue', 'checks'], malformed: ['The messages were invalid', 'sky', 'bands'],
+  size_mismatch: ['Their sizes contradict one another', 'sky', 'stripes'], too_large: ['The images were too large', 'sky', 'dots'], empty: ['They were empty', 'sky', 'checks'],
   unsupported_encoding: ['Their encoding is not supported', 'yellow', 'stripes'], missing: ['The file in the spool is gone', 'ink', 'bands'], foreign: ['Another object has their key', 'ink', 'stripes'],
   access_denied: ['The store denied them', 'ink', 'dots'], refused: ['The store refused them', 'ink', 'checks'], name: ['The store cannot have their name', 'brown', 'stripes'],
-  size: ['They were larger than the store takes', 'brown', 'dots'], changed: ['They changed while they were sent', 'brown', 'checks'],
+  size: ['They were larger than the store accepts', 'brown', 'dots'], changed: ['They changed while they were sent', 'brown', 'checks'],
 };
 const PATTERNS = ['solid', 'bands', 'stripes', 'dots', 'checks'];
 const taken = Object.values(CAUSES).map(([, hue, pattern]) => `${hue} ${pattern}`);
