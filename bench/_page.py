@@ -211,17 +211,6 @@ def _spool(figures: Figures) -> str:
     return _table(('', 'figures'), [(name, words(row)) for name, row in figures.items()])
 
 
-def _growth(figures: Figures) -> str:
-    used = ', '.join(f'{size / 1e6:.1f}' for size in figures['in_use_by_hour'])
-    return _table(('six objects a second, delivered at once', ''), [
-        ('growth of the index', f'{figures["bytes_an_hour"] / 1e6:.2f} MB an hour'),
-        ('an object', f'{figures["bytes_an_object"]:.0f} bytes'),
-        ('to full rows for as long as keys are remembered', f'{figures["to_full_rows"]:.3f}'),
-        ('in use after three hours, four, ...', f'{used} MB'),
-        ('CPU of the longest commit', f'{figures["slowest_commit_ms"]:.0f} ms'),
-    ])  # fmt: skip
-
-
 def _drain(figures: Figures) -> str:
     return _table(('backlog', 'drain', 'boto3', 'speed, drain : boto3', 'spread', 'CPU an object, drain / boto3'), [
         (f'{row["objects"]} x {row["bytes"] / 1000:g} KB', f'{row["drain_per_s"]:.0f}/s', f'{row["bare_per_s"]:.0f}/s',
@@ -321,7 +310,7 @@ _PARTS: Final[Mapping[str, tuple[str, Callable[[Figures], str]]]] = {
     'small_messages': ('small_messages', _small), 'full_rate': ('full_rate', _full_rate), 'memory': ('full_rate', _memory),
     'backlog_memory': ('backlog_memory', _backlog_memory), 'rosbag2': ('bag_recording', _rosbag2),
     'latency': ('latency', _latency), 'encode_formats': ('encode_formats', _encode), 'spool_commits': ('spool_commits', _spool),
-    'index_growth': ('index_growth', _growth), 'keep': ('keep', _keep),
+    'keep': ('keep', _keep),
     'drain': ('drain', _drain), 'mission_calls': ('mission_calls', _mission_calls), 'missions': ('missions', _missions),
     'datasets': ('datasets', _datasets), 'ask': ('ask', _ask),
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """Measures how fast the live page looks back into a spool of eight hours: the first moment, later ones, and playing.
 
 Run it as ``python bench/past.py [--objects 500000] [--delivered 0.5] [--program DIR ...] [--json]``. It makes the index of a
-spool whose objects begin evenly over eight hours, the older part of them delivered (as short rows), with files for the last
+spool whose objects begin evenly over eight hours, the older part of them delivered, with files for the last
 minutes. Then it asks the process that reads the past (``live/history.py``) what the page asks: days, the timeline, a moment,
 moments that follow one another, jumps within those minutes, and a timeline of an hour. With ``--program`` it does the same with
 the package in each of these folders, in turns, so that two versions can be compared on a busy machine.
@@ -59,34 +59,27 @@ def make(folder: Path, count: int, delivered: float) -> int:
     db.execute('PRAGMA synchronous = OFF')
     for trigger in ('object_counted', 'object_moved'):
         db.execute(f'DROP TRIGGER {trigger}')
-    folders: dict[str, int] = {}
-    rows, short = [], []
+    rows = []
     last_ns = START_NS + HOURS * 3600 * SECOND
     for number, (at_ns, sensor, topic, kind, ending) in enumerate(objects(count)):
         path = f'thor/{sensor}/{utc(at_ns):%Y%m%d}/'
         name = f'{utc(at_ns):%H%M%S}_{at_ns // 1_000_000 % 1000:03}_{number}.{ending}'
-        if number < count * delivered:
-            if path not in folders:
-                folders[path] = len(folders) + 1
-                db.execute('INSERT INTO folders VALUES (?,?,?,?)', (folders[path], 'sensor-data', path, sensor))
-            short.append((folders[path], name, number + 1, 0, len(picture), b'\0' * 32, at_ns // SECOND + 5, 0))
-            continue
+        settled = ('delivered', at_ns + 5 * SECOND) if number < count * delivered else ('pending', None)
         metadata = {'robot': 'thor', 'sensor': sensor, 'topic': topic, 'type': kind, 'count': '1', 't_start_ns': str(at_ns),
                     't_end_ns': str(at_ns), 'sha256': '0' * 64, 'pose': f'{number % 900 / 90:.3f} 1.000 0.5000 odom',
                     'battery_pct': '80.0', 'mission_id': 'm1', 'mission_type': 'patrol', 'received_start_ns': str(at_ns + 1000),
                     'received_end_ns': str(at_ns + 1000), 'session': 'x' * 32, 'format_version': '1'}  # fmt: skip
-        rows.append(('sensor-data', path + name, sensor, topic, kind, len(picture), json.dumps(metadata), at_ns, at_ns, at_ns))
+        rows.append((path + name, sensor, topic, kind, len(picture), json.dumps(metadata), at_ns, at_ns, at_ns, *settled))
         if at_ns > last_ns - MINUTES_OF_FILES * 60 * SECOND:
             file = folder / 'ready' / 'sensor-data' / path / name
             file.parent.mkdir(parents=True, exist_ok=True)
             place, turn = {'x': 1.0, 'y': 1.0, 'z': 0.3}, {'x': 0, 'y': 0, 'z': 0, 'w': 1}
             sample = {'stamp_ns': at_ns, 'position': place, 'orientation': turn}
             file.write_bytes(picture if ending == 'jpg' else json.dumps({'type': kind, 'samples': [sample]}).encode())
-    db.executemany('INSERT INTO compact_objects VALUES (?,?,?,?,?,?,?,?)', sorted(short))
     db.executemany(
-        'INSERT INTO objects (bucket, key, state, priority, protected, waits_for, on_request, event, mission, sensor, topic,'
-        ' type, samples, bytes, sha256, content_type, metadata, t_start_ns, t_end_ns, created_ns)'
-        " VALUES (?,?,'pending',5,0,'',0,0,'m1',?,?,?,1,?,'','',?,?,?,?)", rows)  # fmt: skip
+        'INSERT INTO objects (bucket, key, priority, protected, waits_for, on_request, event, mission, sensor, topic,'
+        ' type, samples, bytes, sha256, content_type, metadata, t_start_ns, t_end_ns, created_ns, state, settled_ns)'
+        " VALUES ('sensor-data',?,5,0,'',0,0,'m1',?,?,?,1,?,'','',?,?,?,?,?,?)", rows)  # fmt: skip
     db.commit()
     db.close()
     return last_ns

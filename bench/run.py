@@ -60,10 +60,9 @@ STEPS: Final = (
     Step('likeness', quick=('--vectors', '8640')),
     Step('encode_formats'),
     Step('spool_commits', quick=None),
-    Step('index_growth', quick=None),
     Step('keep', ('--seconds', '140'), None),
 )
-FOLDERLESS: Final = ('encode_formats', 'index_growth')
+FOLDERLESS: Final = ('encode_formats',)
 
 
 def run(step: Step, folder: Path, *, quick: bool) -> dict[str, Any] | None:

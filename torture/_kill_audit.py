@@ -15,7 +15,6 @@ from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -26,8 +25,6 @@ from e2e.reading import TYPES, assert_same, decode
 from e2e.witness import recorded
 from pypcd4.pypcd4 import PointCloud
 
-from shadowhound_data_logger.core import metadata_keys as meta
-from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.stores.base import ObjectStore
 from torture._command import Bar, some
 
@@ -130,15 +127,6 @@ def _objects(found: Audit, heard: Heard, index: Path, store: ObjectStore, robot:
         columns = 'key, state, sha256, topic, t_start_ns, samples'
         rows = {row[0]: row[1:] for row in db.execute(f'SELECT {columns} FROM objects')}  # noqa: S608 - own constants
     db.close()
-    with closing(Index(index, read_only=True)) as known:
-        known.open()
-        short = {row['key']: row for row in known.rows() if row['key'] not in rows}
-    for key, row in short.items():  # it left the spool an hour ago: the rest is what the store says
-        info = store.head(BUCKET, key)
-        said = {} if info is None else info.metadata
-        rows[key] = (
-            row['state'], row['sha256'], said.get(meta.TOPIC), int(said.get(meta.T_START_NS, 0)), int(said.get(meta.COUNT, 0)),
-        )  # fmt: skip
     keys = {info.key for info in store.list(BUCKET, f'{robot}/')}
     found.wrong['foreign'] += sorted(keys - set(rows))
     found.wrong['not delivered'] += sorted(key for key, row in rows.items() if row[0] != 'delivered' or key not in keys)

@@ -122,7 +122,7 @@ class SpoolSettings:
     )
     min_free_bytes: int = _setting(2 * GIBI, 'Free space to leave on the disk.', low=0)
     remember_days: float = _setting(
-        3.0, 'Days for which the keys of delivered objects are remembered, for ledger --verify.', low=1.0, high=3650.0
+        2.0, 'Days for which delivered objects are remembered, for ledger --verify and the live page.', low=1.0, high=3650.0
     )
 
 

@@ -8,7 +8,6 @@ paths, sizes are bounded, texts are only ever shown.
 from __future__ import annotations
 
 import os
-import re
 import sqlite3
 import time
 from collections import OrderedDict
@@ -39,9 +38,6 @@ from shadowhound_data_logger.live.figures import DAY_NS, SpoolFigures, told_gaps
 from shadowhound_data_logger.spool.files import Tree
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.listing import STATES_IN_SPOOL
-from shadowhound_data_logger.spool.overview_table import MAX_NS
-from shadowhound_data_logger.spool.status import read as read_status
-from shadowhound_data_logger.spool.table import after
 from shadowhound_data_logger.stores import open_reader, open_store
 
 if TYPE_CHECKING:
@@ -64,14 +60,11 @@ MAX_BLOCKS: Final = 60
 MAX_MISSIONS: Final = 1000
 MAX_BATTERY: Final = 800
 """Points of the battery's line on a timeline."""
-MS: Final = SECOND // 1000
 BAG_SENSOR: Final = 'bag'
 KEPT_BYTES: Final = 48 << 20
 """Of contents that were read: neighbouring moments are of the same objects."""
 MAX_BAGS: Final = 200
 """Of a day."""
-_IN_KEY: Final = re.compile(r'/(\d{8})/(\d{6})(?:_(\d{3}))?[_.]', re.ASCII)
-_IN_BAG: Final = re.compile(r'_(\d{8})_(\d{6})(?:_\d+)?$', re.ASCII)
 _COLUMNS: Final = ('bucket', 'key', 'sensor', 'topic', 'type', 'bytes', 't_start_ns', 't_end_ns', 'mission_id', 'mission_type',
                    'x', 'y', 'yaw', 'battery_pct', 'received_start_ns', 'clock_offset_ns')  # fmt: skip
 
@@ -306,31 +299,20 @@ class SpoolPast:
     def days(self, robot: str) -> list[str]:
         """Raises SpoolError."""
         with closing(self._index()) as index, _reading(self._spool):
-            numbers, folders = index.overview.recorded_days(robot), index.overview.folders(robot)
-        found = {f'{utc(number * DAY_NS):%Y-%m-%d}' for number in numbers}
-        for folder in folders:
-            at_ns = _stamp(f'{folder}000000_') or _bag_begin(folder.rstrip('/'))
-            if at_ns:
-                found.add(f'{utc(at_ns):%Y-%m-%d}')
-        return sorted(found)
+            return [f'{utc(number * DAY_NS):%Y-%m-%d}' for number in index.overview.recorded_days(robot)]
 
     def runs(self, robot: str, begin_ns: int, end_ns: int, grain_ns: int, by: str = BY_STAMP) -> list[Run]:
         """Looks at the first and the last object of each ``grain_ns`` only. Raises SpoolError."""
         found: list[Run] = []
         self._battery = []
         with closing(self._index()) as index, _reading(self._spool):
-            topics = self._topics(index, robot)
             for sensor in index.overview.sensors():
                 if not _is_bookkeeping(sensor):
-                    found += self._runs_of_rows(index, robot, sensor, begin_ns, end_ns, grain_ns, by)
-            for folder in _folders(index, robot, begin_ns, end_ns, by):
-                if not _is_bookkeeping(folder.sensor):
-                    name = topics.get(folder.sensor, folder.sensor)
-                    found += _runs_of_names(index, folder, name, begin_ns, end_ns, grain_ns, by)
+                    found += self._runs_of_sensor(index, robot, sensor, begin_ns, end_ns, grain_ns, by)
         return sorted(found, key=lambda run: (run.name, run.begin_ns))
 
-    def _runs_of_rows(self, index: Index, robot: str, sensor: str, begin_ns: int, end_ns: int, grain_ns: int,
-                      by: str) -> Iterator[Run]:  # fmt: skip
+    def _runs_of_sensor(self, index: Index, robot: str, sensor: str, begin_ns: int, end_ns: int, grain_ns: int,
+                        by: str) -> Iterator[Run]:  # fmt: skip
         edge = partial(index.overview.edge, robot, sensor, by=by)
         at_ns = begin_ns - LONGEST_BATCH_NS
         while at_ns < end_ns and (first := edge(at_ns, end_ns, is_last=False)) is not None:
@@ -387,11 +369,8 @@ class SpoolPast:
 
     def _read(self, robot: str, begin_ns: int, end_ns: int, by: str) -> list[PastObject]:
         with closing(self._index()) as index, _reading(self._spool):
-            topics = self._topics(index, robot)
             sensors = [sensor for sensor in index.overview.sensors() if sensor != BAG_SENSOR]
             found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, sensors)]
-            for folder in _folders(index, robot, begin_ns, end_ns, by):
-                found += _of_names(index, folder, topics.get(folder.sensor, ''), begin_ns, end_ns, by)
         return sorted(found, key=lambda one: one.begin_ns)
 
     def bag_files(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP) -> dict[str, list[PastObject]]:
@@ -411,33 +390,11 @@ class SpoolPast:
     def _read_bags(self, robot: str, begin_ns: int, by: str) -> list[PastObject]:
         end_ns = begin_ns + DAY_NS
         with closing(self._index()) as index, _reading(self._spool):
-            found = [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, [BAG_SENSOR])]
-            around = (-DAY_NS, 0, DAY_NS) if by == BY_RECEIVED else (0,)
-            for number, bucket, path, sensor in (
-                row for step_ns in around for row in index.overview.folders_of(robot, f'{utc(begin_ns + step_ns):%Y%m%d}')
-            ):
-                at_ns = _bag_begin(path.partition('/rosbags/')[2].partition('/')[0])
-                for name, size, settled_s, late_ms in index.overview.compact(number, '', after('')) if at_ns else ():
-                    offset_ns = late_ms * MS if by == BY_RECEIVED else 0
-                    start_ns = (at_ns or 0) + offset_ns
-                    if begin_ns <= start_ns < end_ns:
-                        last_ns = max(start_ns, settled_s * SECOND)
-                        found.append(PastObject(bucket, path + name, sensor, '', '', size, start_ns, last_ns,
-                                                late_ns=late_ms * MS, offset_ns=offset_ns))  # fmt: skip
-        return found
+            return [self._of_row(row, by) for row in index.overview.recorded(robot, begin_ns, end_ns, by, [BAG_SENSOR])]
 
     def problem(self, *_: object) -> str:
         """Nothing: an index that cannot be read is an error."""
         return ''
-
-    def _topics(self, index: Index, robot: str) -> dict[str, str]:
-        """Sensor -> topic, as the node has them now or its newest objects have them: short rows do not."""
-        found = {row.sensor: topic for topic, row in read_status(self._spool, robot, self._clock).node.topics.items()}
-        for sensor in index.overview.sensors():
-            newest = index.overview.edge(robot, sensor, 0, MAX_NS, BY_STAMP, is_last=True)
-            if newest is not None and newest[4]:
-                found[sensor] = newest[4]
-        return found
 
     def _of_row(self, row: tuple[Any, ...], by: str) -> PastObject:
         """Of a row of ``OverviewTable.recorded``."""
@@ -608,68 +565,6 @@ def _reading(spool: Path) -> Iterator[None]:
         raise SpoolError(f'the index of {spool} cannot be read: {error}') from error
 
 
-class _Folder(NamedTuple):
-    """A folder of short rows, whose keys have the time of their objects: the date in the path, the rest in the name."""
-
-    id: int
-    bucket: str
-    path: str
-    sensor: str
-    date_ns: int
-    late_ns: tuple[int, int]
-    """By how much its times are behind those of the chosen clock: minimum and maximum."""
-
-    def name(self, at_ns: int) -> str:
-        """The first name of that second."""
-        seconds = min(max(0, (at_ns - self.date_ns) // SECOND), 24 * 3600)
-        return f'{seconds // 3600:02}{seconds // 60 % 60:02}{seconds % 60:02}'
-
-    def at_ns(self, row: tuple[str, int, int, int], by: str) -> int | None:
-        """When the object of a short row begins."""
-        at_ns = _stamp(self.path + row[0])
-        return None if at_ns is None else at_ns + (row[3] * MS if by == BY_RECEIVED else 0)
-
-
-def _folders(index: Index, robot: str, begin_ns: int, end_ns: int, by: str) -> Iterator[_Folder]:
-    """Those that may have objects of a time."""
-    around_ns = DAY_NS if by == BY_RECEIVED else 0
-    for date in dates_between(begin_ns - around_ns, end_ns + around_ns):
-        for number, bucket, path, sensor in index.overview.folders_of(robot, date.replace('-', '')):
-            if path.endswith(f'/{date.replace("-", "")}/'):
-                late_ms = index.overview.delays_ms(number) if by == BY_RECEIVED else (0, 0)
-                yield _Folder(number, bucket, path, sensor, date_ns(date), (late_ms[0] * MS, late_ms[1] * MS))
-
-
-def _of_names(index: Index, folder: _Folder, topic: str, begin_ns: int, end_ns: int, by: str) -> Iterator[PastObject]:
-    first, last = folder.name(begin_ns - folder.late_ns[1]), folder.name(end_ns - folder.late_ns[0] + SECOND)
-    for row in index.overview.compact(folder.id, first, last):
-        at_ns = folder.at_ns(row, by)
-        if at_ns is not None and begin_ns <= at_ns < end_ns:
-            late_ns = row[3] * MS
-            yield PastObject(folder.bucket, folder.path + row[0], folder.sensor, topic, '', row[1], at_ns, at_ns,
-                             late_ns=late_ns, offset_ns=late_ns if by == BY_RECEIVED else 0)  # fmt: skip
-
-
-def _runs_of_names(index: Index, folder: _Folder, name: str, begin_ns: int, end_ns: int, grain_ns: int, by: str) -> Iterator[Run]:
-    """Names are in the order of time; the first and the last of each ``grain_ns`` are looked at."""
-    edge = partial(index.overview.compact_edge, folder.id)
-    step = -(-grain_ns // SECOND) * SECOND
-    at_ns, until_ns = begin_ns - folder.late_ns[1], end_ns - folder.late_ns[0]
-    while at_ns < until_ns and (first := edge(folder.name(at_ns), folder.name(until_ns + SECOND), is_last=False)) is not None:
-        stamp_ns = _stamp(folder.path + first[0])
-        if stamp_ns is None:
-            at_ns += step
-            continue
-        at_ns = stamp_ns // SECOND * SECOND + step
-        both = first, edge(first[0], folder.name(at_ns), is_last=True) or first
-        times = [each for each in (folder.at_ns(row, by) for row in both) if each is not None]
-        settled_ns = max(row[2] for row in both) * SECOND
-        if abs(both[0][3] - both[1][3]) * MS > grain_ns:
-            yield from (Run(name, each, each, settled_ns) for each in sorted(times) if begin_ns <= each < end_ns)
-        elif min(times) < end_ns and max(times) >= begin_ns:
-            yield Run(name, min(times), max(times), settled_ns)
-
-
 def _is_bookkeeping(name: str) -> bool:
     """Whether a sensor has no data of the robot: bags have their own marks."""
     return not name or name in {BAG_SENSOR, 'missions'} or name.startswith('_')
@@ -701,26 +596,6 @@ def _of_catalog(row: Mapping[str, Any]) -> PastObject:
         row['battery_pct'], 0 if row['received_start_ns'] is None else row['received_start_ns'] - row['t_start_ns'],
         row['clock_offset_ns'] or 0,
     )  # fmt: skip
-
-
-def _stamp(key: str) -> int | None:
-    """The time that stands in a key of the shape ``.../20261018/120005_250_front.jpg``."""
-    found = _IN_KEY.search(key)
-    return _parsed(found[1] + found[2], int(found[3] or 0)) if found else None
-
-
-def _bag_begin(bag: str) -> int | None:
-    found = _IN_BAG.search(bag)
-    return _parsed(found[1] + found[2], 0) if found else None
-
-
-def _parsed(text: str, millis: int) -> int | None:
-    parts = [int(text[:4]), *(int(text[place : place + 2]) for place in range(4, 14, 2))]
-    try:
-        at = datetime(parts[0], parts[1], parts[2], parts[3], parts[4], parts[5], tzinfo=timezone.utc)
-    except ValueError:
-        return None
-    return int(at.timestamp()) * SECOND + millis * MS
 
 
 def _pose(text: object) -> tuple[float, float, float] | None:

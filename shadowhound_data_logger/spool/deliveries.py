@@ -76,27 +76,13 @@ class Deliveries:
         self._progress.unlink(missing_ok=True)
 
     def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]:
-        """Delivered objects that are not verified yet, as the store must describe them: first those with full rows, by id.
-
-        An object whose row is shortened during the run is returned only once.
-        """
+        """Delivered objects that are not verified yet, as the store must describe them, by id."""
         last = 0
-        returned: set[int] = set()
         while page := self._read(partial(self._index.history.delivered, last, PAGE)):
             last = page[-1][0]
-            returned.update(number for number, _ in page)
-            yield from self._unverified(page)
-        place = (0, '')
-        while True:
-            page, place = self._read(partial(self._index.history.delivered_compact, place, PAGE))
-            if not page:
-                return
-            yield from self._unverified([(number, item) for number, item in page if number not in returned])
-
-    def _unverified(self, page: list[tuple[int, ObjectInfo]]) -> Iterator[list[tuple[int, ObjectInfo]]]:
-        verified = {number for number, _ in page if self._query('SELECT 1 FROM verified WHERE id = ?', number)}
-        if left := [(number, item) for number, item in page if number not in verified]:
-            yield left
+            verified = {number for number, _ in page if self._query('SELECT 1 FROM verified WHERE id = ?', number)}
+            if left := [(number, item) for number, item in page if number not in verified]:
+                yield left
 
     def set_verified(self, ids: Iterable[int]) -> None:
         """Remember that these objects were verified."""

@@ -60,7 +60,7 @@ class Index:
         self.requested = RequestedTable(db)
         self.catalog = CatalogTable(db, self.gaps)
         self.history = HistoryTable(db, self.gaps)
-        self.objects = ObjectTable(db, self.history)
+        self.objects = ObjectTable(db)
         self.states = ObjectStates(db, self.catalog, self.requested)
         self.kept = KeptTable(db, self.objects, self.states, self.catalog)
         self.overview = OverviewTable(db)

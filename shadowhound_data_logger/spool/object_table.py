@@ -23,9 +23,8 @@ from shadowhound_data_logger.core.model import (
     waits_for,
 )
 from shadowhound_data_logger.spool.catalog_table import CatalogTable
-from shadowhound_data_logger.spool.history_table import HistoryTable
 from shadowhound_data_logger.spool.request_table import RequestedTable
-from shadowhound_data_logger.spool.table import Table, after, marks, split
+from shadowhound_data_logger.spool.table import Table, after, marks
 
 MISSING: Final = 'missing'
 """Reason of a quarantined object whose file is missing."""
@@ -39,20 +38,14 @@ _PROTECTED: Final = "protected = 1, waits_for = CASE WHEN waits_for <> '' AND ev
 class ObjectTable(Table):
     """Reads the rows of objects, those that have left the spool among them."""
 
-    def __init__(self, connection: Callable[[], sqlite3.Connection], history: HistoryTable) -> None:
-        super().__init__(connection)
-        self._history = history
-
     # -- by key or number ------------------------------------------------------------------------------------------
 
     def has(self, bucket: str, key: str) -> bool:
         return self.row(bucket, key) is not None
 
     def row(self, bucket: str, key: str) -> sqlite3.Row | None:
-        """The row of a key; without ``content_type``, ``metadata`` and ``priority`` if the object left the spool an hour ago."""
-        path, name = split(key)
-        found = self.select('bucket = ? AND key = ?', (bucket, key))
-        return next(iter(found or self._history.select('bucket = ? AND path = ? AND name = ?', (bucket, path, name))), None)
+        """The row of a key."""
+        return next(iter(self.select('bucket = ? AND key = ?', (bucket, key))), None)
 
     def full_row(self, number: int) -> Mapping[str, Any] | None:
         """All columns of an object, and ``counts``: messages by account if it has several."""
@@ -65,25 +58,22 @@ class ObjectTable(Table):
         return {**dict(row), 'counts': counts}
 
     def state(self, number: int) -> State | None:
-        """The state of an object; None if it left the spool an hour ago or never existed."""
+        """The state of an object; None if it is forgotten or never existed."""
         found = self._db.execute('SELECT state FROM objects WHERE id = ?', (number,)).fetchone()
         return State(found[0]) if found else None
 
     def rows(self) -> list[sqlite3.Row]:
         """The rows of all objects, in the order in which they were spooled."""
-        return sorted(self.select('1') + self._history.select('1'), key=itemgetter('id'))
+        return self.select('1 ORDER BY id')
 
     def with_prefix(self, bucket: str, prefix: str, states: Collection[State] = tuple(State)) -> list[sqlite3.Row]:
         """Rows in these states whose keys start with ``prefix``, in the order in which they were spooled."""
         values = (bucket, prefix, after(prefix), *(state.value for state in states))
-        found = self.select(f'bucket = ? AND key >= ? AND key < ? AND state IN ({marks(len(states))})', values)
-        found += [row for row in self._history.with_prefix(bucket, prefix) if State(row['state']) in states]
-        return sorted(found, key=itemgetter('id'))
+        return self.select(f'bucket = ? AND key >= ? AND key < ? AND state IN ({marks(len(states))}) ORDER BY id', values)
 
     def with_content(self, bucket: str, prefix: str, sha256: str) -> list[sqlite3.Row]:
         """Rows with this content whose keys start with ``prefix``."""
-        found = self.select('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, after(prefix), sha256))
-        return found + self._history.with_prefix(bucket, prefix, sha256)
+        return self.select('bucket = ? AND key >= ? AND key < ? AND sha256 = ?', (bucket, prefix, after(prefix), sha256))
 
     def in_spool(self) -> list[sqlite3.Row]:
         """Rows of pending, held, kept and quarantined objects, in the order in which they were spooled."""

@@ -62,7 +62,7 @@ class OverviewTable(Table):
         )
 
     def sensors(self) -> list[str]:
-        """Sensors of objects with full rows, except the catalog."""
+        """Sensors of objects, except the catalog."""
         return [name for (name,) in self._db.execute(_SENSORS)]
 
     def recorded(self, robot: str, begin_ns: int, end_ns: int, by: str = BY_STAMP, sensors: Sequence[str] | None = None,
@@ -70,7 +70,7 @@ class OverviewTable(Table):
         """Objects of a robot that are not lost and begin in this time, with what the catalog has of them, by time.
 
         (bucket, key, state, reason, sensor, topic, type, bytes, t_start_ns, t_end_ns, received_start_ns, received_end_ns,
-        mission_id, mission_type, pose, battery, content_key); objects with a short row are not included.
+        mission_id, mission_type, pose, battery, content_key).
         """
         start = _START[by]
         described = ', '.join(f"json_extract(metadata, '$.{word}')" for word in _DESCRIBED)
@@ -99,43 +99,8 @@ class OverviewTable(Table):
         ).fetchone()
         return row
 
-    def folders_of(self, robot: str, date: str) -> list[tuple[int, str, str, str]]:
-        """Folders of keys with short rows that have this ``YYYYMMDD``: (id, bucket, path, sensor)."""
-        return self._db.execute(
-            'SELECT id, bucket, path, sensor FROM folders'  # noqa: S608
-            f" WHERE path >= ? AND path < ? AND instr(path, ?) AND sensor <> '{CATALOG}'",
-            (f'{robot}/', after(f'{robot}/'), date),
-        ).fetchall()
-
-    def delays_ms(self, folder: int) -> tuple[int, int]:
-        """How much later than their stamps the objects of a folder arrived: minimum and maximum; both 0 without objects."""
-        least, most = self._db.execute(
-            'SELECT min(late_ms), max(late_ms) FROM compact_objects WHERE folder = ? AND state <> 2', (folder,)
-        ).fetchone()
-        return least or 0, most or 0
-
-    def compact(self, folder: int, first: str, last: str) -> Iterator[tuple[str, int, int, int]]:
-        """Short rows of objects that are not lost, with names from ``first`` to before ``last``.
-
-        (name, bytes, settled_s, late_ms)
-        """
-        return self._db.execute(
-            'SELECT name, bytes, settled_s, late_ms FROM compact_objects'
-            ' WHERE folder = ? AND name >= ? AND name < ? AND state <> 2',
-            (folder, first, last),
-        )
-
-    def compact_edge(self, folder: int, first: str, last: str, *, is_last: bool) -> tuple[str, int, int, int] | None:
-        """The first or last of these, found without reading others."""
-        row: tuple[str, int, int, int] | None = self._db.execute(
-            'SELECT name, bytes, settled_s, late_ms FROM compact_objects WHERE folder = ? AND name >= ? AND name < ?'  # noqa: S608
-            f' AND state <> 2 ORDER BY name {"DESC" if is_last else ""} LIMIT 1',
-            (folder, first, last),
-        ).fetchone()
-        return row
-
     def recorded_days(self, robot: str) -> list[int]:
-        """Days since 1970 on which objects with full rows begin."""
+        """Days since 1970 on which objects begin."""
         found = set()
         for sensor in self.sensors():
             at_ns = EARLIEST_SANE_NS
@@ -143,11 +108,3 @@ class OverviewTable(Table):
                 found.add(row[1] // DAY_NS)
                 at_ns = (row[1] // DAY_NS + 1) * DAY_NS
         return sorted(found)
-
-    def folders(self, robot: str) -> list[str]:
-        """The folders of objects with short rows."""
-        rows = self._db.execute(
-            f"SELECT DISTINCT path FROM folders WHERE path >= ? AND path < ? AND sensor <> '{CATALOG}'",  # noqa: S608
-            (f'{robot}/', after(f'{robot}/')),
-        )
-        return [path for (path,) in rows]

@@ -166,7 +166,7 @@ class RequestedTable(Table):
         )
 
     def selectable(self, robot: str) -> Iterator[KeptObject]:
-        """A robot's objects that are kept, released but not delivered, or lost within the last hour."""
+        """A robot's objects that are kept, released but not delivered, or lost as far as the index remembers."""
         columns = (
             'id, bucket, key, bytes, sensor, topic, t_start_ns, t_end_ns, metadata, state, ifnull(reason, state),'
             ' ifnull(settled_ns, 0)'

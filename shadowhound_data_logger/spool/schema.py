@@ -32,7 +32,6 @@ _CONDITIONS: Final = {
         " OR length(reason) > 200 OR reason GLOB '*/*' OR reason IN ('.', '..')"
     ),
     'rhythms': f'period NOT BETWEEN 0 AND {_MAX}',
-    'compact_objects': 'state > 2',
 }
 
 

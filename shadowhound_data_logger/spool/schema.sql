@@ -4,7 +4,7 @@
 -- Triggers only keep sums: tally (objects, bytes and messages by topic and state) and the messages of lost objects in gaps.
 -- Everything else that follows from a new state is written by ObjectTable, in the same transaction.
 
--- Objects in the spool, and those that left it within the last hour.
+-- Objects in the spool, and those that left it within spool.remember_days.
 CREATE TABLE objects (
   id INTEGER PRIMARY KEY AUTOINCREMENT,
   bucket TEXT NOT NULL,
@@ -39,6 +39,8 @@ CREATE INDEX held ON objects (reason, id) WHERE state = 'held';
 CREATE INDEX kept ON objects (id, bytes) WHERE state = 'kept';
 CREATE INDEX evictable ON objects (priority DESC, id, bytes) WHERE state IN ('pending', 'held') AND NOT protected;
 CREATE INDEX quarantined ON objects (reason, bytes) WHERE state = 'quarantined';
+-- Lost objects, which a request for kept objects must name.
+CREATE INDEX lost ON objects (id) WHERE state IN ('evicted', 'quarantined') AND on_request;
 CREATE INDEX settled ON objects (settled_ns) WHERE state IN ('delivered', 'deduplicated', 'evicted');
 -- The past of a sensor by either of its two times, which the live page seeks in.
 CREATE INDEX begun ON objects (sensor, t_start_ns);
@@ -85,24 +87,6 @@ CREATE TRIGGER contents_moved AFTER UPDATE OF state ON objects WHEN OLD.state <>
   INSERT INTO tally SELECT topic, NEW.state, 0, 0, samples FROM contents WHERE id = NEW.id
     ON CONFLICT DO UPDATE SET samples = samples + excluded.samples;
 END;
-
--- Objects that left the spool more than an hour ago: what must be remembered of a used key, in a tenth of the bytes.
-CREATE TABLE folders (
-  id INTEGER PRIMARY KEY,
-  bucket TEXT NOT NULL,
-  path TEXT NOT NULL,           -- the key up to and including its last slash
-  sensor TEXT NOT NULL,
-  UNIQUE (bucket, path, sensor));
-CREATE TABLE compact_objects (
-  folder INTEGER NOT NULL,
-  name TEXT NOT NULL,           -- the rest of the key
-  id INTEGER NOT NULL,
-  state INTEGER NOT NULL,       -- 0 delivered, 1 deduplicated, 2 evicted
-  bytes INTEGER NOT NULL,
-  sha256 BLOB NOT NULL,
-  settled_s INTEGER NOT NULL,
-  late_ms INTEGER NOT NULL,     -- how much later than its stamp its first message arrived; 0 if unknown
-  PRIMARY KEY (folder, name)) WITHOUT ROWID;
 
 -- Delivered objects without a row in any part of the catalog, and the statistics of their contents.
 CREATE TABLE uncataloged (id INTEGER PRIMARY KEY);

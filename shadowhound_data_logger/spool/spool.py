@@ -50,8 +50,6 @@ CLOSE_S: Final = 10.0
 PUT_BACK_S: Final = 2.5
 """How long a starting process waits for a running one to put back a deleted index: the running one commits once per second."""
 DAY_NS: Final = 24 * 3600 * SECOND
-FULL_ROWS_NS: Final = 3600 * SECOND
-"""How long the index keeps the full row of an object that left the spool; afterwards only key, size, checksum and state."""
 MAX_OBJECTS: Final = 32
 """Per commit: their rows take about 5 ms, during which other processes wait."""
 _LEFT: Final = frozenset({State.DELIVERED, State.DEDUPLICATED, State.EVICTED})
@@ -77,7 +75,7 @@ class Spool:
         self._tree = Tree(root)
         self._connections = Connections(root)
         self._session: Session | None = None
-        self._compacted_ns = self._forgot_ns = 0
+        self._forgot_ns = 0
         self._shortage = Shortage(root)
         self._ballast = Ballast(root / 'ballast')
         self.requests = Requests(self._connections, self._tree, robot)
@@ -360,12 +358,7 @@ class Spool:
             log.warning('cannot move %s to the quarantine: %s', item.path, error)
 
     def _tidy(self, now_ns: int) -> None:
-        """Once per minute, shorten the rows of objects that left the spool an hour ago; once per hour, forget old ones.
-
-        While more remains to be done, each commit does one step.
-        """
-        if not 0 <= now_ns - self._compacted_ns < 60 * SECOND:
-            self._compacted_ns = now_ns if self._connections.writing.history.compact(now_ns - FULL_ROWS_NS) else 0
+        """Once per hour, forget objects and gaps of long ago; while more remain, each commit forgets some."""
         if not 0 <= now_ns - self._forgot_ns < 3600 * SECOND:
             done = self._connections.writing.history.forget(now_ns - round(self._settings.remember_days * DAY_NS))
             self._forgot_ns = now_ns if done else 0

@@ -23,12 +23,6 @@ def after(prefix: str) -> str:
     return f'{prefix[:-1]}{chr(ord(prefix[-1]) + 1)}' if prefix else '\U0010ffff'
 
 
-def split(key: str) -> tuple[str, str]:
-    """The folder of a key, with the slash, and the rest."""
-    folder, slash, name = key.rpartition('/')
-    return folder + slash, name
-
-
 def marks(count: int) -> str:
     """Placeholders for a statement."""
     return ', '.join('?' * count)

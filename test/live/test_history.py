@@ -24,7 +24,7 @@ from lake.gap_parts import lost, mark, tell
 from lake.making import NOON_NS, add, add_part, folder_store
 from lake.test_pull import Field
 from live.test_kinds import cdr, header, new
-from spool.making import FakeClock, index_of, make, new_spool, put, settle
+from spool.making import FakeClock, make, new_spool, put, settle
 
 from shadowhound_data_logger.bags.manifest import COMPLETE, EventOf, Manifest, MissionOf, SliceEntry, TriggerOf
 from shadowhound_data_logger.core.clock import SECOND, utc
@@ -219,9 +219,8 @@ def test_messages_of_a_batch_are_shown_when_they_arrived(store: ObjectStore, ope
         assert before_ms == pytest.approx(1000 * age_s, abs=0.2)
 
 
-@pytest.mark.parametrize('is_compact', [False, True])
-def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_path: Path, *, is_compact: bool) -> None:
-    """Also what has a short row only, and what arrived on another day than its stamp."""
+def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
+    """Also what arrived on another day than its stamp."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -234,11 +233,6 @@ def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_pat
         settle(spool, item, State.DELIVERED)
     finally:
         spool.close()
-    with index_of(tmp_path / 'spool') as index:
-        index.catalog.clear()
-        with index.transaction():
-            if is_compact:
-                index.history.compact(clock.wall_ns() + 1)
     history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
     for by, at_ns in (('stamp', NOON_NS_OF_SPOOL), ('received', NOON_NS_OF_SPOOL + late_ns)):
         head, _ = history.moment('thor', at_ns + SECOND, by)
@@ -248,7 +242,7 @@ def test_a_spool_is_shown_by_arrival(store: ObjectStore, opened: Opened, tmp_pat
 
 
 def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path) -> None:
-    """What waits is read from the spool, what was delivered from the store, also when its row is a short one."""
+    """What waits is read from the spool, what was delivered from the store."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
     spool.open()
@@ -263,10 +257,6 @@ def test_the_past_of_a_spool(store: ObjectStore, opened: Opened, tmp_path: Path)
             settle(spool, item, State.DELIVERED)
     finally:
         spool.close()
-    with index_of(tmp_path / 'spool') as index:
-        index.catalog.clear()
-        with index.transaction():
-            index.history.compact(clock.wall_ns() + 1)
     history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
     assert history.answer({'do': 'days', 'robot': 'thor'})[0] == {'days': ['2025-10-18']}
     for second, where in enumerate(('the store', 'the store', 'the spool')):
@@ -543,11 +533,8 @@ def pauses(found: list[list[Any]], topic: str) -> list[tuple[int, int]]:
     return [(round(begin - noon) // 1000, round(end - noon) // 1000) for name, begin, end in found if name == topic]
 
 
-@pytest.mark.parametrize('is_compact', [False, True])
 @pytest.mark.parametrize('by', ['stamp', 'received'])
-def test_a_timeline_of_a_spool_has_every_pause(
-    store: ObjectStore, opened: Opened, tmp_path: Path, by: str, *, is_compact: bool
-) -> None:
+def test_a_timeline_of_a_spool_has_every_pause(store: ObjectStore, opened: Opened, tmp_path: Path, by: str) -> None:
     """Though only the first and the last object of each step are read; bookkeeping is not data; ``fit`` opens at the data."""
     clock = FakeClock()
     spool = new_spool(tmp_path / 'spool', clock)
@@ -565,18 +552,13 @@ def test_a_timeline_of_a_spool_has_every_pause(
                 settle(spool, item, State.DELIVERED)
     finally:
         spool.close()
-    with index_of(tmp_path / 'spool') as index:
-        index.catalog.clear()
-        if is_compact:
-            with index.transaction():
-                index.history.compact(clock.wall_ns() + 1)
     history = opened(SpoolPast(tmp_path / 'spool', 'thor'), SpoolKept(tmp_path / 'spool', 'thor'))
     noon = NOON_NS_OF_SPOOL // 1_000_000
     day = {'do': 'timeline', 'robot': 'thor', 'from': noon - 3_600_000, 'to': noon + 3_600_000, 'by': by}
     found, _ = history.answer({**day, 'fit': 1})
     assert noon + 1000 * (late_s - 20) <= found['from'] < noon + 1000 * late_s
     assert noon + 1000 * (late_s + 82) < found['to'] <= noon + 1000 * (late_s + 102)
-    topic = 'camera' if is_compact else '/camera'
+    topic = '/camera'
     expected = [(begin + late_s, end + late_s) for begin, end in ((0, 19), (40, 49), (60, 60), (80, 82))]
     assert pauses(found['recorded'], topic) == expected
     assert {name for name, *_ in found['recorded']} == {topic}

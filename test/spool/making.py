@@ -106,16 +106,6 @@ def rows(root: Path) -> list[dict[str, Any]]:
         connection.close()
 
 
-def short_rows(root: Path) -> list[dict[str, Any]]:
-    """All rows of what left the spool an hour ago, read by somebody else."""
-    connection = sqlite3.connect(root / 'index.db')
-    connection.row_factory = sqlite3.Row
-    try:
-        return [dict(row) for row in connection.execute('SELECT * FROM compact_objects ORDER BY id')]
-    finally:
-        connection.close()
-
-
 def files(root: Path) -> dict[str, bytes]:
     """Every payload in the spool's tree by its path."""
     folders = ('incoming', 'ready', 'held', 'quarantine', 'kept', 'foreign')

@@ -22,7 +22,6 @@ from spool.making import (
     receive,
     rows,
     settle,
-    short_rows,
 )
 
 from shadowhound_data_logger.bags.local import RECORDS
@@ -193,7 +192,7 @@ def test_forgetting_keeps_up(spool: Spool, root: Path, clock: FakeClock, monkeyp
     left = []
     for _ in range(3):
         spool.commit()
-        left.append(len(short_rows(root)))
+        left.append(len(rows(root)))
     assert left == [3, 1, 0]
 
 

@@ -1,26 +1,20 @@
-"""What the index keeps of an object that left the spool: all of it for an hour, then what must be known of its key."""
+"""Objects that left the spool keep their rows for ``spool.remember_days``."""
 
 from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from profiles import examples
 from spool.conftest import Open
-from spool.making import BUCKET, NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows, short_rows
+from spool.making import BUCKET, NOON_NS, FakeClock, assert_whole, make, new_spool, put, rows
 
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.model import DataObject, Outcome, State
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.files import content_sha256
-from shadowhound_data_logger.spool.history_table import COMPACT_STATES
 from shadowhound_data_logger.spool.index import Index
 from shadowhound_data_logger.spool.spool import Spool
 
@@ -50,7 +44,7 @@ def catalog(spool: Spool) -> None:
 
 
 def age(spool: Spool, by_ns: int = 2 * HOUR_NS) -> None:
-    """Let time pass, and commit until all rows are short that are due."""
+    """Let time pass, and commit until everything is forgotten that is due."""
     clock = spool._clock
     assert isinstance(clock, FakeClock)
     clock.now_ns += by_ns
@@ -65,18 +59,6 @@ def used(root: Path) -> tuple[int, int]:
     return (count - free) * size, count * size
 
 
-@pytest.mark.long('an hour of rows')
-def test_what_left_an_hour_ago_takes_a_tenth(spool: Spool, root: Path) -> None:
-    """Of the bytes that it took in the index before."""
-    empty = used(root)[0]
-    leave(spool, *(frame(second) for second in range(2000)))
-    full = used(root)[0] - empty
-    age(spool)
-    assert used(root)[0] - empty <= full / 10
-    assert rows(root) == []
-
-
-@pytest.mark.long('an hour of rows')
 def test_pages_are_used_again(spool: Spool, root: Path) -> None:
     """The file does not grow once as much is forgotten as comes."""
     sizes = []
@@ -88,12 +70,11 @@ def test_pages_are_used_again(spool: Spool, root: Path) -> None:
 
 
 def test_what_a_key_needs_stays_known(opened: Open, spool: Spool, root: Path) -> None:
-    """That it was given out, with which content; what became of it; and the ledger."""
+    """That it was used, with which content; what became of it; and the ledger."""
     leave(spool, frame(1), make('thor/rosbags/bag_a/bag_a_0.mcap', b'a slice'))
     leave(spool, make('thor/rosbags/bag_a/bag_a_1.mcap', b'another'), state=State.EVICTED)
     before = assert_whole(root)
     age(spool)
-    assert len(short_rows(root)) == 3
     assert assert_whole(root) == before
     key, sha256 = frame(1).key, content_sha256(frame(1).body)
     assert spool.has(BUCKET, key)
@@ -114,26 +95,20 @@ def test_what_a_key_needs_stays_known(opened: Open, spool: Spool, root: Path) ->
     assert not os.path.lexists(path)
 
 
-def test_an_audit_asks_for_both(spool: Spool, root: Path) -> None:
-    """Objects with full rows and with short ones, each once, also one that changes meanwhile; not the catalog's parts."""
+def test_an_audit_checks_each_delivery_once(spool: Spool, root: Path) -> None:
+    """An interrupted audit continues with the others; parts of the catalog are not checked."""
     part = make('thor/_catalog/a', b'part', sensor='_catalog', topic=None, samples=0)
-    leave(spool, *(frame(second) for second in range(5)), part)
-    age(spool)
-    leave(spool, *(frame(second) for second in range(5, 9)))
+    leave(spool, *(frame(second) for second in range(9)), part)
     with closing(Deliveries(root)) as deliveries:
         deliveries.open('an audit')
         assert (deliveries.known(), deliveries.forgotten(), deliveries.since_ns()) == (9, 0, NOON_NS)
-        pages = deliveries.pages()
-        page = next(pages)
-        deliveries.set_verified([number for number, _ in page])
-        age(spool)
-        assert len(short_rows(root)) == 10
-        asked = [*page, *(item for more in pages for item in more)]
+        (asked,) = deliveries.pages()
         assert sorted(info.key for _, info in asked) == sorted(frame(second).key for second in range(9))
         assert {info.sha256 for _, info in asked} == {content_sha256(frame(second).body) for second in range(9)}
+        deliveries.set_verified([number for number, _ in asked[:4]])
     with closing(Deliveries(root)) as deliveries:
         deliveries.open('an audit')
-        assert sum(map(len, deliveries.pages())) == 5, 'what is noted is not asked for again'
+        assert sum(map(len, deliveries.pages())) == 5
 
 
 def test_what_the_catalog_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
@@ -143,7 +118,7 @@ def test_what_the_catalog_lacks_keeps_its_row(spool: Spool, root: Path) -> None:
     age(spool, 30 * DAY_NS)
     assert len(rows(root)) == 1
     catalog(spool)
-    age(spool)
+    age(spool, DAY_NS)
     assert rows(root) == []
 
 
@@ -154,81 +129,7 @@ def test_what_a_full_disk_never_took_in_is_forgotten_too(root: Path) -> None:
     spool.open()
     put(spool, frame(1))
     assert [row['state'] for row in rows(root)] == ['evicted']
-    age(spool)
-    assert [row['state'] for row in short_rows(root)] == [COMPACT_STATES.index(State.EVICTED)]
     age(spool, 30 * DAY_NS)
-    assert short_rows(root) == []
+    assert rows(root) == []
     assert assert_whole(root)['objects']['evicted'] == 1
     spool.close()
-
-
-def test_rows_are_made_short_step_by_step(opened: Open, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each commit does a step, and between the steps every key is found."""
-    spool = opened()
-    leave(spool, *(frame(second) for second in range(5)))
-    spool.close()
-    monkeypatch.setattr('shadowhound_data_logger.spool.history_table.COMPACT_STEP', 2)
-    spool = opened()
-    left = [len(rows(root))]
-    clock = spool._clock
-    assert isinstance(clock, FakeClock)
-    clock.now_ns += 2 * HOUR_NS
-    for _ in range(3):
-        spool.commit()
-        left.append(len(rows(root)))
-        assert all(spool.has(BUCKET, frame(second).key) for second in range(5))
-    assert left == [5, 3, 1, 0]
-
-
-@pytest.mark.parametrize(
-    'damage',
-    ['UPDATE compact_objects SET state = 7', "UPDATE compact_objects SET sha256 = 'text'", "UPDATE folders SET path = x'00'",
-     "UPDATE gaps_reported SET version = 'x'"],
-)  # fmt: skip
-def test_a_short_row_that_cannot_be_is_found(opened: Open, root: Path, damage: str) -> None:
-    """As one of any other table: the index is made anew."""
-    spool = opened()
-    leave(spool, frame(1))
-    age(spool)
-    spool.close()
-    with closing(sqlite3.connect(root / 'index.db')) as db:
-        db.execute(damage)
-        db.commit()
-    assert opened().recovery.counts['damaged index rebuilt'] == 1
-
-
-@pytest.fixture(scope='module')
-def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Index, Index]]:
-    """Two indexes, empty."""
-    opened = tuple(Index(tmp_path_factory.mktemp('index') / 'index.db') for _ in range(2))
-    for index in opened:
-        index.open()
-    yield opened  # type: ignore[misc]
-    for index in opened:
-        index.close()
-
-
-_NAMES = st.lists(st.text('ab_/.', min_size=1, max_size=6), min_size=1, max_size=12, unique=True)
-
-
-@given(names=_NAMES, prefix=st.text('ab_/.', max_size=4), states=st.sets(st.sampled_from(COMPACT_STATES)))
-@settings(max_examples=examples(150), deadline=None)
-def test_keys_that_begin_so_are_the_same_with_short_rows(
-    two: tuple[Index, Index], names: list[str], prefix: str, states: set[State]
-) -> None:
-    """Whatever folder a prefix ends in."""
-    found = []
-    for index, before_ns in zip(two, (0, NOON_NS + 1), strict=True):
-        index._db.executescript('DELETE FROM objects; DELETE FROM compact_objects')
-        with index.transaction():
-            for place, name in enumerate(names):
-                number = index.states.insert(make(name), name, f'{place % 3:064x}', State.PENDING, None, {}, NOON_NS)
-                index.states.move([number], COMPACT_STATES[place % 3], None, NOON_NS)
-            index._db.execute('DELETE FROM uncataloged')
-            index.history.compact(before_ns)
-        assert [index.objects.has(BUCKET, name) for name in names] == [True] * len(names)
-        found.append((
-            [row['key'] for row in index.objects.with_prefix(BUCKET, prefix, states)],
-            sorted(row['key'] for row in index.objects.with_content(BUCKET, prefix, f'{1:064x}')),
-        ))  # fmt: skip
-    assert found[0] == found[1]
