@@ -56,29 +56,27 @@ COMMANDS: Final = """\
 
 *Generated from the code by `make docs`: change `shadowhound_data_logger/cli/`, not this page.*
 
-`shadowhound-data VERB --help` describes each verb with all of its options. Most print JSON with `--json`. Times are UTC and are
-written alike everywhere: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
+`shadowhound-data VERB --help` describes each verb with all of its options and more examples. Most print JSON with `--json`.
+Times are UTC: `yesterday`, `2h`, `2025-10-18`, `2025-10-18T12:30`.
 
-An error names the verb, what is wrong and where, and on the next line what to do:
+An error names the verb, what is wrong, and on the next line what to do:
 
     shadowhound-data bag info: there is no bag patrol of rover in the folder /home/hound/.shadowhound/store
       -> the store has no bag of rover; --robot names another robot
 
-With `--json` (and `--format json`) an error is one line of JSON on standard error, and nothing is printed on standard output:
+With `--json` an error is one line of JSON on standard error, and nothing is printed on standard output:
 
     {"error": "there is no sensor 'camra'", "remedy": "is it 'camera'?", "verb": "shadowhound-data query", "exit_code": 2}
 
-A name that does not exist in the store (robot, sensor, topic, field, mission, mission type, policy, label, bag) is a
-usage error. If all names exist and nothing matches, the answer is empty and the exit code is 0.
+A name that does not exist in the store (robot, sensor, topic, mission, label, ...) is a usage error. If nothing matches, the
+answer is empty and the exit code is 0.
 
 ## Completion in the shell
-The package installs completion for bash: `share/bash-completion/completions/shadowhound-data` in its prefix. If your shell does
-not find it there, put one of these lines into `~/.bashrc`; the second also works in a virtual environment:
+The package installs completion for bash. If your shell does not find it, put one of these lines into `~/.bashrc`; the second also
+works in a virtual environment, and with `zsh_source` and `fish_source` in other shells:
 
     source $(ros2 pkg prefix shadowhound_data_logger)/share/bash-completion/completions/shadowhound-data
     eval "$(_SHADOWHOUND_DATA_COMPLETE=bash_source shadowhound-data)"
-
-Verbs, options and choices are completed. For zsh and fish, click has `zsh_source` and `fish_source`.
 
 ## Exit codes
 The same for every verb; the node exits with 0, 1 or 2 in the same sense.
@@ -253,11 +251,17 @@ OTHER_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
         '',
         'The passphrase of keys made with `policy keys --encrypt`; otherwise it is prompted for.',
     ),
+    (
+        'SHADOWHOUND_POLICY_ISOLATION',
+        '`sandbox`',
+        'The weakest isolation of a smoke run ([policies](policies.md#the-smoke-runs-sandbox)).',
+    ),
+    ('SHADOWHOUND_ALERT_URL', '', 'Where the live page sends [alerts](live.md#alerts).'),
     ('SHADOWHOUND_LIVE_BIND', '`127.0.0.1`', 'Where the live page listens; read by its systemd unit.'),
     (
         'SHADOWHOUND_PORT_GUARD',
         '`on`',
-        'With `off`, ports in shared memory that killed listeners leave are not repaired (reliability.md).',
+        'With `off`, ports in shared memory that killed listeners leave are not repaired ([why](reliability.md#limits)).',
     ),
     (
         'AWS_SHARED_CREDENTIALS_FILE',
@@ -304,29 +308,29 @@ def commands() -> str:
     parts = [COMMANDS, _row('code', 'meaning'), '|---|---|\n']
     parts += [_row(f'`{code.value}`', meaning) for code, meaning in MEANINGS.items()]
     for title, names in READERS.items():
-        parts += [f'\n## {title}\n', _row('verb', ''), '|---|---|\n']
-        parts += [_row(f'[`{name}`](#{name})', verbs[name].help) for name in names]
+        parts.append(f'\n## {title}\n')
         for name in names:
             parts += _verb(name, verbs[name].load())
     return ''.join(parts)
 
 
 def _verb(name: str, verb: click.Command) -> Iterator[str]:
-    """The section of a verb: its examples, and a row for each verb below it."""
+    """The section of a verb: a row for each verb below it, or its examples."""
     yield f'\n### {name}\n{verb.get_short_help_str(1000)}\n\n'
-    yield from (f'    {line}\n' for line in _examples(verb))
     if isinstance(verb, click.Group):
-        yield '\n' + _row('verb', '', 'for example') + '|---|---|---|\n'
+        yield _row('verb', '', 'for example') + '|---|---|---|\n'
         yield from _rows((name,), verb)
+    else:
+        yield from (f'    {line}\n' for line in _examples(verb))
 
 
 def _rows(path: tuple[str, ...], group: click.Group) -> Iterator[str]:
     for name, verb in group.commands.items():
         at = (*path, name)
-        listed = '<br>'.join(f'`{line}`' for line in _examples(verb))
-        yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000), listed)
         if isinstance(verb, click.Group):
             yield from _rows(at, verb)
+        else:
+            yield _row(f'`{" ".join(at)}`', verb.get_short_help_str(1000), f'`{_examples(verb)[0]}`')
 
 
 def _examples(verb: click.Command) -> list[str]:
