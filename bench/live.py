@@ -84,7 +84,7 @@ class Watcher:
             if not reads:
                 await asyncio.sleep(3600)
             said_s = time.monotonic()
-            telling: asyncio.Task[None] | None = None
+            serve_policy_topics: asyncio.Task[None] | None = None
 
             async def tell() -> None:  # after what came with it, as link.js does
                 if (said := frames.acknowledgement()) is not None:
@@ -96,8 +96,8 @@ class Watcher:
                 if bytes_s:
                     await asyncio.sleep(len(message.data) / bytes_s)
                 items = frames.take(message.data)
-                if telling is None or telling.done():
-                    telling = asyncio.create_task(tell())
+                if serve_policy_topics is None or serve_policy_topics.done():
+                    serve_policy_topics = asyncio.create_task(tell())
                 for head, body in items:
                     if head['kind'] == 'video' and self.takes_video:
                         await video.told(head)

@@ -49,7 +49,7 @@ def pair(node: Any, topic: str) -> tuple[Reader, Reader]:
     plan = Plan(topic, 'std_msgs/msg/String', reliable=True, transient_local=False, depth=2 * MESSAGES)
     readers = []
     for enough in ((), (99,)):
-        reader.TELLS_PUBLISHERS = enough  # type: ignore[misc]
+        reader.REPORTS_PUBLISHERS = enough  # type: ignore[misc]
         readers.append(Reader(node, plan, PolledGroup()))
     assert [one._taker is None for one in readers] == [True, False], 'takes through librcl are not proved here'
     return readers[0], readers[1]

@@ -34,6 +34,6 @@ def free_domain() -> Iterator[int]:
             yield domain
         finally:
             os.close(lock)
-            orphans(is_freed=True)
+            orphans(free=True)
         return
     pytest.fail('no ROS domain is free')

@@ -52,7 +52,7 @@ from shadowhound_data_logger.lake import gaps, prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prune import forgotten
-from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.node.encoding.halver import Halver
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.requests import RequestServer
 from shadowhound_data_logger.shipping.thinning import Thinner
@@ -117,7 +117,9 @@ class World:
         return (self._clock.now_ns - MONDAY_NS) // MINUTE_NS % (24 * 60) in self.shift
 
     def number(self, topic: str, path: Sequence[str]) -> float | str:
-        return self.soc if (topic, tuple(path)) == ('lowstate', ('bms_state', 'soc')) else f'no message of {topic} came yet'
+        return (
+            self.soc if (topic, tuple(path)) == ('lowstate', ('bms_state', 'soc')) else f'no message of {topic} was received yet'
+        )
 
     def networks(self) -> Collection[str]:
         return {self.ssid} - {''}
@@ -283,7 +285,7 @@ class Weeks:
         self.now_s = (self.clock.now_ns - MONDAY_NS) / SECOND
         self.catalog = CatalogWriter(self.folder / 'spool', CatalogSettings(), ROBOT, self.clock, lambda: self.now_s, keeps=True)
         home = self.folder / 'home'
-        thinner = Thinner(self.spool, KEEP.thin_to_hz, Halving(home, ROBOT, KEEP.thin_to_hz))
+        thinner = Thinner(self.spool, KEEP.thin_to_hz, Halver(home, ROBOT, KEEP.thin_to_hz))
         self.server = RequestServer(
             self.spool, self.store, KEEP, ROBOT, self.clock, put=self._put, released=lambda _: None,
             cutter=partial(KeptCut, home), thin=thinner.step, monotonic=lambda: self.now_s,

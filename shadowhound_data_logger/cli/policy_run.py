@@ -271,7 +271,7 @@ def _syncing(given: dict[str, Any]) -> Iterator[PolicySync]:
 def _telling() -> Iterator[None]:
     """The topics of the policy during that time, if ROS is installed."""
     try:
-        from shadowhound_data_logger.ros.policy_topics import telling  # noqa: PLC0415 - ROS is not everywhere
+        from shadowhound_data_logger.ros.policy_topics import serve_policy_topics  # noqa: PLC0415 - ROS is not everywhere
     except ImportError as error:
         print(
             f'without ROS ({error}): ~/policy is not published, and only `policy report` reports health',
@@ -280,7 +280,7 @@ def _telling() -> Iterator[None]:
         )
         yield
         return
-    with telling(_policies()):
+    with serve_policy_topics(_policies()):
         yield
 
 

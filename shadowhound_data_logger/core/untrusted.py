@@ -221,7 +221,7 @@ def decompress(compression: str, content: bytes, size: int | None = None) -> byt
     except (RuntimeError, EOFError) as error:  # lz4 raises the former
         raise ValueError(str(error)) from error
     if not is_whole or len(found) > max_bytes or size not in {None, len(found)}:
-        raise ValueError(f'it does not decompress to {"at max_bytes " * (size is None)}{max_bytes:,} bytes, as it should')
+        raise ValueError(f'it does not decompress to {"at most " * (size is None)}{max_bytes:,} bytes, as it should')
     return found
 
 

@@ -203,7 +203,7 @@ def _fixed(what: tuple[str, ...], context: Context) -> str:
             Path(name).chmod(int(rest[0], 8))
             return f'chmod {rest[0]} {name}'
         if kind == 'segments':
-            freed = orphans(Path(name), is_freed=True)
+            freed = orphans(Path(name), free=True)
             return f'freed {sum(each.bytes for each in freed) / 1e6:.0f} MB in {name}'
         if kind == 'ports':
             return f'repaired {", ".join(settle(Path(name))) or "nothing"} in {name}'

@@ -1,1 +1,1 @@
-"""From the robot to closed batches: all of the node that imports rclpy. Messages are handed on as they came."""
+"""Everything in the node's process, from subscriptions to closed batches. Messages are passed on unchanged."""

@@ -1,4 +1,4 @@
-"""The node's life: its arguments, its signals, its main loop. Importing this loads rclpy, and with it the middleware."""
+"""The node's process: arguments, signals, main loop. Importing this loads rclpy, and with it the middleware."""
 
 from __future__ import annotations
 
@@ -34,70 +34,69 @@ log = logging.getLogger(__name__)
 
 USAGE = """\
 usage: sensor_logger_node [--ros-args [--params-file FILE] [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] ...]
-What it is doing: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to a folder, $SHADOWHOUND_HOME/store."""
+Its state: shadowhound-data status. Without AWS_ENDPOINT_URL it stores to the folder $SHADOWHOUND_HOME/store."""
 LISTENER = '_sensor_logger_intake'
-"""Name of the node where the front has the public one; `ros2 node list` hides what begins so."""
+"""Name of the listening node if the front has the public one; `ros2 node list` hides names that start with _."""
 NO_SERVICE = 'start_type_description_service'
 """A parameter of rclpy since Jazzy."""
-UNHEARD = 'the parameter file has nothing for {name}, so the defaults hold: begin its section with /**, or with that name'
+UNHEARD = 'the parameter file has nothing for {name}, so the defaults apply: start its section with /**, or with that name'
 NO_FRONT = (
     '{rmw} is not installed here, so services, parameters and /diagnostics are not offered to the robot: install it, '
     'or use `shadowhound-data node`'
 )
 SPIN_S = 0.5
-"""How long a signal may wait to be seen; two of them are the second that is between two statuses."""
+"""Maximum delay until a signal is seen; two of them make the second between two statuses."""
 GIVE_BACK_S = 20.0
-"""How often what a crowd of topics or an outage took is given back: half a millisecond with a heap of 100 MB."""
+"""Interval for returning memory to the system after many topics or an outage; takes 0.5 ms with a heap of 100 MB."""
 SECOND_SIGNAL_S = 1.0
-"""A second signal later than this ends the node at once; an earlier one is the same key press."""
+"""A second signal later than this exits immediately; an earlier one is the same key press."""
 WATCHDOG_PART: Final = 3
-"""The node says that it lives this many times within the time that systemd allows, so that one lost word is not a death."""
+"""Number of watchdog pings within systemd's timeout, so that one lost ping does not kill the node."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ros:
-    """How the logger takes part in ROS."""
+    """The logger's ROS nodes and middleware."""
 
     node: Node
-    """The node that listens."""
+    """The node with the subscriptions."""
     name: str
-    """The full name under which ROS knows the logger."""
+    """The logger's full public name in ROS."""
     middleware: Middleware
     front: Front | None
     """Offers services, parameters and diagnostics in the robot's RMW; None if the node itself does, or no process can."""
 
 
 class SystemdService:
-    """What the node tells systemd when it is a service: that it is ready, that it lives, that it stops (sd_notify(3)).
+    """Notifies systemd, if it started this service: ready, alive, stopping (sd_notify(3)).
 
-    Without systemd it tells nobody and costs nothing. New; ``ready`` once; ``alive`` from the main loop, as often as it turns;
-    ``stopping`` once.
+    Does nothing without systemd. New; ``ready`` once; ``alive`` from the main loop, as often as it runs; ``stopping`` once.
     """
 
     def __init__(self, environ: MutableMapping[str, str]) -> None:
-        """Takes the variables out of the environment: they are this process's, and none of its children's."""
+        """Removes the variables from the environment: they are for this process, not its children."""
         self._address = environ.pop('NOTIFY_SOCKET', '')
         pid, interval_us = environ.pop('WATCHDOG_PID', ''), environ.pop('WATCHDOG_USEC', '')
         is_watched = bool(self._address) and interval_us.isdigit() and pid in {'', str(os.getpid())}
         self._pause_s = int(interval_us) / 1e6 / WATCHDOG_PART if is_watched else None
         self._due_s = 0.0
-        self._told = False
+        self._failure_logged = False
 
     def ready(self, what: str) -> None:
-        """It logs now; ``what`` is shown by ``systemctl status``."""
-        self._tell(f'READY=1\nSTATUS={what}')
+        """Logging has started; ``systemctl status`` shows ``what``."""
+        self._notify(f'READY=1\nSTATUS={what}')
 
     def alive(self) -> None:
-        """Its main loop turned; a loop that hangs lets systemd end it with SIGABRT and start it again."""
+        """The main loop runs; if it hangs, systemd ends the process with SIGABRT and restarts it."""
         if self._pause_s is not None and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + self._pause_s
-            self._tell('WATCHDOG=1')
+            self._notify('WATCHDOG=1')
 
     def stopping(self) -> None:
-        self._tell('STOPPING=1\nSTATUS=closing: open batches are finished and delivered')
+        self._notify('STOPPING=1\nSTATUS=closing: open batches are finished and delivered')
 
-    def _tell(self, text: str) -> None:
-        """Never raises and never waits: systemd's silence is not a reason to stop logging."""
+    def _notify(self, text: str) -> None:
+        """Never raises and never blocks: a problem with systemd must not stop logging."""
         if not self._address:
             return
         name = '\0' + self._address[1:] if self._address.startswith('@') else self._address
@@ -105,13 +104,13 @@ class SystemdService:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC) as sender:
                 sender.sendto(text.encode(), name)
         except OSError as error:
-            if not self._told:
-                self._told = True
+            if not self._failure_logged:
+                self._failure_logged = True
                 log.warning('cannot report to systemd: %s', error)
 
 
 class StopSignals:
-    """SIGINT and SIGTERM ask to stop; a second one, later, ends the process: what is spooled is durable already."""
+    """SIGINT and SIGTERM request a stop; a second, later one exits the process: spooled data is durable already."""
 
     def __init__(self) -> None:
         self.first_s: float | None = None
@@ -130,29 +129,29 @@ class StopSignals:
 
 
 def refuse(rest: list[str]) -> int:
-    """Answer arguments that are not for ROS; the exit code."""
+    """Report arguments that are not for ROS; returns the exit code."""
     if rest[0] in {'-h', '--help'}:
         print(USAGE)  # noqa: T201
         return 0
-    print(f'sensor_logger_node: {rest[0]!r} is not an argument of it; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
+    print(f'sensor_logger_node: {rest[0]!r} is not a valid argument; settings follow --ros-args\n{USAGE}', file=sys.stderr)  # noqa: T201
     return 2
 
 
 def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) -> int:
-    """From the start of ROS to its end; the exit code.
+    """Run ROS from start to shutdown; returns the exit code.
 
-    ``arguments`` are those of ROS, without the program's name; ``robot`` is the environment before we changed it.
+    ``arguments`` are those of ROS, without the program's name; ``robot`` is the environment before our changes.
     """
     heap.limit_arenas()
     try:
-        if rest := remove_ros_args(arguments):  # a --params-file without --ros-args, say: rcl would ignore it
+        if rest := remove_ros_args(arguments):  # such as --params-file without --ros-args, which rcl would ignore
             return refuse(rest)
         rclpy.init(args=[sys.argv[0], *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # a parameter file or argument that rcl cannot parse; there is no logger yet
         print(f'sensor_logger_node: {error}', file=sys.stderr)  # noqa: T201
         return 2
     stop = StopSignals()
-    freed = orphans(is_freed=True)  # before anything of ours needs the room that the node before may have left full
+    freed = orphans(free=True)  # before we need the shared memory that a killed node may have left full
     with middleware.profiled(os.environ), dead_ports_avoided(get_default_context().get_domain_id()) as avoided:
         node, name = make_node(arguments, is_public=not middleware.is_foreign)
     guard = PortGuard()
@@ -176,8 +175,8 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
     except DataLoggerError as error:
         node.get_logger().fatal(str(error))
         return 1
-    except BaseException as error:  # the one supervised catch-all of the main loop; systemd starts the node again
-        logging.getLogger(__name__).critical('the node ends: %s: %s', type(error).__name__, error, exc_info=error)
+    except BaseException as error:  # the one supervised catch-all of the main loop; systemd restarts the node
+        logging.getLogger(__name__).critical('the node exits: %s: %s', type(error).__name__, error, exc_info=error)
         return 1
     finally:
         node.destroy_node()
@@ -187,9 +186,9 @@ def run(arguments: list[str], middleware: Middleware, robot: Mapping[str, str]) 
 
 
 def make_node(arguments: Sequence[str], *, is_public: bool) -> tuple[Node, str]:
-    """The node that listens, and the full name under which ROS knows the logger.
+    """The listening node, and the logger's full public name in ROS.
 
-    Where the front has that name, the node that listens has another one, no services, and all else that the arguments say of it.
+    If the front has the public name, the listening node has another one, no services, and otherwise the same arguments.
     """
     if is_public:
         node = Node(NODE, automatically_declare_parameters_from_overrides=True)
@@ -208,13 +207,13 @@ def make_node(arguments: Sequence[str], *, is_public: bool) -> tuple[Node, str]:
 
 
 def log_until(stop: StopSignals, ros: Ros) -> None:
-    """Until a signal comes."""
+    """Run until a signal arrives."""
     service = SystemdService(os.environ)
     node, middleware = ros.node, ros.middleware
     parameters = Parameters(node)
     given = parameters.load()
     if given.capture.rmw != middleware.asked:
-        allowed = f'{middleware.asked!r}, which is what the command line says to those who read it before ROS is loaded'
+        allowed = f'{middleware.asked!r}, the value that the command line gives before ROS is loaded'
         raise SettingError(SETTING, given.capture.rmw, allowed)
     early = EarlyReaders(node, given.sensors)
     from shadowhound_data_logger.node.pipeline import Pipeline  # noqa: PLC0415 - half a second, in which the robot is heard already
@@ -243,7 +242,7 @@ def log_until(stop: StopSignals, ros: Ros) -> None:
 
 
 class RosHandler(logging.Handler):
-    """Hands records on. Each severity has its own line below: rclpy ties a severity to the calling line."""
+    """Forwards log records. Each severity needs a separate line below: rclpy ties a severity to the calling line."""
 
     def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""ROS parameters in, frozen settings out: the one place of the node that reads them, at its start and while it runs."""
+"""Converts ROS parameters to frozen settings: the only place in the node that reads them, at startup and later."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.core.options import GROUPS
 from shadowhound_data_logger.core.rules import read_rule
 
-FIXED: Final = 'Read at the start: change the parameter file and start the node again.'
+FIXED: Final = 'Read at startup: change the parameter file and restart the node.'
 MAX_INT: Final = (1 << 63) - 1
 ROBOT: Final = 'The first part of every key. If empty: SHADOWHOUND_ROBOT, the namespace, thor for a Go2, or the host name.'
-SENSORS: Final = 'The sensors there are, by name.'
+SENSORS: Final = 'The names of the sensors.'
 Described = dict[str, Any]
-"""A parameter: name, value, description, constraints, read_only, and low and high, which are None where it has no range."""
+"""A parameter: name, value, description, constraints, read_only, and low and high, which are None without a range."""
 _OPEN: Final[Mapping[str, None]] = {'low': None, 'high': None}
 
 
 class Parameters:
-    """The node's parameters. Those that are live may be changed; a change is checked as the start is, all of it or nothing.
+    """The node's parameters. Live ones can be changed; a change is checked as at startup, all or nothing.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``.
+    The node must have been created with ``automatically_declare_parameters_from_overrides``.
     """
 
     def __init__(self, node: Node) -> None:
@@ -39,21 +39,21 @@ class Parameters:
         self._described: list[Described] = []
 
     def given(self) -> bool:
-        """Whether file or command line set anything of ours; to be asked before ``load`` declares the rest."""
+        """Whether the file or command line set any of our parameters; call it before ``load`` declares the rest."""
         return any(name.partition('.')[0] not in NOT_SETTINGS for name in self._node.get_parameters_by_prefix(''))
 
     def load(self) -> Settings:
-        """The settings; every parameter is declared then, so that ``ros2 param list`` shows it. Raises SettingError."""
+        """The settings; declares every parameter, so that ``ros2 param list`` shows it. Raises SettingError."""
         settings = self._read()
         _check_topics(self._node, settings)
         self._described = sorted(_declarations(settings), key=lambda each: str(each['name']))
         for each in self._described:
             declare(self._node, each)
-        self._node.add_on_set_parameters_callback(self._judge)
+        self._node.add_on_set_parameters_callback(self._validate)
         return settings
 
     def changed(self) -> Settings | None:
-        """The settings as they are now; None when nobody has set a parameter since the last call."""
+        """The current settings; None if no parameter was set since the last call."""
         if not self._changed:
             return None
         self._changed = False
@@ -62,13 +62,13 @@ class Parameters:
     # -- for ``commands`` -------------------------------------------------------------------------------------------
 
     def get(self, names: Sequence[str]) -> dict[str, Any]:
-        """Values by name; raises DataLoggerError for a name that there is not."""
+        """Values by name; raises DataLoggerError for an unknown name."""
         for name in names:
             self._check_known(name)
         return {name: plain(self._node.get_parameter(name).value) for name in names}
 
     def set(self, values: Mapping[str, Any]) -> tuple[bool, str]:
-        """All of them or none, as ``ros2 param set`` does it; whether that was done, and why not. Raises DataLoggerError."""
+        """Set all or none, as ``ros2 param set`` does; returns whether it succeeded, and why not. Raises DataLoggerError."""
         for name, value in values.items():
             self._check_known(name)
             if value is not None and not _is_parameter(value):
@@ -80,7 +80,7 @@ class Parameters:
         return True, ', '.join(f'{name} = {value}' for name, value in values.items())
 
     def described(self) -> list[Described]:
-        """Each of our own, as it is now."""
+        """Each of our parameters with its current value."""
         return [{**each, 'value': plain(self._node.get_parameter(each['name']).value)} for each in self._described]
 
     def _check_known(self, name: str) -> None:
@@ -88,10 +88,10 @@ class Parameters:
             known = [each for each in self._node.get_parameters_by_prefix('') if each.partition('.')[0] not in NOT_SETTINGS]
             near = [each for each in known if each.partition('.')[0] == name.partition('.')[0]]
             there_are = ', '.join(sorted(near or {each.partition('.')[0] for each in known}))
-            raise DataLoggerError(f'there is no parameter {name!r}', remedy=f'there are {there_are}')
+            raise DataLoggerError(f'there is no parameter {name!r}', remedy=f'known are {there_are}')
 
-    def _judge(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Whether the node could have been started with these values; they are in force after ``changed``."""
+    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Whether the node could have been started with these values; they apply after ``changed``."""
         try:
             self._read(parameters)
         except SettingError as error:
@@ -106,7 +106,7 @@ class Parameters:
 
 
 def live(settings: Settings) -> dict[str, Any]:
-    """The settings that can be changed while the node runs, by the names of their parameters."""
+    """The settings that can be changed at run time, by parameter name."""
     return {name: value for name, value, spec in _flat(settings) if spec.metadata['live']}
 
 
@@ -119,7 +119,7 @@ def _flat(settings: Settings) -> Iterator[tuple[str, Any, Field[Any]]]:
 
 
 def _declarations(settings: Settings) -> Iterator[Described]:
-    """Every parameter."""
+    """Descriptions of all parameters."""
     for name, value, text in (('robot', '', ROBOT), ('sensors', [sensor.name for sensor in settings.sensors], SENSORS)):
         yield {'name': name, 'value': value, 'description': text, 'constraints': FIXED, 'read_only': True, **_OPEN}
     for name, value, spec in _flat(settings):
@@ -134,7 +134,7 @@ def _declarations(settings: Settings) -> Iterator[Described]:
 
 
 def _span(spec: Field[Any]) -> tuple[float | None, float | None]:
-    """The bounds of a number, in its own type; an open end is the largest one there is."""
+    """The bounds of a number, in its type; an open end is the largest value of the type."""
     low, high = spec.metadata['low'], spec.metadata['high']
     if low is None or not isinstance(spec.default, (int, float)):
         return None, None
@@ -144,7 +144,7 @@ def _span(spec: Field[Any]) -> tuple[float | None, float | None]:
 
 
 def declare(node: Node, each: Described) -> None:
-    """So that ROS shows the parameter as it is described. The type is left open, so that 5 is taken for 5.0."""
+    """Declare a parameter with its description. Its type is dynamic, so that 5 is accepted for 5.0."""
     descriptor = ParameterDescriptor(
         description=each['description'], additional_constraints=each['constraints'], read_only=each['read_only'],
         dynamic_typing=True,
@@ -169,7 +169,7 @@ def _is_parameter(value: object) -> bool:
 
 
 def _check_topics(node: Node, settings: Settings) -> None:
-    """Every topic has a valid name and, once resolved (namespace, remapping), a single sensor. Raises SettingError."""
+    """Check that every topic name is valid and, once resolved, belongs to a single sensor. Raises SettingError."""
     owners: dict[str, str] = {}
     mission = settings.mission
     for name, given in (('odometry', mission.odometry), ('battery', mission.battery), ('temperature', mission.temperature)):
@@ -193,7 +193,7 @@ def _check_topics(node: Node, settings: Settings) -> None:
             name = f'{sensor.name}.topics'
             resolved = _resolve(node, name, topic, list(sensor.topics))
             if resolved in owners:
-                text = f'a topic of its own, and {resolved} is in {owners[resolved]} already'
+                text = f'a unique topic; {resolved} is already in {owners[resolved]}'
                 raise SettingError(name, list(sensor.topics), text)
             owners[resolved] = name
 
@@ -202,13 +202,13 @@ def _resolve(node: Node, name: str, topic: str, given: object) -> str:
     """The full name of a topic; raises SettingError for an invalid one."""
     try:
         return str(node.resolve_topic_name(topic))
-    except (RuntimeError, ValueError) as error:  # RCLError is the one, InvalidTopicNameException the other
+    except (RuntimeError, ValueError) as error:  # one raises RCLError, the other InvalidTopicNameException
         reason = str(error).partition(', at ')[0].partition('\n')[0]
         raise SettingError(name, given, f'valid topic names, not {topic!r} ({reason})') from error
 
 
 def parameter(name: str, value: Any) -> Parameter:
-    """None stands for no value."""
+    """A ROS parameter; None means no value."""
     return Parameter(name, value=value) if value is not None else Parameter(name, Parameter.Type.NOT_SET)
 
 

@@ -1,4 +1,4 @@
-"""The stages of the node, put together: opened from the store back to the robot, closed the other way round."""
+"""Assembles the stages of the node: opened from the store to the robot, closed in reverse order."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from shadowhound_data_logger.core.stamps import StampRule
 from shadowhound_data_logger.core.status import MissionStatus
 from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.encoding.encode_pool import BatchQueue, EncodePool
-from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.node.encoding.halver import Halver
 from shadowhound_data_logger.node.encoding.pose_track import RobotTrack
 from shadowhound_data_logger.node.encoding.rejections import RejectionLog
 from shadowhound_data_logger.node.intake.early import EarlyReaders
@@ -72,14 +72,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CLOSE_S = 5.0
-"""Time for what is in memory to become durable at a stop; it takes a fraction of that unless the disk hangs."""
+"""Time for making data in memory durable at shutdown; it takes a fraction of that unless the disk hangs."""
 DAMAGED_S = 0.5
-"""The same where the spool takes nothing any more."""
+"""The same if the spool rejects all writes."""
 LEDGER_BUCKET = 'sensor-data'
 
 
 class Pipeline:
-    """Puts the stages of the node together, and starts and stops them in order.
+    """Assembles the node's stages, and starts and stops them in order.
 
     New; open once; close once.
     """
@@ -108,20 +108,20 @@ class Pipeline:
             self._opened = opened.pop_all()
 
     def _open_disk(self, opened: ExitStack) -> None:
-        """The store and the spool, which nobody else may be filling; ``opened`` closes them."""
+        """Open the store and the spool, which no other node may use; ``opened`` closes them."""
         settings = self._settings
         self._store = open_store(settings.store, settings.upload)
         opened.callback(self._store.close)
         self.spool.open()
         opened.callback(self.spool.close)
         if not opened.enter_context(self.spool.node_lock()):
-            raise SpoolError(f'another sensor_logger_node logs {settings.robot} to {self.spool.root} already',
-                             remedy='stop it, or give this one a robot name or SHADOWHOUND_HOME of its own')  # fmt: skip
+            raise SpoolError(f'another sensor_logger_node already logs {settings.robot} to {self.spool.root}',
+                             remedy='stop it, or give this one another robot name or SHADOWHOUND_HOME')  # fmt: skip
         for sink in SINKS:
             self.spool.carry(sink)
 
     def _make_stages(self) -> None:
-        """Each with what it hands its work to; none runs yet."""
+        """Create each stage with its downstream stage; none runs yet."""
         settings = self._settings
         queue = BatchQueue(settings.queue)
         self.writer = SpoolWriter(self.spool, expects=queue.is_busy)
@@ -131,7 +131,7 @@ class Pipeline:
                          self._record.offsets, keeps=partial(keeps_bag, settings.bag, settings.keep))  # fmt: skip
         recovery = BagRecovery(place, settings.bag.priority)
         self.event_buffer = EventBuffer(node, settings, place, recovery, types)
-        # Who listens to the robot; what is wanted besides the sensors' topics is shared with those further down.
+        # Consumers; topics besides those of the sensors are shared with later consumers.
         bag_queue = BagQueue()
         sensors = {sensor.name: sensor for sensor in settings.sensors}
         stamps = StampRule(self._clock, round(settings.clock.max_offset_s * SECOND))
@@ -148,12 +148,12 @@ class Pipeline:
         consumers = (track, sampler, *self.event_buffer.consumers, *self._rules.consumers, bags)
         named = [node.resolve_topic_name(topic) for sensor in settings.sensors for topic in sensor.topics]
         found = None if settings.capture.topics == NAMED else FoundTopics(node, settings.capture.topics, named)
-        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.is_place, found=found,
+        self.intake = Intake(node, sensors, accounts, types, stamps, consumers, first=track.has_pose, found=found,
                              early=self._early)  # fmt: skip
         self.recorder = Recorder(settings.bag, place, bag_queue, recovery, partial(self.intake.listen, bags))
         observer = MissionObserver(settings.mission, sensors, settings.robot, types, node.resolve_topic_name, track.marks,
                                    track.place)  # fmt: skip
-        self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._tell_mission)
+        self.mission = MissionWatch(settings, self.intake, sampler, queue, observer, self._on_mission)
         keeping = Keeping(settings.keep, sensors, settings.robot)
         marks = self.mission.mark, track.mark, keeping.mark, self._redating.mark
         self.pool = EncodePool(settings.robot, queue, sensors, types, self.writer, marks, self.mission.observe,
@@ -170,11 +170,11 @@ class Pipeline:
         self._interface = Interface(self._node, self._commands.answer) if not self._ros.middleware.is_foreign else None
 
     def _open_stages(self, opened: ExitStack) -> None:
-        """Start them, who is handed work before who hands it on; ``opened`` closes them in the opposite order, come what may."""
+        """Start the stages, downstream first; ``opened`` closes them in reverse order in any case."""
         front = self._ros.front
         if front is not None:
             opened.callback(front.close)
-        opened.callback(self._tell, ended=True)
+        opened.callback(self._publish_status, ended=True)
         self.writer.open()
         opened.callback(self.writer.close, 1.0)
         self.pool.open()
@@ -201,18 +201,18 @@ class Pipeline:
         log.info(self.describe())
 
     def describe(self) -> str:
-        """What goes where, in one line."""
+        """The data flow in one line."""
         listed = {sensor.name for sensor in self._settings.sensors}
         others = [name for name, own in DEFAULT_SENSORS.items() if name not in listed and own.get('enabled', True)]
         left_out = f'; not logged, because sensors does not list them: {", ".join(others)}' if others else ''
         return f'logging {" ".join(self.intake.topics)} to {self._store.describe()}, spool {self.spool.root}{left_out}'
 
     def close(self) -> None:
-        """Close the open batches, make all durable, deliver for at most ``shutdown.drain_s``, leave the rest in the spool."""
+        """Close the open batches, make all durable, upload for at most ``shutdown.drain_s``, leave the rest in the spool."""
         self._opened.close()
 
     def _finish(self) -> None:
-        """Everything that is in memory to the spool, and from there what can be delivered in time."""
+        """Move everything in memory to the spool, and upload what is possible before the deadline."""
         close_s = DAMAGED_S if self.writer.damaged else CLOSE_S
         end_s = time.monotonic() + close_s
         finished = {
@@ -227,7 +227,7 @@ class Pipeline:
         if not all(finished.values()):
             return
         self._ship_ledger()
-        self._look_at_link(is_last=True)
+        self._sample_link(is_last=True)
         self.writer.prompt = True
         self.writer.flush(1.0)
         end_s = time.monotonic() + self._settings.shutdown.drain_s
@@ -241,15 +241,16 @@ class Pipeline:
             )
 
     def tick(self) -> None:
-        """Called several times a second: starts threads again that died, and once a second tells what goes on.
+        """Called several times per second: restarts threads that ended, and reports the status once per second.
 
-        A failure of a thread is reported at once. At the turn of each UTC day the ledger is shipped. Raises SpoolError when the
-        spool cannot be repaired while it is in use.
+        A failure of a thread is reported immediately. At the start of each UTC day the ledger is uploaded. Raises SpoolError if
+        the
+        spool cannot be repaired while in use.
         """
         if self.writer.damaged:
             text = f'the index of the spool {self.spool.root} is damaged'
-            raise SpoolError(text, remedy='start the node again: it is rebuilt then')
-        # rmw_fastrtps may clear the condition unseen if it is triggered just as the executor goes to sleep.
+            raise SpoolError(text, remedy='restart the node: it is rebuilt at startup')
+        # rmw_fastrtps may clear the condition unseen if it is triggered just as the executor goes to sleep
         self._handle_requests()
         now_s = time.monotonic()
         if not self._supervise() and now_s < self._due_s:
@@ -259,26 +260,26 @@ class Pipeline:
         self.uploader.wait_for(self._rules.poll())
         self.recorder.check_clock()
         self._spool_parts(self._catalog.due)
-        self._look_at_link()
-        self._tell()
+        self._sample_link()
+        self._publish_status()
         day = self._today()
         if day != self._day:
             self._day = day
             self._ship_ledger()
 
     def _handle_requests(self) -> None:
-        """Called by the executor when somebody asks for something at the control socket."""
+        """Called by the executor when a request waits at the control socket."""
         self._control.handle_requests(self._commands.answer)
 
     def _supervise(self) -> bool:
-        """Start threads again that died; whether any thread failed since the last time."""
+        """Restart threads that ended; return whether any thread failed since the last call."""
         for worker in self._stages.workers:
             worker.poll()
         before, self._failures = self._failures, sum(worker.failures for worker in self._stages.workers)
         return self._failures != before
 
     def apply(self, settings: Settings) -> None:
-        """Go on by other settings, as far as they are live."""
+        """Apply the live part of other settings."""
         before, self._settings = live(self._settings), settings
         for name, value in live(settings).items():
             if value != before[name]:
@@ -291,7 +292,7 @@ class Pipeline:
         return self.mission.status()
 
     def _make_request_server(self, track: RobotTrack) -> None:
-        """Only where something is kept until somebody asks for it."""
+        """Created only if data is kept until requested."""
         self._requests: RequestServer | None = None
         self._link: LinkTrack | None = None
         settings = self._settings
@@ -300,8 +301,8 @@ class Pipeline:
             return
         sweep(settings.home, settings.robot)
         self._link = link = LinkTrack(self.uploader.status, track.marks, settings.robot, self._clock)
-        least_hz = settings.keep.thin_to_hz
-        thinner = Thinner(self.spool, least_hz, Halving(settings.home, settings.robot, least_hz))
+        min_hz = settings.keep.thin_to_hz
+        thinner = Thinner(self.spool, min_hz, Halver(settings.home, settings.robot, min_hz))
         self._requests = RequestServer(self.spool, self._store, settings.keep, settings.robot, self._clock,
                                        put=partial(self.writer.put, wait=False), released=self.uploader.wake,
                                        cutter=partial(KeptCut, settings.home), mbps=lambda: link.mbps,
@@ -309,7 +310,7 @@ class Pipeline:
                                        thin=thinner.step)  # fmt: skip
 
     def _expedite(self) -> None:
-        """Somebody waits for what was asked for."""
+        """Requested objects wait: upload them without delay."""
         self._catalog.expedite()
 
     def _settled(self, ids: Collection[int]) -> None:
@@ -318,24 +319,24 @@ class Pipeline:
             self._requests.wake()
 
     def _make_unheard(self) -> Unheard | None:
-        """None where nobody listens through another RMW beside the node."""
+        """None if the node uses the robot's RMW."""
         middleware, node = self._ros.middleware, self._node
         if self._ros.front is None:
             return None
         return Unheard(middleware.rmw, middleware.robot, lambda: self.intake.wanted,
                        lambda topic: {publisher.gid for publisher in endpoints(node, topic)})  # fmt: skip
 
-    def _tell_mission(self, mission: MissionStatus) -> None:
+    def _on_mission(self, mission: MissionStatus) -> None:
         self.spool.accounts.set_mission(mission.mission_id)
         if self._interface is not None:
-            self._interface.tell_mission(fields_of(mission))
+            self._interface.publish_mission(fields_of(mission))
         of = MissionOf(mission.type, mission.mission_id, mission.run_id) if mission else None
         self.recorder.on_mission(of)
         self.event_buffer.on_mission(of)
         if not mission:
             self._catalog.expedite()
 
-    def _tell(self, *, ended: bool = False) -> None:
+    def _publish_status(self, *, ended: bool = False) -> None:
         status = self._status.poll(ended=ended)
         if status is not None:
             self._status.write(status)
@@ -346,28 +347,28 @@ class Pipeline:
         return f'{utc(self._clock.wall_ns()):%Y%m%d}'
 
     def _ship_ledger(self) -> None:
-        """A ledger that cannot be read now is not worth the node: the next one holds all that this one would."""
+        """A ledger that cannot be read now must not stop the node: the next one includes all its content."""
         try:
             self.writer.put(self._redating.mark(self._ledger()), wait=False)
         except DataLoggerError as error:
             log.warning('the ledger was not shipped: %s', error)
 
     def _spool_parts(self, made: Callable[[], list[DataObject]]) -> None:
-        """The catalog's next parts; what keeps them back now keeps them until the next time."""
+        """Spool the catalog's next parts; on failure they are kept until the next call."""
         try:
             for part in made():
                 self.writer.put(part, wait=False)
         except (DataLoggerError, sqlite3.Error) as error:
             log.warning('the catalog is not written yet: %s', error)
 
-    def _look_at_link(self, *, is_last: bool = False) -> None:
-        """How fast uploads go where the robot is, where somebody may ask for more of them."""
+    def _sample_link(self, *, is_last: bool = False) -> None:
+        """Record upload throughput and position, if data can be requested."""
         found = self._link.poll(is_last=is_last) if self._link is not None else None
         if found is not None:
             self.writer.put(found, wait=False)
 
     def _name_held(self) -> None:
-        """What waited for the clock to be set may go now, or as soon as the disk lets it."""
+        """Name the objects that waited for the clock, or as soon as the disk allows it."""
         try:
             if named := self._redating.step():
                 self.uploader.wake(named)
@@ -375,7 +376,7 @@ class Pipeline:
             log.warning('objects that wait for the clock have no names yet: %s', error)
 
     def _ledger(self) -> DataObject:
-        """The ledger as an object of its own, for the store."""
+        """The ledger as an object for the store."""
         now_ns = self._clock.wall_ns() if self._clock.is_set else self._clock.boot_ns()
         content = ledger.read(self.spool.root, self._settings.robot)
         robot = self._settings.robot

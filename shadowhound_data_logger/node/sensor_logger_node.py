@@ -1,8 +1,8 @@
 """``sensor_logger_node``: stores what the robot publishes, and accounts for every message in the ledger.
 
-    ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
+   ros2 run shadowhound_data_logger sensor_logger_node --ros-args --params-file go2.yaml -r __ns:=/tachi
 
-Exit codes: 0 asked to stop, 1 a failure, 2 settings refused.
+Exit codes: 0 stopped on request, 1 a failure, 2 invalid settings.
 """
 
 from __future__ import annotations

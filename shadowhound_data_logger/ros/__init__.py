@@ -1,1 +1,1 @@
-"""Reads topics raw and polled, through what rclpy of each distribution and each middleware offer."""
+"""Polled raw subscriptions, for the rclpy of each distribution and each middleware."""

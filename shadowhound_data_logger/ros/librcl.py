@@ -1,8 +1,8 @@
-"""Asks librcl, by ctypes on rclpy's handle of a subscription, for what this distribution's rclpy does not tell.
+"""Calls librcl through ctypes on rclpy's subscription handle, for information that this distribution's rclpy lacks.
 
-Whoever calls holds the handle (``with handle``) and hands in its address (``handle.pointer``). Sources: rcl/subscription.h,
-rmw/types.h (``rmw_message_info_t``), rcutils/types/uint8_array.h and rcutils/allocator.h, the same from Humble to Kilted in all
-that is read here; what differs, the length of a gid, comes after it.
+The caller holds the handle (``with handle``) and passes its address (``handle.pointer``). Sources: rcl/subscription.h,
+rmw/types.h (``rmw_message_info_t``), rcutils/types/uint8_array.h and rcutils/allocator.h. The parts read here are the same from
+Humble to Kilted; the difference, the length of a gid, comes after them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ TAKE_FAILED: Final = 401
 UNSUPPORTED: Final = (1 << 64) - 1
 """RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED."""
 FIRST_BYTES: Final = 4096
-"""Of the buffer of a take; it grows with the messages."""
+"""Initial size of a take's buffer; it grows with the messages."""
 INFO_BYTES: Final = 256
-"""More than ``rmw_message_info_t`` has (64, on Humble 72), should it grow."""
+"""More than the size of ``rmw_message_info_t`` (64, on Humble 72), in case it grows."""
 GID_BYTES: Final = 16
-"""Of a gid, those that are not padding: an RTPS GUID."""
+"""The bytes of a gid that are not padding: an RTPS GUID."""
 _INFO: Final = struct.Struct(f'=qqQQQ{GID_BYTES}s')
-"""source_timestamp, received_timestamp, publication_sequence_number, reception_sequence_number, and of publisher_gid the
-implementation_identifier and the data."""
+"""source_timestamp, received_timestamp, publication_sequence_number, reception_sequence_number, and from publisher_gid the
+implementation_identifier and the data.
+"""
 
 
 class Allocator(ctypes.Structure):
@@ -45,13 +46,13 @@ class Bytes(ctypes.Structure):
 
 
 class RclMessage(NamedTuple):
-    """A serialized message with all that rmw knows of it."""
+    """A serialized message with all information from rmw."""
 
     cdr: bytes
     source_ns: int
     received_ns: int
     number: int | None
-    """None where the middleware numbers none."""
+    """None if the middleware has no sequence numbers."""
     gid: bytes
     implementation: int
     """Address of the name of the RMW that filled this in."""
@@ -59,19 +60,19 @@ class RclMessage(NamedTuple):
 
 @cache
 def library() -> ctypes.PyDLL:
-    """The one that rclpy has loaded, with those that it needs. Its calls keep the interpreter's lock, as those of rclpy do."""
+    """The library that rclpy has loaded, with its dependencies. Calls keep the GIL, as rclpy's do."""
     return ctypes.PyDLL('librcl.so')
 
 
 def publisher_count(pointer: int) -> int:
-    """Number of publishers that the subscription is matched with; rclpy has it since 4.0 (Iron). Raises OSError."""
+    """Number of matched publishers; rclpy has it since 4.0 (Iron). Raises OSError."""
     count = ctypes.c_size_t()
     _check('rcl_subscription_get_publisher_count', ctypes.c_void_p(pointer), ctypes.byref(count))
     return count.value
 
 
 def implementation() -> int:
-    """Address of the name of the RMW in use, as ``RclMessage.implementation`` has it. Raises AttributeError without one."""
+    """Address of the name of the RMW in use, as in ``RclMessage.implementation``. Raises AttributeError if there is none."""
     function = library().rmw_get_implementation_identifier
     function.restype = ctypes.c_void_p
     return int(function() or 0)
@@ -81,7 +82,7 @@ class Taker:
     """Takes messages of one subscription, one thread at a time, into a buffer that grows to the largest; ``close`` once."""
 
     def __init__(self) -> None:
-        """Raises OSError or AttributeError where librcl is not what is expected."""
+        """Raises OSError or AttributeError if librcl is not as expected."""
         rcl = library()
         self._take = rcl.rcl_take_serialized_message
         default = rcl.rcutils_get_default_allocator
@@ -92,7 +93,7 @@ class Taker:
         self._places = ctypes.c_void_p(ctypes.addressof(self._message)), ctypes.c_void_p(ctypes.addressof(self._info))
 
     def take(self, pointer: ctypes.c_void_p) -> tuple[bytes, int, int, int | None, bytes, int] | None:
-        """The oldest message that waits, as the fields of an ``RclMessage``; None where there is none. Raises OSError."""
+        """The oldest waiting message, as the fields of an ``RclMessage``; None if there is none. Raises OSError."""
         message, info = self._places
         code = self._take(pointer, message, info, None)
         if code == TAKE_FAILED:
@@ -116,6 +117,6 @@ def _check(name: str, *arguments: object) -> None:
 
 
 def _failure(name: str, code: int) -> OSError:
-    """What librcl said of it is reset, so that the next error is not told as one on top of another."""
+    """Resets librcl's error state, so that it is not reported with the next error."""
     library().rcutils_reset_error()
     return OSError(f'{name} returned {code}')

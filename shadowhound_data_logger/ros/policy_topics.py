@@ -1,9 +1,9 @@
-"""Which policy is active, for the robot's nodes; and their word that it misbehaves.
+"""Publishes the active policy to the robot's nodes, and receives reports that it misbehaves.
 
 The node ``shadowhound_policy`` publishes ``~/policy`` (std_msgs/msg/String, latched): the id of the active version, such as
-``go2_patrol@7#0123456789abcdef``, empty while none is. It listens to ``~/health`` (std_msgs/msg/String): JSON such as
-``{"policy": "go2_patrol@7#0123456789abcdef", "failures": 4, "p99_ms": 180.0}``. A version that breaks the limits of its
-manifest is rolled back. So whoever is on the robot's ROS network can send a policy out, and nobody can bring one in.
+``go2_patrol@7#0123456789abcdef``, empty if there is none. It subscribes to ``~/health`` (std_msgs/msg/String): JSON such as
+``{"policy": "go2_patrol@7#0123456789abcdef", "failures": 4, "p99_ms": 180.0}``. A version that violates the limits in its
+manifest is rolled back. So a client in the robot's ROS network can remove a policy, but not activate one.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ log = logging.getLogger(__name__)
 
 NODE: Final = 'shadowhound_policy'
 LOOK_S: Final = 0.1
-"""How late a change of the active version is published."""
+"""Interval of checking the active version."""
 MAX_HEALTH_BYTES: Final = 4096
 MAX_VALUE: Final = 1e9
-"""Failures, and ms."""
+"""Maximum of failures, and of ms."""
 END_S: Final = 5.0
 
 
 class PolicyTopics:
-    """The two topics, of a node. New; all of it on the thread of the node's executor."""
+    """The two topics of a node. New; used on the thread of the node's executor."""
 
     def __init__(self, node: Node, folder: PolicyFolder) -> None:
         self._folder = folder
-        self._told: str | None = None
+        self._active: str | None = None
         self.ignored = Counter[str]()
-        """Messages about health that count for nothing, by reason: ``size`` ``json`` ``values`` ``other`` (another version)."""
+        """Ignored health messages by reason: ``size`` ``json`` ``values`` ``other`` (another version)."""
         latched = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(String, '~/policy', latched)
         self._subscription = node.create_subscription(String, '~/health', self._on_health, 10)
@@ -54,26 +54,26 @@ class PolicyTopics:
         self.poll()
 
     def poll(self) -> None:
-        """Publish the active version if it is another one."""
+        """Publish the active version if it changed."""
         now = self._folder.current() or ''
-        if now != self._told:
-            self._told = now
+        if now != self._active:
+            self._active = now
             self._publisher.publish(String(data=now))
 
     def _on_health(self, message: String) -> None:
-        reason = self._judged(message.data)
+        reason = self._ignored_reason(message.data)
         if reason:
             self.ignored[reason] += 1
             if str(self.ignored[reason]).strip('0') == '1':
                 log.warning('%d messages about the health of a policy are ignored so far (%s)', self.ignored[reason], reason)
 
-    def _judged(self, text: str) -> str:
-        """Why it counts for nothing; empty where it was judged."""
+    def _ignored_reason(self, text: str) -> str:
+        """Why a health message is ignored; empty if it was evaluated."""
         if len(text) > MAX_HEALTH_BYTES:
             return 'size'
         try:
-            told = from_json(text.encode(), MAX_HEALTH_BYTES)
-            name, failures, p99_ms = told['policy'], told.get('failures', 0), told.get('p99_ms', 0.0)
+            report = from_json(text.encode(), MAX_HEALTH_BYTES)
+            name, failures, p99_ms = report['policy'], report.get('failures', 0), report.get('p99_ms', 0.0)
         except (ValueError, KeyError, TypeError, AttributeError):
             return 'json'
         if type(failures) is not int or type(p99_ms) not in {int, float}:
@@ -88,14 +88,14 @@ class PolicyTopics:
                 log.warning('%s is rolled back: %d failures, p99 %g ms; active: %s', name, failures, p99_ms,
                             self._folder.current() or 'none')  # fmt: skip
         except (DataLoggerError, OSError) as error:
-            log.warning('%s cannot be judged: %s', name, error)
+            log.warning('the health of %s cannot be evaluated: %s', name, error)
         self.poll()
         return ''
 
 
 @contextmanager
-def telling(folder: PolicyFolder) -> Iterator[PolicyTopics]:
-    """Serve the topics meanwhile, on a thread of their own."""
+def serve_policy_topics(folder: PolicyFolder) -> Iterator[PolicyTopics]:
+    """Serve the topics on a separate thread."""
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:

@@ -1,24 +1,24 @@
-"""Keeps a listener that is killed from stopping the publishers that wrote to it, where Fast DDS uses shared memory.
+"""Prevents a killed listener from blocking its publishers, if Fast DDS uses shared memory.
 
-A listener says in its port that it processes a message. Killed at that moment, it says so forever. Fast DDS notices this within
-seconds and marks the port. A publisher that meets the mark in the middle of a message tries to take that word back, waits for a
-mutex that it holds itself, gives up after a second and tries again, without end: its ``publish`` never returns (Fast DDS 2.6 to
-3.6: SharedMemManager.hpp, ``recover_blocked_processing``; SharedMemGlobal.hpp, ``get_and_remove_blocked_processing``; Fast-DDS
+A listener marks in its port that it processes a message. If it is killed at that moment, the mark stays. Fast DDS notices this
+within seconds and flags the port. A publisher that meets the flag during a message tries to clear the mark, waits for a mutex
+that it holds itself, times out after a second and tries again, endlessly: its ``publish`` never returns (Fast DDS 2.6 to 3.6:
+SharedMemManager.hpp, ``recover_blocked_processing``; SharedMemGlobal.hpp, ``get_and_remove_blocked_processing``; Fast-DDS
 issue 6484, pull request 6497).
 
-``settle`` takes the word back for it: one byte then says that the listener waits, and since it never wakes up again, Fast DDS
-leaves the port within seconds. That ends such a loop as well, as long as nobody has replaced the port, and it does the same for a
-listener that died between waiting and processing (pull request 4737).
+``settle`` clears the mark: one byte then states that the listener waits, and because it never wakes up, Fast DDS abandons the
+port within seconds. That also ends such a loop, as long as the port has not been replaced, and also works for a listener that was
+killed between waiting and processing (pull request 4737).
 
-A process that is killed while it makes a port leaves one that is never finished, and whoever opens that waits forever as well
-(managed_open_or_create_impl.hpp of boost interprocess). ``settle`` marks it as damaged, and the next process makes it anew.
+A process that is killed while it creates a port leaves an unfinished one, and every process that opens it waits forever
+(managed_open_or_create_impl.hpp of boost interprocess). ``settle`` marks it as damaged, and the next process creates it again.
 
-    flock --no-fork FILE python -I -S port_guard.py PID
+   flock --no-fork FILE python -I -S port_guard.py PID
 
-As a program, which ``flock`` becomes when the lock of its parent is free, it settles what that one left. It imports nothing of
-the package.
+As a program, which ``flock`` executes once its parent has released the lock, it settles what the parent left. It imports nothing
+from the package.
 
-This is the only place that writes into files of another library. ``SHADOWHOUND_PORT_GUARD=off`` turns it off
+This is the only module that writes into files of another library. ``SHADOWHOUND_PORT_GUARD=off`` turns it off
 (docs/decisions/0026).
 """
 
@@ -40,43 +40,43 @@ from typing import Final
 FOLDER: Final = Path('/dev/shm')  # noqa: S108 - where Fast DDS has its segments
 _PORT: Final = re.compile(r'(fastdds|fastrtps)_port(\d{4,5})')
 MAKING_S: Final = 5.0
-"""A port is made within a millisecond."""
+"""Creating a port takes less than a millisecond."""
 _MOST_BYTES: Final = 4 << 20
-"""A port of 512 messages, as by default, has 52 KB."""
+"""A port of 512 messages, the default, has 52 KB."""
 _ENDING_S: Final = 5.0
-"""For a parent whose lock is free and that is not gone yet: its other locks go with it."""
+"""Wait for a parent that has released the lock but not exited: it releases its other locks at exit."""
 
 # The first word of a segment of boost interprocess, as managed_open_or_create_impl.hpp numbers them.
 _WORD: Final = struct.Struct('=I')
 _UNINITIALIZED, _INITIALIZING, _CORRUPTED = 0, 1, 3
 
-# struct PortNode of SharedMemGlobal.hpp, ABI 5: the same in 2.6.10, 2.14.5, 3.2.3, 3.6.1 and what followed until August 2026.
-# Its name lies right behind it; between its head and the listeners are 512 semaphores and two mutexes of the C library.
+# struct PortNode of SharedMemGlobal.hpp, ABI 5: the same in 2.6.10, 2.14.5, 3.2.3, 3.6.1 and later until August 2026.
+# Its name follows it; between its head and the listeners are 512 semaphores and two mutexes of the C library.
 _NAME: Final = b'port_node_abi5\0'
 _HEAD: Final = struct.Struct('=8xI8xIIIIIII')
-"""References, number of the port, listeners, two periods in ms, capacity, how many wait, flags."""
+"""References, number of the port, listeners, two periods in ms, capacity, number of waiting listeners, flags."""
 _IS_OK, _IS_EXCLUSIVE = 1, 2
 _MUTEXES: Final = (40, 48)
-"""Bytes of a pthread_mutex_t on x86-64 and on aarch64."""
+"""sizeof(pthread_mutex_t) on x86-64 and on aarch64."""
 _FIRST: Final = 56 + 512 * 40 + 2 * 8
-"""Where the listeners would begin without the two mutexes."""
+"""Offset of the listeners without the two mutexes."""
 _LISTENERS, _LISTENER = 1024, 20
 _DOMAIN: Final = 17
 IN_USE, WAITING, PROCESSING = 1, 2, 4
-"""Flags in the first byte of a listener, which it alone writes."""
+"""Flags in the first byte of a listener, which only it writes."""
 
 
 def is_enabled() -> bool:
-    """Whether the operator has not turned the guard off."""
+    """Whether the guard is enabled."""
     return os.environ.get('SHADOWHOUND_PORT_GUARD', 'on').lower() not in {'off', '0', 'false', 'no'}
 
 
 def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
-    """Ports of this user in which a dead listener is still said to be at work, or that nobody finishes.
+    """Ports of this user that are marked as in use by a dead listener, or that were never finished.
 
-    Without ``is_done`` they are only looked for. A listener is dead where the lock of its port can be had. Where a publisher has
-    removed the lock's file, only a port that Fast DDS has marked is settled: a listener that lives leaves such a port by itself,
-    and takes that word back, too.
+    Without ``is_done`` they are only listed. A listener is dead if the lock of its port can be acquired. If a publisher has
+    removed the lock's file, only a port that Fast DDS has flagged is settled: a live listener leaves such a port on its own and
+    clears its mark, too.
     """
     if not is_enabled():
         return []
@@ -90,7 +90,7 @@ def settle(folder: Path = FOLDER, *, is_done: bool = True) -> list[str]:
 def _settle(path: Path, *, is_done: bool) -> bool:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:  # gone meanwhile, or not for us
+    except OSError:  # removed since, or no permission
         return False
     try:
         file = os.fstat(descriptor)
@@ -102,12 +102,12 @@ def _settle(path: Path, *, is_done: bool) -> bool:
             if is_left and is_done:
                 _give_up(descriptor, path, file.st_size)
             return is_left
-        if not _at_work(path.name, data, has_lock=True):
+        if not _busy_listeners(path.name, data, has_lock=True):
             return False
         with _abandoned(path.with_name(f'{path.name}_el')) as has_lock:
             if has_lock is None:
                 return False
-            found = _at_work(path.name, os.pread(descriptor, file.st_size, 0), has_lock=has_lock)
+            found = _busy_listeners(path.name, os.pread(descriptor, file.st_size, 0), has_lock=has_lock)
             for offset, flags in found if is_done else ():
                 os.pwrite(descriptor, bytes((flags & ~PROCESSING | WAITING,)), offset)
             return bool(found)
@@ -122,7 +122,7 @@ def _is_unfinished(data: bytes) -> bool:
 
 
 def _give_up(descriptor: int, path: Path, size: int) -> None:
-    """Tell those who wait for it, as boost does where making it fails."""
+    """Mark it as failed for waiting processes, as boost does."""
     path.unlink()
     if size:
         os.pwrite(descriptor, _WORD.pack(_CORRUPTED), 0)
@@ -130,8 +130,8 @@ def _give_up(descriptor: int, path: Path, size: int) -> None:
         os.ftruncate(descriptor, 1)
 
 
-def _at_work(name: str, data: bytes, *, has_lock: bool) -> list[tuple[int, int]]:
-    """(offset, flags) of the listeners that are to be settled; none where anything is not as expected."""
+def _busy_listeners(name: str, data: bytes, *, has_lock: bool) -> list[tuple[int, int]]:
+    """(offset, flags) of the listeners to be settled; empty if anything is not as expected."""
     match = _PORT.fullmatch(name)
     end = data.find(_NAME)
     if match is None or data.find(_NAME, end + 1) >= 0:
@@ -155,7 +155,7 @@ def _at_work(name: str, data: bytes, *, has_lock: bool) -> list[tuple[int, int]]
 
 @contextmanager
 def _abandoned(path: Path) -> Iterator[bool | None]:
-    """Hold the lock of a port whose listener is dead: True. False where it has no lock; None where its listener lives."""
+    """Hold the lock of a port whose listener is dead: True. False if it has no lock; None if its listener is alive."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -171,7 +171,7 @@ def _abandoned(path: Path) -> Iterator[bool | None]:
 
 
 def _lock(descriptor: int, path: Path) -> bool | None:
-    """True where it was had, and is that of the path still."""
+    """True if it was acquired and still belongs to the path."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return True if path.stat().st_ino == os.fstat(descriptor).st_ino else None
@@ -180,8 +180,8 @@ def _lock(descriptor: int, path: Path) -> bool | None:
 
 
 def main(parent: int) -> None:
-    """Wait until the parent is gone; then settle."""
-    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):  # who ends all that a service has left comes too early
+    """Wait until the parent has exited; then settle."""
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):  # SIGTERM to the complete service arrives too early
         signal.signal(number, signal.SIG_IGN)
     end_s = time.monotonic() + _ENDING_S
     while os.getppid() == parent and time.monotonic() < end_s:

@@ -1,7 +1,7 @@
-"""One subscription, drained instead of called back. The seam to what rclpy of each distribution offers.
+"""A subscription that is polled instead of called back; the only interface to each distribution's rclpy.
 
-Where rclpy tells less of a message than its RMW knows (Humble: neither number nor publisher; Jazzy and the first Kilted: not the
-publisher), messages are taken through librcl, if that proves right for messages of the node's own.
+If rclpy reports less about a message than its RMW knows (Humble: neither number nor publisher; Jazzy and the first Kilted: no
+publisher), messages are taken through librcl, after that was verified with messages of the node to itself.
 """
 
 from __future__ import annotations
@@ -47,27 +47,29 @@ log = logging.getLogger(__name__)
 T = TypeVar('T')
 
 MAX_TAKES: Final = 20_000
-"""Takes of one drain: beyond it the other topics have their turn first."""
+"""Maximum takes per drain: then the other topics have their turn."""
 FAST_DDS: Final = ('rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
-"""The RMWs that know the number and the publisher of each message (the number since rmw_fastrtps 6.2.1)."""
-TELLS_PUBLISHERS: Final = (9, 1, 1)
-"""The first rclpy that tells all that is wanted of a message, weeks after Kilted's 9.1.0; numbers came with 4.0. Source: rclpy,
-pull requests 1466 (10.0.0) and 1468. Rolling's 9.2.0, older than 9.1.1, is the exception."""
-PROOF_S: Final = 3.0
-"""For messages of the node to itself to arrive; it takes milliseconds."""
-_PROVED: Final[dict[str, bool]] = {}
-"""By RMW, whether takes through librcl were right in this process."""
+"""The RMWs that report number and publisher of each message (the number since rmw_fastrtps 6.2.1)."""
+REPORTS_PUBLISHERS: Final = (9, 1, 1)
+"""The first rclpy that reports everything needed, weeks after Kilted's 9.1.0; numbers came with 4.0. Source: rclpy, pull requests
+1466 (10.0.0) and 1468. Rolling's 9.2.0, older than 9.1.1, is the exception.
+"""
+VERIFY_S: Final = 3.0
+"""Timeout for messages of the node to itself; they take milliseconds."""
+_VERIFIED: Final[dict[str, bool]] = {}
+"""By RMW, whether takes through librcl were verified in this process."""
 
 
 class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
-    """Keeps what is in it out of every wait set.
+    """Keeps its entities out of every wait set.
 
-    That holds for event handlers too: in rmw_fastrtps a reader's events and its data share one condition, so a wait set
-    with an event of an undrained subscription returns at once, forever (a whole core, measured on Kilted).
+    That includes event handlers: in rmw_fastrtps a reader's events and its data share one condition, so a wait set with an event
+    of
+    an undrained subscription returns immediately, forever (a full core, measured on Kilted).
     """
 
     def add_entity(self, entity: Any) -> None:
-        """Forget those that are destroyed, which rclpy does not, and know this one."""
+        """Add an entity and remove destroyed ones, which rclpy does not do."""
         self.entities: set[Any] = {known for known in self.entities if known() is not None}
         super().add_entity(entity)
 
@@ -84,14 +86,14 @@ class PolledGroup(CallbackGroup):  # type: ignore[misc]  # rclpy has no types
 _TYPE: Final = re.compile(
     r'([a-z][a-z0-9_]*)/(?:(msg)/([A-Z][A-Za-z0-9]*)|(srv|action)/([A-Z][A-Za-z0-9]*)_([A-Z][A-Za-z_]*))', re.ASCII
 )
-"""https://design.ros2.org/articles/interface_definition.html; of services and actions the parts that are messages."""
+"""https://design.ros2.org/articles/interface_definition.html; for services and actions the parts that are messages."""
 _KINDS: Final = {'msg': 'messages', 'srv': 'services', 'action': 'actions'}
 SHIPPED: Final = frozenset({'go2_interfaces', 'unitree_go', 'unitree_hg'})
 """Message packages in ``interfaces/``."""
 MAX_PUBLISHERS: Final = 1000
-"""Senders that a subscription knows by name at once."""
+"""Maximum publishers that a subscription names at a time."""
 UNKNOWN_NODES: Final = frozenset({'_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_'})
-"""What rmw calls the node of a publisher that is not a ROS node, or of which it does not know yet."""
+"""rmw's names for the node of a publisher without ROS, or of one that it does not know yet."""
 
 
 class TypeUnavailable(LookupError):
@@ -99,14 +101,15 @@ class TypeUnavailable(LookupError):
 
 
 class SubscriptionRefused(RuntimeError):
-    """The middleware makes no such subscription: this node has the topic under another type, or the name is none of ROS."""
+    """The middleware rejects the subscription: this node has the topic with another type, or the name is invalid in ROS."""
 
 
 def message_class(type_name: str) -> type:
     """The rclpy class of ``package/msg/Name``, ``package/srv/Name_Event`` or ``package/action/Name_FeedbackMessage``.
 
     Raises TypeUnavailable. The name may come from any machine in the network: a package is imported only if it has interfaces of
-    this kind, because importing runs what is in it.
+    this
+    kind, because an import executes its code.
     """
     match = _TYPE.fullmatch(type_name)
     if match is None:
@@ -119,7 +122,7 @@ def message_class(type_name: str) -> type:
         module = import_module(f'{package}.{kind}')
         found: type = getattr(module, match[3]) if match[3] else _part(module, match[5], match[6])
         check_for_type_support(found)
-    except UnsupportedTypeSupport as error:  # no ImportError, though it is about one
+    except UnsupportedTypeSupport as error:  # not an ImportError, although an import failed
         text = f'{type_name}: a library of {package} does not load: is its workspace sourced, and built for this Python?'
         raise TypeUnavailable(text) from error
     except AttributeError as error:
@@ -130,7 +133,7 @@ def message_class(type_name: str) -> type:
 
 
 def _part(module: ModuleType, name: str, part: str) -> type:
-    """The class of a message of a service or an action: a name of the module, or inside the class (all of Humble's actions)."""
+    """The message class of a service or an action: an attribute of the module, or of the class (all of Humble's actions)."""
     found: type | None = getattr(module, f'{name}_{part}', None)
     if found is None:
         interface = getattr(module, name)
@@ -139,7 +142,7 @@ def _part(module: ModuleType, name: str, part: str) -> type:
 
 
 def _is_installed(package: str, kind: str) -> bool:
-    """Whether a package has interfaces of this kind; looked up without running anything."""
+    """Whether a package has interfaces of this kind; found without executing anything."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):
@@ -148,7 +151,7 @@ def _is_installed(package: str, kind: str) -> bool:
 
 
 def install_hint(type_name: str) -> str:
-    """How to install the package of a type, after the reason why it is unavailable."""
+    """How to install the package of a type, to follow the reason why it is unavailable."""
     package = type_name.partition('/')[0]
     if package in SHIPPED:
         return f'; build it from interfaces/ of shadowhound_data_logger: colcon build --base-paths interfaces/{package}'
@@ -167,7 +170,7 @@ def unavailable(type_name: str) -> str:
 
 
 def endpoints(node: Node, topic: str) -> list[Endpoint]:
-    """The publishers of a resolved topic as the graph knows them."""
+    """The publishers of a resolved topic in the graph."""
     return [
         Endpoint(
             gid=bytes(info.endpoint_gid[: librcl.GID_BYTES]).hex(),
@@ -181,24 +184,24 @@ def endpoints(node: Node, topic: str) -> list[Endpoint]:
 
 
 def node_of(node: Node, topic: str, publisher: str) -> str:
-    """The full name of the node of a publisher of a resolved topic; '' if it is unknown, as that of a program without ROS is."""
-    gid = publisher.partition('.')[0]  # what follows it counts the successors of a publisher
+    """The full name of the node of a topic's publisher; '' if unknown, as for a program without ROS."""
+    gid = publisher.partition('.')[0]  # a suffix counts the successors of a publisher
     return next((each.node for each in endpoints(node, topic) if each.gid == gid), '')
 
 
 class Reader:
-    """A live subscription. Created, drained and closed by one thread alone: a take after a destroy raises."""
+    """A live subscription. Created, drained and closed by a single thread: a take after a destroy raises."""
 
     def __init__(self, node: Node, plan: Plan, group: PolledGroup) -> None:
-        """Raises TypeUnavailable if the type is not installed, SubscriptionRefused if the middleware does not accept it."""
+        """Raises TypeUnavailable if the type is not installed, SubscriptionRefused if the middleware rejects it."""
         self.plan = plan
         self.drained_s: float | None = None
-        """When its owner drained it last, by the monotonic clock."""
+        """Time of the last drain, by the monotonic clock."""
         self._node = node
         self._group = group
         self._class = message_class(plan.type)
         self._names: dict[bytes, str] = {}
-        self._is_stuck = self._has_told = False
+        self._is_stuck = self._has_warned = False
         self._subscription = self._subscribe()
         self._taker = librcl.Taker() if takes_through_librcl(node) else None
 
@@ -219,40 +222,41 @@ class Reader:
             raise SubscriptionRefused(f'no subscription of type {plan.type} can be made ({error})') from error
 
     def matched(self) -> int:
-        """Number of publishers it is matched with."""
+        """Number of matched publishers."""
         handle = self._subscription.handle
         with handle:
             if hasattr(handle, 'get_publisher_count'):
                 return int(handle.get_publisher_count())
             return librcl.publisher_count(handle.pointer)  # Humble
 
-    def drain(self, most: int = MAX_TAKES) -> list[Taken]:
-        """Everything that waits, oldest first, up to so many."""
+    def drain(self, max_takes: int = MAX_TAKES) -> list[Taken]:
+        """Take everything that waits, oldest first, up to ``max_takes``."""
         handle = self._subscription.handle
         with handle:
             waiting = self._through_rclpy(handle) if self._taker is None else self._through_librcl(handle, self._taker)
-            taken = list(islice(waiting, most))
+            taken = list(islice(waiting, max_takes))
         if self._is_stuck:
             self._renew()
         return taken
 
     def _renew(self) -> None:
-        """Listen by another subscription: this one gives an empty message again and again, and nothing that waits behind it.
+        """Replace the subscription: this one returns an empty message repeatedly, and nothing behind it.
 
-        Fast DDS (2.6 to 3.6) forgets a message that came in parts when its RELIABLE publisher has no more of them to send, and
-        leaves it in the list of those to be taken (ReaderHistory::remove_fragmented_changes_until; Fast-DDS pull request 2239).
+        Fast DDS (2.6 to 3.6) drops a partly received message when its RELIABLE publisher can no longer resend its fragments, and
+        leaves it in the list of messages to be taken (ReaderHistory::remove_fragmented_changes_until; Fast-DDS pull request
+        2239).
         """
         stuck = self._subscription
         try:
             self._subscription = self._subscribe()
-        except SubscriptionRefused as error:  # what was taken before counts; the next drain tries again
+        except SubscriptionRefused as error:  # messages taken so far count; the next drain tries again
             log.warning('%s', error)
             return
         self._node.destroy_subscription(stuck)
         self._is_stuck = False
-        if not self._has_told:
+        if not self._has_warned:
             log.warning('%s: subscribing again: the middleware gave no messages after a part of one was lost', self.plan.topic)
-            self._has_told = True
+            self._has_warned = True
 
     def _through_rclpy(self, handle: Any) -> Iterator[Taken]:
         take, message_type, empty = handle.take_message, self._class, 0
@@ -263,10 +267,10 @@ class Reader:
                 if self._is_endless(empty):
                     return
                 continue
-            gid = info.get('publisher_gid')  # Jazzy and older do not tell it
+            gid = info.get('publisher_gid')  # Jazzy and older do not report it
             yield Taken(
                 cdr, info['source_timestamp'], None if gid is None else self._name(gid['data']),
-                info.get('publication_sequence_number'), info['received_timestamp'] or _came_ns(info['source_timestamp']),
+                info.get('publication_sequence_number'), info['received_timestamp'] or _received_ns(info['source_timestamp']),
             )  # fmt: skip
 
     def _through_librcl(self, handle: Any, taker: librcl.Taker) -> Iterator[Taken]:
@@ -278,10 +282,10 @@ class Reader:
                 if self._is_endless(empty):
                     return
                 continue
-            yield Taken(cdr, source_ns, self._name(gid), number, received_ns or _came_ns(source_ns))
+            yield Taken(cdr, source_ns, self._name(gid), number, received_ns or _received_ns(source_ns))
 
     def _is_endless(self, empty: int) -> bool:
-        """Whether a drain gave more empty messages than can wait: a few may have been sent so, and are left out."""
+        """Whether a drain returned more empty messages than can wait: a few may be real, and are skipped."""
         self._is_stuck = empty > self.plan.depth
         return self._is_stuck
 
@@ -292,7 +296,7 @@ class Reader:
             self._taker = None
 
     def _name(self, gid: bytes) -> str:
-        """The sender's gid in hex, as the graph has it."""
+        """The publisher's gid in hex, as in the graph."""
         name = self._names.get(gid)
         if name is None:
             if len(self._names) >= MAX_PUBLISHERS:
@@ -302,22 +306,24 @@ class Reader:
 
 
 def takes_through_librcl(node: Node) -> bool:
-    """Whether readers take so: where the RMW knows more of a message than rclpy tells, and that proved right; tried once."""
+    """Whether readers take through librcl: if the RMW knows more about a message than rclpy reports, and it was verified; tried
+    once.
+    """
     rmw = get_rmw_implementation_identifier()
-    if rmw not in FAST_DDS or rclpy_version() >= TELLS_PUBLISHERS:
+    if rmw not in FAST_DDS or rclpy_version() >= REPORTS_PUBLISHERS:
         return False
-    if rmw not in _PROVED:
-        problem = disproof(node)
-        _PROVED[rmw] = not problem
+    if rmw not in _VERIFIED:
+        problem = verify_librcl(node)
+        _VERIFIED[rmw] = not problem
         if problem:
-            log.warning('taking messages through rclpy, which does not give their publishers: through librcl %s', problem)
+            log.warning('taking messages through rclpy, which does not report their publishers: through librcl %s', problem)
         else:
-            log.info('taking messages through librcl, which gives their numbers and publishers; rclpy does not')
-    return _PROVED[rmw]
+            log.info('taking messages through librcl, which reports their numbers and publishers; rclpy does not')
+    return _VERIFIED[rmw]
 
 
 def rclpy_version() -> tuple[int, ...]:
-    """Of the installed rclpy; () where its metadata are missing."""
+    """The version of the installed rclpy; () if its metadata is missing."""
     for name in ('rclpy', 'ros-rclpy'):  # as part of a distribution, and as a wheel
         try:
             return tuple(int(part) for part in metadata.version(name).split('.') if part.isdecimal())
@@ -326,10 +332,10 @@ def rclpy_version() -> tuple[int, ...]:
     return ()
 
 
-def disproof(node: Node) -> str:
-    """What is wrong of messages that the node sends itself on a topic of its own, as librcl tells them; empty if nothing is.
+def verify_librcl(node: Node) -> str:
+    """Verify librcl with messages that the node sends itself on a private topic; the error, or empty if all is correct.
 
-    Bytes, number, time of sending and publisher of each are known here otherwise.
+    Content, number, time of sending and publisher of each are known independently.
     """
     topic = f'{node.get_fully_qualified_name()}/_take_{uuid4().hex}'
     publisher = node.create_publisher(String, topic, 10, event_callbacks=PublisherEventCallbacks(use_default_callbacks=False))
@@ -339,7 +345,7 @@ def disproof(node: Node) -> str:
     )  # fmt: skip
     try:
         with subscription.handle:
-            return _disproof(node, topic, publisher, ctypes.c_void_p(subscription.handle.pointer))
+            return _verify_message(node, topic, publisher, ctypes.c_void_p(subscription.handle.pointer))
     except (OSError, AttributeError) as error:
         return f'they cannot be taken: {error}'
     finally:
@@ -347,25 +353,26 @@ def disproof(node: Node) -> str:
         node.destroy_publisher(publisher)
 
 
-def _disproof(node: Node, topic: str, publisher: Any, pointer: ctypes.c_void_p) -> str:
+def _verify_message(node: Node, topic: str, publisher: Any, pointer: ctypes.c_void_p) -> str:
     rmw, taker = librcl.implementation(), librcl.Taker()
     try:
-        if not _within(PROOF_S, lambda: librcl.publisher_count(pointer.value or 0) and endpoints(node, topic)):
-            return 'nothing is heard of what this node sends to itself'
+        if not _within(VERIFY_S, lambda: librcl.publisher_count(pointer.value or 0) and endpoints(node, topic)):
+            return 'messages of this node to itself do not arrive'
         gid = bytes.fromhex(endpoints(node, topic)[0].gid)
         for number, size in enumerate((1, librcl.FIRST_BYTES, 2), start=1):
             cdr = serialize_message(String(data='x' * size))
             before_ns = time.time_ns()
             publisher.publish(cdr)
             first_ns, last_ns = sorted((before_ns, time.time_ns()))  # the clock may have stepped
-            taken = _within(PROOF_S, lambda: taker.take(pointer))
+            taken = _within(VERIFY_S, lambda: taker.take(pointer))
             if taken is None:
-                return 'a message of this node to itself does not come'
+                return 'a message of this node to itself does not arrive'
             found = librcl.RclMessage(*taken)
             known = librcl.RclMessage(cdr, found.source_ns, found.received_ns, number, gid, rmw)
             if found != known or not first_ns <= found.source_ns <= last_ns:
-                said = found._replace(cdr=found.cdr[:16])
-                return f'message {number} of {gid.hex()}, {len(cdr)} bytes, sent from {first_ns} to {last_ns}, is told as {said}'
+                reported = found._replace(cdr=found.cdr[:16])
+                sent = f'message {number} of {gid.hex()}, {len(cdr)} bytes, sent from {first_ns} to {last_ns}'
+                return f'{sent}, is reported as {reported}'
         return ''
     finally:
         taker.close()
@@ -379,8 +386,8 @@ def _within(seconds: float, ask: Callable[[], T]) -> T:
     return answer
 
 
-def _came_ns(sent_ns: int) -> int:
-    """When a message came whose middleware does not say (Humble's Cyclone DDS): when it was sent, if that was just now.
+def _received_ns(sent_ns: int) -> int:
+    """Arrival time if the middleware does not report it (Humble's Cyclone DDS): the time of sending, if that is recent.
 
     Source: rmw_cyclonedds_cpp, rmw_node.cpp; received_timestamp is 0 before its version 2.2.1 (Jazzy).
     """

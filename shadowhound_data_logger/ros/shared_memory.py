@@ -1,13 +1,14 @@
-"""Shared memory that killed processes leave in /dev/shm: Fast DDS keeps there 35 MB (with our profile) for each of them.
+"""Shared memory that killed processes leave in /dev/shm: Fast DDS keeps 35 MB (with our profile) for each of them.
 
 The owner of a segment ``fastdds_X`` (Fast DDS 3) or ``fastrtps_X`` (Fast DDS 2), where X is 16 random hex digits, holds a flock
-on the file ``..._X_el`` beside it for as long as it lives, in whatever container; a segment whose lock can be had has no owner.
-Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Not freed are ``fast_datasharing_...``,
-of which nothing tells whether somebody lives, and ``..._portN``, which are small and taken over by the next process of the same
-domain. That one may hear nothing of processes that wrote to the dead one: they go on with the segment that it replaced. Fast DDS
-mends that within a second, but not where the listener died between waiting for a message and processing it (SharedMemGlobal.hpp,
-``update_status_all_listeners``; Fast-DDS pull request 4737). ``dead_ports_avoided`` is for that. What is worse, a listener that
-died while it processed a message can stop who writes to it: ``port_guard`` and ``PortGuard`` are for that.
+on the file ``..._X_el`` in the same folder for as long as it runs, in any container; a segment whose lock can be acquired has no
+owner. Source: RobustExclusiveLock.hpp and SharedMemManager.hpp of Fast DDS 2.6, 2.14 and 3.6. Two kinds are not freed:
+``fast_datasharing_...``, whose owner cannot be determined, and ``..._portN``, which are small and reused by the next process of
+the same domain. That process may miss messages of publishers that wrote to the dead one: they keep using the segment that it
+replaced. Fast DDS repairs that within a second, unless the listener was killed between waiting for a message and processing it
+(SharedMemGlobal.hpp, ``update_status_all_listeners``; Fast-DDS pull request 4737); ``dead_ports_avoided`` handles that case.
+Worse,
+a listener killed while it processed a message can block its publishers: ``port_guard`` and ``PortGuard`` handle that.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from shadowhound_data_logger.ros.port_guard import FOLDER, settle
 
 log = logging.getLogger(__name__)
 STARTING_S: Final = 5.0
-"""A process that starts has its file before it has its lock."""
+"""A starting process has its file before it has its lock."""
 MAX_DEAD_PORTS: Final = 50
 """Fast DDS tries a hundred."""
 _PORT: Final = re.compile(r'((?:fastdds|fastrtps)_port(\d{4,5}))_el')
@@ -46,15 +47,15 @@ class Orphan:
     bytes: int
 
 
-def orphans(folder: Path = FOLDER, *, is_freed: bool = False) -> list[Orphan]:
-    """Those that there are; with ``is_freed`` they are removed. Segments of other users are never touched."""
+def orphans(folder: Path = FOLDER, *, free: bool = False) -> list[Orphan]:
+    """List them; with ``free`` they are removed. Segments of other users are never touched."""
     found = []
     for path in _locks(folder):
         with _owned(path) as has_no_owner:
             if has_no_owner:
                 segment = path.with_name(path.name.removesuffix('_el'))
                 size = _size(segment)
-                if is_freed:
+                if free:
                     for each in (segment, path):
                         with suppress(OSError):
                             each.unlink()
@@ -65,31 +66,32 @@ def orphans(folder: Path = FOLDER, *, is_freed: bool = False) -> list[Orphan]:
 
 @contextmanager
 def dead_ports_avoided(domain: int, folder: Path = FOLDER, processes: Path = Path('/proc')) -> Iterator[list[str]]:
-    """Participants that are made meanwhile take other ports than those of killed ones; yields the names of these.
+    """Makes participants created within it avoid the ports of killed ones; yields the names of these ports.
 
-    Only where a living process may still write to their segment; the others can be taken over. Fast DDS passes over a port whose
-    lock somebody has. What may stop those who write to dead ports is settled first: it cannot be once a port is taken over.
+    Only if a running process may still write to their segments; the others can be reused. Fast DDS skips a port whose lock is
+    held.
+    Ports that could block other processes are settled first: that is impossible once a port is reused.
     """
     if settled := settle(folder):
-        log.warning('what killed processes left in shared memory could have stopped others: settled %s', ', '.join(settled))
-    first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; from 7000 on are readers with a network flow of their own, of any domain
+        log.warning('leftovers of killed processes in shared memory could have blocked others: settled %s', ', '.join(settled))
+    first = 7400 + 250 * domain  # RTPS 2.2, 9.6.1.1; from 7000 on are readers with a separate network flow, of any domain
     ours = (*range(7000, 7400), *range(first, first + 250))
     dead = {}
     for path in _entries(folder):
         if (found := _PORT.fullmatch(path.name)) is not None and int(found[2]) in ours:
-            with suppress(OSError):  # a lock without a segment is of no use to Fast DDS
+            with suppress(OSError):  # Fast DDS ignores a lock without a segment
                 dead[found[1]] = path.with_name(found[1]).lstat().st_mtime_ns
-    written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))  # those that died last first
+    written = sorted(_mapped(processes, dead), key=lambda name: (-dead[name], name))  # the most recently killed first
     with ExitStack() as held:
         yield [name for name in written[:MAX_DEAD_PORTS] if _has_lock(folder / f'{name}_el', held)]
 
 
 class PortGuard:
-    """A process that keeps running for a moment after this one was killed, to repair its ports; none if it has no ports.
+    """A process that runs briefly after this one was killed, to repair its ports; none if it has no ports.
 
-
-    Life: New once the participants are made; ``close`` when they are gone. Until then it is ``flock`` (1.8 MB), which waits for a
-    lock that this process has and nobody can take over, and then becomes ``port_guard``.
+    Lifecycle: New once the participants exist; ``close`` after they are destroyed. Until then it is ``flock`` (1.8 MB), which
+    waits
+    for a lock held by this process, and then executes ``port_guard``.
     """
 
     def __init__(self) -> None:
@@ -107,11 +109,11 @@ class PortGuard:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=environ,
-                start_new_session=True,  # Ctrl-C in a terminal, and what is sent to our whole group, is not for it
+                start_new_session=True,  # Ctrl-C in a terminal and signals to our process group must not reach it
             )
         except OSError as error:
             os.close(self._locked)
-            log.warning('no process looks after our shared memory should we be killed (util-linux has flock): %s', error)
+            log.warning('no process repairs our shared memory if this process is killed (util-linux has flock): %s', error)
 
     def close(self) -> None:
         """Idempotent."""
@@ -123,26 +125,26 @@ class PortGuard:
 
 
 def _has_ports() -> bool:
-    """Whether this process listens through shared memory: it holds the lock of a port then."""
+    """Whether this process listens through shared memory: it then holds the lock of a port."""
     for descriptor in Path('/proc/self/fd').iterdir():
-        with suppress(OSError):  # closed meanwhile
+        with suppress(OSError):  # closed since
             if _PORT.fullmatch(descriptor.readlink().name):
                 return True
     return False
 
 
 def _has_lock(path: Path, held: ExitStack) -> bool:
-    """Whether the lock was to be had; it is let go with the stack."""
+    """Whether the lock was acquired; it is released with the stack."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:  # gone meanwhile, or not for us
+    except OSError:  # removed since, or no permission
         return False
     held.callback(os.close, descriptor)
-    return lock(descriptor, wait=False)  # else its owner lives
+    return lock(descriptor, wait=False)  # otherwise its owner is alive
 
 
 def _mapped(processes: Path, ports: Iterable[str]) -> set[str]:
-    """Those of them that a process has in its memory; all of them where one cannot be looked at."""
+    """The ports that a process has mapped; all of them if one process cannot be inspected."""
     ports = set(ports)
     found = set[str]()
     for process in processes.glob('[0-9]*/maps') if ports else ():
@@ -169,10 +171,10 @@ def _entries(folder: Path) -> list[Path]:
 
 @contextmanager
 def _owned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a segment that has no other owner; whether that is so."""
+    """Hold the lock of a segment without an owner; yields whether it was acquired."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:  # gone meanwhile, or not for us
+    except OSError:  # removed since, or no permission
         yield False
         return
     try:
@@ -185,7 +187,7 @@ def _owned(path: Path) -> Iterator[bool]:
 
 
 def _size(segment: Path) -> int | None:
-    """Of its memory; None where there is none of this user's."""
+    """Size of its memory; None if it has none that belongs to this user."""
     try:
         found = segment.lstat()
     except OSError:

@@ -25,9 +25,9 @@ Halve = Callable[[ThinnableObject], 'Thinned | None']
 """Half of the pictures and clouds in an object; None where there are none, or too few. Raises DataLoggerError, OSError."""
 
 
-def may_halve(count: int, span_ns: float, least_hz: float) -> bool:
+def may_halve(count: int, span_ns: float, min_hz: float) -> bool:
     """Whether half of so many messages in this time still come at this rate."""
-    return count > 1 and -(-count // 2) * SECOND >= TOLERANCE * least_hz * span_ns
+    return count > 1 and -(-count // 2) * SECOND >= TOLERANCE * min_hz * span_ns
 
 
 def span_of(count: int, first_ns: int, last_ns: int) -> float:
@@ -42,10 +42,10 @@ class Thinner:
     again with the oldest.
     """
 
-    def __init__(self, spool: Spool, least_hz: float, halve: Halve) -> None:
-        """Down to ``least_hz``; 0 thins nothing."""
+    def __init__(self, spool: Spool, min_hz: float, halve: Halve) -> None:
+        """Down to ``min_hz``; 0 thins nothing."""
         self._spool = spool
-        self._least_hz = least_hz
+        self._min_hz = min_hz
         self._halve = halve
         self._work = self._all()
 
@@ -54,7 +54,7 @@ class Thinner:
 
         Raises OSError or sqlite3.Error.
         """
-        return bool(self._least_hz) and self._spool.kept.is_short() and next(self._work)
+        return bool(self._min_hz) and self._spool.kept.is_short() and next(self._work)
 
     def _all(self) -> Iterator[bool]:
         after = told_ns = 0
@@ -67,7 +67,7 @@ class Thinner:
             if window[0].t_start_ns >= told_ns:  # what is new comes in small windows
                 told_ns = window[0].t_start_ns + HOUR_NS
                 log.info('room for what is kept runs short: pictures and clouds of the hour from %s on are thinned, to %g Hz',
-                         iso(window[0].t_start_ns), self._least_hz)  # fmt: skip
+                         iso(window[0].t_start_ns), self._min_hz)  # fmt: skip
             while window:
                 left: list[ThinnableObject] = []
                 frames = defaultdict[str, list[ThinnableObject]](list)
@@ -99,7 +99,7 @@ class Thinner:
         """Every second one goes; what may lose half once more."""
         ordered = sorted(frames, key=lambda item: item.t_start_ns)
         span_ns = span_of(len(ordered), ordered[0].t_start_ns, ordered[-1].t_start_ns)
-        if not may_halve(len(ordered), span_ns, self._least_hz):
+        if not may_halve(len(ordered), span_ns, self._min_hz):
             return []
         self._spool.kept.evict(ordered[1::2])
         return ordered[::2]

@@ -23,7 +23,7 @@ class Known:
     type: str | None = None
 
     def number(self, topic: str, path: Sequence[str]) -> float | str:
-        return self.numbers.get(f'{topic}:{".".join(path)}', f'no message of {topic} came yet')
+        return self.numbers.get(f'{topic}:{".".join(path)}', f'no message of {topic} was received yet')
 
     def networks(self) -> Collection[str] | str:
         return self.ssids
@@ -71,7 +71,7 @@ def test_what_rules_say(text: str, holds: bool) -> None:
     ('soc:data > 30 or mission', None), ('wifi.ssid == "lab"', None), ('wifi.ssid != "lab"', None), ('time 00:00-24:00', None),
 ])  # fmt: skip
 def test_what_is_unknown_is_neither_true_nor_false(text: str, holds: bool | None) -> None:
-    known = Known(ssids='the system does not tell', at='the clock of this machine is not set')
+    known = Known(ssids='the system does not report', at='the clock of this machine is not set')
     found = evaluate(text, known)
     assert found.holds is holds
     assert holds is not None or 'unknown' in found.why

@@ -221,7 +221,9 @@ def endpoint_of_the_node(scene: Scene) -> None:
 
 
 def failing_front(scene: Scene) -> None:
-    scene.run_node(middleware=beside(), workers={'front': {'failing': True, 'failures': 3, 'last_error': 'it ended by signal 9'}})
+    scene.run_node(
+        middleware=beside(), workers={'front': {'failing': True, 'failures': 3, 'last_error': 'it exited by signal 9'}}
+    )
 
 
 FAULTS: dict[str, tuple[Inject, str, str, tuple[str, ...]]] = {
@@ -321,7 +323,7 @@ def test_a_robot_with_cyclone_dds_is_judged_by_how_it_is_heard(robot: Scene) -> 
     assert robot.findings('sockets') == []
     (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')
     assert told.seen.startswith(
-        "the node would listen with rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS hands on"
+        "the node would listen with rmw_fastrtps_cpp (the robot's is rmw_cyclonedds_cpp: Fast DDS reports"
     )
     robot.run_node(middleware=beside(rmw='rmw_cyclonedds_cpp', why="the robot's own", asked='robot', receive_bytes=MEBI))
     (told,) = (result for result in robot.ask('ros.environment') if result.check == 'ros.listener')

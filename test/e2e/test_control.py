@@ -195,7 +195,7 @@ def test_a_parameter_is_judged_alike(operated: Operated, name: str, value: Any) 
     done, words = tell(operated, 'set', full, f'{value:.9f}' if isinstance(value, float) else str(value))
     assert done is (not reason)
     assert words == f'{full} = {value}' if done else words.startswith(reason)
-    assert ('start the node again' in words) is (name == 'batch_s')
+    assert ('restart the node' in words) is (name == 'batch_s')
     until(lambda: operated.station.get(full) == by_ros, 'a front follows')
     assert by_ros == (value if done else before)
 

@@ -243,7 +243,7 @@ def test_a_front_that_dies_is_started_again(shared: Processes, nodes: dict[str, 
     until(lambda: stations[BESIDE].answers(2.0), 'its services answer')
     row = node.topic(f'{BESIDE}/talk')
     assert (row['received'], row['missed']) == (before + 2 * COUNT, node.known(0))
-    assert 'front failed (1 times so far) and tries again: it ended by signal 9' in node.log
+    assert 'front failed (1 times so far) and tries again: it exited by signal 9' in node.log
 
 
 def test_the_front_ends_with_the_node(processes: Processes) -> None:

@@ -41,12 +41,12 @@ def test_a_publisher_where_our_profile_does_not_look_is_an_error(processes: Proc
         node.said(SAID)
         (line,) = (line for line in node.log.splitlines() if SAID in line)
         assert line.startswith('[ERROR]')
-        assert '/there is not all heard: rmw_cyclonedds_cpp finds a publisher that rmw_fastrtps_cpp' in line
+        assert '/there is not fully received: rmw_cyclonedds_cpp finds a publisher that rmw_fastrtps_cpp' in line
         until(lambda: any(SAID in text for text in findings(node)), 'the status says so')
         assert node.topic('/there').get('received', 0) == 0
         machines.join_networks()
         until(lambda: not any(SAID in text for text in findings(node)), 'it is found')
         node.received('/there', 10)
-        assert 'no longer knows a publisher' in node.log
+        assert 'no longer has a publisher' in node.log
         node.signal(signal.SIGINT)
         assert node.wait() == 0

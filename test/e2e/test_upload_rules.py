@@ -34,7 +34,7 @@ def delivery(node: Node) -> dict[str, Any]:
 def test_uploads_wait_for_the_dock(processes: Processes, seaweed: Tower, store: ObjectStore, station: Station) -> None:
     """A latched message counts however old it is, until its publisher is gone; an event goes at once."""
     node = processes.node(seaweed.environment(), PARAMETERS)
-    unknown = f'{DOCK}:data == true is unknown: no message of {DOCK} came yet'
+    unknown = f'{DOCK}:data == true is unknown: no message of {DOCK} was received yet'
     until(lambda: delivery(node)['waits_for'] == {'upload.when': unknown}, 'it is said what uploads wait for')
     publisher, dock = processes.publisher(), processes.publisher()
     dock.create(DOCK, 'std_msgs/msg/Bool', latched=True, depth=1)
@@ -56,7 +56,7 @@ def test_uploads_wait_for_the_dock(processes: Processes, seaweed: Tower, store: 
     node.delivered(20)
     assert len(Objects.of(store, 'sensor-data', processes.robot).sensor('talk')) == 20
     dock.end()
-    until(lambda: f'nobody publishes {DOCK} any more' in delivery(node)['waits_for'].get('upload.when', ''), 'the dock is gone')
+    until(lambda: f'{DOCK} is no longer published' in delivery(node)['waits_for'].get('upload.when', ''), 'the dock is gone')
     publisher.publish(TALK, texts(range(20, 25)))
     until(lambda: node.ledger()['objects']['pending'] >= 5, 'uploads wait again')
     ledger = node.stop()

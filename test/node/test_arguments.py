@@ -20,7 +20,7 @@ def test_what_ros_would_ignore_is_refused(arguments: list[str], capsys: pytest.C
     """Exit code 2, the argument by its name, and where it belongs: rcl would run with the defaults and say nothing."""
     assert main(arguments) == 2
     said = capsys.readouterr().err
-    assert f'{arguments[0]!r} is not an argument' in said
+    assert f'{arguments[0]!r} is not a valid argument' in said
     assert '--ros-args' in said
 
 

@@ -17,7 +17,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from shadowhound_data_logger.ros.reader import PolledGroup, SubscriptionEventCallbacks, disproof
+from shadowhound_data_logger.ros.reader import PolledGroup, SubscriptionEventCallbacks, verify_librcl
 
 pytestmark = pytest.mark.ros
 TOLD = {'source_timestamp', 'received_timestamp'}
@@ -79,4 +79,4 @@ def test_a_group_answers_all_that_an_executor_asks_of_it(node: Any) -> None:
 @pytest.mark.skipif(rclpy.get_rmw_implementation_identifier() != 'rmw_fastrtps_cpp', reason='the layout is used with Fast DDS')
 def test_the_layout_of_what_librcl_tells(node: Any) -> None:
     """The proof of the start holds on this distribution, also where rclpy tells all and nobody needs it."""
-    assert disproof(node) == ''
+    assert verify_librcl(node) == ''

@@ -80,7 +80,7 @@ def test_every_parameter_is_described(node: Node, loaded: tuple[Parameters, Sett
     descriptor = node.describe_parameter(name)
     assert descriptor.description
     assert descriptor.read_only is (name not in live(loaded[1]))
-    assert descriptor.read_only is ('start the node again' in descriptor.additional_constraints)
+    assert descriptor.read_only is ('restart the node' in descriptor.additional_constraints)
 
 
 def test_the_ranges_are_those_of_the_settings(node: Node, loaded: tuple[Parameters, Settings]) -> None:

@@ -86,7 +86,7 @@ def test_the_history_is_sized_from_what_is_heard(type_name: str, size: int, rate
     history = HistoryDepth(type_name)
     depths = []
     for _ in range(5):
-        history.hear([size] * min(round(rate_hz / 5), history.depth), 0.2)
+        history.observe([size] * min(round(rate_hz / 5), history.depth), 0.2)
         depths.append(history.depth)
     assert depths[-1] == messages
     assert len(set(depths)) <= 5
@@ -96,16 +96,16 @@ def test_the_history_is_sized_from_what_is_heard(type_name: str, size: int, rate
 def test_a_full_history_grows() -> None:
     """More came than it held, so nobody knows how much: it grows until it is no longer full."""
     history = HistoryDepth(TYPE)
-    history.hear([40] * 4000, 60.0)
+    history.observe([40] * 4000, 60.0)
     assert history.depth == 4096
 
 
 def test_a_stall_is_no_rate() -> None:
     """What gathered while nobody took came in the whole time since the last drain; a first drain counts as one poll at least."""
     history = HistoryDepth(TYPE)
-    history.hear([40] * 3000, 1.5)
+    history.observe([40] * 3000, 1.5)
     assert history.depth == 4000
-    history.hear([40] * 100, 0.0)
+    history.observe([40] * 100, 0.0)
     assert history.depth == 4000
 
 

@@ -56,8 +56,8 @@ needs_fast_dds = pytest.mark.skipif(get_rmw_implementation_identifier() not in r
 @pytest.fixture
 def through_librcl(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever this rclpy tells."""
-    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', (99,))
-    monkeypatch.setattr(reader, '_PROVED', {})
+    monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', (99,))
+    monkeypatch.setattr(reader, '_VERIFIED', {})
 
 
 def read(node: Any, topic: str, depth: int = 100, *, latched: bool = False) -> Reader:
@@ -74,9 +74,9 @@ def drained(found: Reader, count: int) -> list[Taken]:
 @pytest.mark.parametrize('latched', [False, True])
 def test_librcl_and_rclpy_tell_the_same(node: Any, monkeypatch: pytest.MonkeyPatch, *, latched: bool) -> None:
     """Of each message of two publishers, small, large and small again: bytes, times, and what rclpy tells of who sent it."""
-    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', ())
+    monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', ())
     by_rclpy = read(node, '/both', latched=latched)
-    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', (99,))
+    monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', (99,))
     by_librcl = read(node, '/both', latched=latched)
     assert (by_rclpy._taker, by_librcl._taker is None) == (None, False)
     quality = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
@@ -124,7 +124,7 @@ def test_takes_through_librcl_are_proved_once(node: Any, caplog: pytest.LogCaptu
 def test_who_needs_librcl(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...], *, needs_librcl: bool) -> None:
     """Humble, Jazzy, and the Kilted of its first weeks: their rclpy does not tell whose a message is."""
     monkeypatch.setattr(reader, 'rclpy_version', lambda: version)
-    monkeypatch.setattr(reader, '_PROVED', {})
+    monkeypatch.setattr(reader, '_VERIFIED', {})
     assert reader.takes_through_librcl(node) is needs_librcl
 
 
@@ -132,13 +132,13 @@ def test_who_needs_librcl(node: Any, monkeypatch: pytest.MonkeyPatch, version: t
 def test_this_rclpy_tells_what_its_version_says(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether a take through it names the publisher, which the bound rests on."""
     with monkeypatch.context() as patch:
-        patch.setattr(reader, 'TELLS_PUBLISHERS', ())
+        patch.setattr(reader, 'REPORTS_PUBLISHERS', ())
         found = read(node, '/told')
     publisher = node.create_publisher(String, '/told', 10)
     until(lambda: found.matched() == 1, 'it is matched')
     publisher.publish(String(data='x'))
     (told,) = drained(found, 1)
-    assert (told.publisher is not None) is (reader.rclpy_version() >= reader.TELLS_PUBLISHERS)
+    assert (told.publisher is not None) is (reader.rclpy_version() >= reader.REPORTS_PUBLISHERS)
     found.close()
 
 
@@ -148,7 +148,7 @@ def test_an_empty_message_is_none(
     node: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, version: tuple[int, ...]
 ) -> None:
     """Fast DDS gives one without end where it lost its place: the reader goes on with another subscription, and says so once."""
-    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', version)
+    monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', version)
     found = read(node, '/stuck')
     publisher = node.create_publisher(String, '/stuck', 10)
     for turn in range(2):
@@ -194,7 +194,7 @@ def test_what_came_before_an_empty_message_is_taken(node: Any, monkeypatch: pyte
 @pytest.mark.parametrize('version', [(), (99,)])
 def test_what_is_behind_an_empty_message_is_taken(node: Any, monkeypatch: pytest.MonkeyPatch, version: tuple[int, ...]) -> None:
     """Anybody in the network may send some: they cost neither the messages behind them nor the subscription."""
-    monkeypatch.setattr(reader, 'TELLS_PUBLISHERS', version)
+    monkeypatch.setattr(reader, 'REPORTS_PUBLISHERS', version)
     found = read(node, '/hollow')
     before = found._subscription
     publisher = node.create_publisher(String, '/hollow', 10)
@@ -245,7 +245,7 @@ def test_what_is_told_wrong_is_not_trusted(
     assert [each._taker for each in readers] == [None, None]
     (record,) = caplog.records
     assert record.levelname == 'WARNING'
-    assert 'is told as RclMessage(' in record.getMessage()
+    assert 'is reported as RclMessage(' in record.getMessage()
     publisher = node.create_publisher(String, '/wrong0', 10)
     until(lambda: readers[0].matched() == 1, 'it is matched')
     publisher.publish(String(data='still'))

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from shadowhound_data_logger.ros.policy_topics import MAX_HEALTH_BYTES, NODE, PolicyTopics, telling
+from shadowhound_data_logger.ros.policy_topics import MAX_HEALTH_BYTES, NODE, PolicyTopics, serve_policy_topics
 
 
 class Listener:
@@ -69,7 +69,7 @@ def listener(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Listener]
 
 def test_a_policy_is_told_judged_and_sent_out(scene: Scene, listener: Listener) -> None:
     first, second = scene.folder.versions.ids()
-    with telling(scene.folder) as topics:
+    with serve_policy_topics(scene.folder) as topics:
         listener.until(lambda: listener.heard, 'a node that comes later hears it too')
         assert listener.heard[-1] == second
         listener.until(listener.health.get_subscription_count, 'somebody listens to its health')
@@ -108,7 +108,7 @@ def test_what_cannot_be_judged_stays(scene: Scene, listener: Listener, caplog: p
         manifest.parent.chmod(0o700)
         manifest.unlink()
         topics._on_health(String(data=json.dumps({'policy': now, 'failures': 99})))
-        assert 'cannot be judged' in caplog.text
+        assert 'cannot be evaluated' in caplog.text
         assert scene.folder.current() == now
     finally:
         node.destroy_node()

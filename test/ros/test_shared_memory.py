@@ -37,16 +37,16 @@ def test_only_what_nobody_holds_is_freed(shm: Path) -> None:
     with flock(shm / f'{ALIVE}_el'):
         assert [each.name for each in orphans(shm)] == [DEAD]
         assert names(shm) == before
-        assert orphans(shm, is_freed=True) == [Orphan(DEAD, 8192)]
+        assert orphans(shm, free=True) == [Orphan(DEAD, 8192)]
         assert names(shm) == before - {DEAD, f'{DEAD}_el'}
-        assert orphans(shm, is_freed=True) == []
+        assert orphans(shm, free=True) == []
 
 
 def test_what_belongs_to_another_user_stays(shm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever may remove it: root, say."""
     before, mine = names(shm), os.geteuid()
     monkeypatch.setattr(os, 'geteuid', lambda: mine + 1)
-    assert orphans(shm, is_freed=True) == []
+    assert orphans(shm, free=True) == []
     assert names(shm) == before
 
 
@@ -62,14 +62,14 @@ def test_a_lock_that_is_none_is_left_alone(shm: Path, tmp_path_factory: pytest.T
     segment = shm / f'{DEAD}'
     segment.unlink()
     segment.symlink_to(outside)
-    assert [each.name for each in orphans(shm, is_freed=True)] == [ALIVE]
+    assert [each.name for each in orphans(shm, free=True)] == [ALIVE]
     assert outside.read_text() == 'precious'
     assert {link.name, pipe.name} <= names(shm)
 
 
 def test_a_machine_without_such_a_folder(tmp_path: Path) -> None:
     """Nothing is freed, and nothing fails."""
-    assert orphans(tmp_path / 'none', is_freed=True) == []
+    assert orphans(tmp_path / 'none', free=True) == []
 
 
 def ports(shm: Path, *numbers: int) -> list[str]:

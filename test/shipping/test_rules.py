@@ -31,7 +31,7 @@ def event(number: int) -> DataObject:
     return replace(data_object(number, 'bags', priority=1), protected=True, sensor='bag', metadata={meta.EVENT: 'fall'})
 
 
-def telling(number: int) -> DataObject:
+def serve_policy_topics(number: int) -> DataObject:
     return replace(data_object(number, priority=9), sensor='_catalog')
 
 
@@ -49,7 +49,7 @@ def test_only_what_waits_for_the_rule_waits(draining: Draining, store: MemorySto
     """Events and what tells of objects pass a backlog of more important ones; once the rule holds, all of it goes."""
     draining.uploader.wait_for({UPLOAD_WHEN: 'wifi.ssid == "lab": it is "cafe"'})
     waiting = spool(draining, plain(0, MANY))
-    free = spool(draining, [event(1000), telling(1001)])
+    free = spool(draining, [event(1000), serve_policy_topics(1001)])
     draining.uploader.open()
     until(lambda: keys(store) == free)
     until(lambda: draining.uploader.status().state == 'waiting')
@@ -68,7 +68,7 @@ def test_only_what_waits_for_the_rule_waits(draining: Draining, store: MemorySto
 def test_events_may_wait_for_a_rule_of_their_own(draining: Draining, store: MemoryStore) -> None:
     draining.uploader.wait_for({EVENTS_WHEN: 'mission: no mission is active'})
     events = spool(draining, [event(1), event(2)])
-    others = spool(draining, [*plain(10, 5), telling(20)])
+    others = spool(draining, [*plain(10, 5), serve_policy_topics(20)])
     draining.uploader.open()
     until(lambda: keys(store) == others)
     assert not draining.uploader.drain(5.0)
@@ -85,7 +85,7 @@ def test_a_rule_that_ends_to_hold_stops_what_was_looked_up(draining: Draining, s
     draining.uploader.wait_for({UPLOAD_WHEN: 'it does not'})
     until(lambda: draining.uploader.status().in_flight == 0)
     store.fail = None
-    free = spool(draining, [telling(100)])
+    free = spool(draining, [serve_policy_topics(100)])
     until(lambda: keys(store) == free)
     until(lambda: draining.spool.pending_count() == 20)
     draining.uploader.wait_for({})
@@ -95,7 +95,7 @@ def test_a_rule_that_ends_to_hold_stops_what_was_looked_up(draining: Draining, s
 def test_drained_where_nothing_waits_for_the_rule(draining: Draining) -> None:
     draining.uploader.wait_for({UPLOAD_WHEN: 'it does not'})
     draining.uploader.open()
-    spool(draining, [telling(1)])
+    spool(draining, [serve_policy_topics(1)])
     until(lambda: draining.spool.pending_count() == 0)
     assert draining.uploader.drain(10.0)
 
@@ -122,7 +122,7 @@ def test_what_waits_costs_a_look_nothing(tmp_path: Path, oldest: bool) -> None:
     """The few that may go are found by an index of their own."""
     opened = Draining(tmp_path / 'spool', MemoryStore())
     try:
-        opened.spool.commit([*plain(0, 50), telling(100), event(101)])
+        opened.spool.commit([*plain(0, 50), serve_policy_topics(100), event(101)])
         found = opened.spool.pending(10, oldest=oldest, waiting_for={UPLOAD_WHEN})
         assert {item.waits_for for item in found} == {'', EVENTS_WHEN}
         assert [item.waits_for for item in opened.spool.pending(10, oldest=oldest, waiting_for={UPLOAD_WHEN, EVENTS_WHEN})] == [

@@ -29,7 +29,7 @@ from shadowhound_data_logger.formats.mcap.ranges import LocalFile
 from shadowhound_data_logger.formats.mcap.slice_info import Channel
 from shadowhound_data_logger.formats.mcap.writer import SliceWriter
 from shadowhound_data_logger.formats.rows.parts import read_rows
-from shadowhound_data_logger.node.encoding.halving import Halving
+from shadowhound_data_logger.node.encoding.halver import Halver
 from shadowhound_data_logger.shipping.catalog_writer import CatalogWriter
 from shadowhound_data_logger.shipping.thinning import Thinner, may_halve
 from shadowhound_data_logger.spool.files import description_of
@@ -45,18 +45,18 @@ IMU = Channel('/imu', 'sensor_msgs/msg/Imu', '', '', '', '')
 class Robot:
     """A spool that keeps, and what thins it."""
 
-    def __init__(self, root: Path, max_bytes: int, least_hz: float = 1.0) -> None:
+    def __init__(self, root: Path, max_bytes: int, min_hz: float = 1.0) -> None:
         self.root = root
         self.clock = FakeClock()
-        self.max_bytes, self.least_hz = max_bytes, least_hz
+        self.max_bytes, self.min_hz = max_bytes, min_hz
         self.random = random.Random(0)
         self.open()
 
     def open(self) -> None:
-        keep = KeepSettings(max_bytes=self.max_bytes, thin_to_hz=self.least_hz)
+        keep = KeepSettings(max_bytes=self.max_bytes, thin_to_hz=self.min_hz)
         self.spool = Spool(self.root, SpoolSettings(min_free_bytes=0), self.clock, 'thor', keep)
         self.spool.open()
-        self.thinner = Thinner(self.spool, self.least_hz, Halving(self.root.parent / 'home', 'thor', self.least_hz))
+        self.thinner = Thinner(self.spool, self.min_hz, Halver(self.root.parent / 'home', 'thor', self.min_hz))
 
     def keep(self, *items: DataObject, topics: Sequence[str] = ('/camera',)) -> None:
         for item in items:
@@ -91,8 +91,8 @@ class Robot:
 def make_robot(tmp_path: Path) -> Iterator[Callable[..., Robot]]:
     made: list[Robot] = []
 
-    def build(max_bytes: int, least_hz: float = 1.0) -> Robot:
-        made.append(Robot(tmp_path / 'spool', max_bytes, least_hz))
+    def build(max_bytes: int, min_hz: float = 1.0) -> Robot:
+        made.append(Robot(tmp_path / 'spool', max_bytes, min_hz))
         return made[-1]
 
     yield build
@@ -159,13 +159,13 @@ def messages_of(body: bytes, content_type: str) -> dict[int, bytes]:
     return {one['stamp_ns']: files[one.get('repeat_of', f'{one["stamp_ns"]:019d}.jpg')] for one in said}
 
 
-@pytest.mark.parametrize(('count', 'seconds', 'least_hz', 'expected'), [
+@pytest.mark.parametrize(('count', 'seconds', 'min_hz', 'expected'), [
     (2, 2.0, 0.5, True), (2, 2.0, 1.0, False), (2, 1.0, 1.0, True), (1, 0.0, 0.1, False), (30, 1.0, 1.0, True),
     (30, 1.0, 15.0, True), (30, 1.0, 16.0, False), (5, 0.0, 1000.0, True),
 ])  # fmt: skip
-def test_no_rate_goes_below_the_least(count: int, seconds: float, least_hz: float, expected: bool) -> None:
+def test_thinning_respects_the_minimum_rate(count: int, seconds: float, min_hz: float, expected: bool) -> None:
     """The half that stays comes as often as is asked for, or more often."""
-    assert may_halve(count, seconds * SECOND, least_hz) is expected
+    assert may_halve(count, seconds * SECOND, min_hz) is expected
 
 
 def test_frames_lose_rate_before_time(make_robot: Callable[..., Robot]) -> None:

@@ -1,1 +1,1 @@
-"""From batches of messages to the objects that the spool stores."""
+"""Encodes batches of messages into objects for the spool."""

@@ -1,7 +1,7 @@
-"""From the intake to the spool: batches wait in a bounded queue, and the threads of the pool turn them into objects.
+"""A bounded queue of batches, and the threads that encode them into objects.
 
-The queue never blocks the intake: when it is full, the least important batch is dropped. Every sample that the pool takes from it
-comes out as stored or as rejected with a reason, also when an encoder has a fault of its own.
+The queue never blocks the intake: when it is full, a batch of the lowest priority is dropped. Every sample taken from it ends up
+stored, or rejected with a reason, even if an encoder has a bug.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ WAIT_S: Final = 0.5
 THREADS: Final = min(max(2, len(os.sched_getaffinity(0)) // 2), 4)
 """Encoder threads: half the cores that this process may use, at least two, at most four."""
 MAX_MESSAGES: Final = 50_000
-"""Messages that wait for an encoder at most, however small they are."""
+"""Maximum number of messages that wait for an encoder, however small."""
 PATIENCE_S: Final = 60.0
 """A batch that takes longer is stuck: the largest images and clouds take a second on a Jetson."""
 Marking = Callable[[DataObject], DataObject]
-"""Gives an object more metadata, or another name; from any thread."""
+"""Adds metadata to an object or renames it; called from any thread."""
 Preview = Callable[[DataObject], 'DataObject | None']
 Observe = Callable[[Batch, 'DataObject | None'], None]
 
 
 class BatchQueue:
-    """Batches by priority, first in first out within one. Thread-safe; ``_lock`` guards all of it.
+    """Batches by priority, first in first out within one. Thread-safe; ``_lock`` guards all state.
 
-    Whoever takes a batch says ``done`` when it has left for good, so that one can wait for those before a moment.
+    The consumer calls ``done`` for each batch that it has finished, so that ``finished`` can wait for earlier batches.
     """
 
     def __init__(self, settings: QueueSettings, max_messages: int = MAX_MESSAGES) -> None:
@@ -50,7 +50,7 @@ class BatchQueue:
         self._lock = threading.Lock()
         self._ready = threading.Condition(self._lock)
         self._left = threading.Condition(self._lock)
-        self._unfinished: dict[int, tuple[int, Batch]] = {}  # id of a batch -> its number, rising
+        self._unfinished: dict[int, tuple[int, Batch]] = {}  # id of a batch -> its sequence number
         self._put = self._finished = 0
         self._lanes: dict[int, deque[Batch]] = {}
         self._messages = 0
@@ -58,7 +58,9 @@ class BatchQueue:
         self._closed = False
 
     def put(self, batch: Batch, priority: int) -> list[Batch]:
-        """Add a batch, at once. Returns what had to be dropped for it: the least important, oldest first; maybe itself."""
+        """Add a batch without blocking. Returns the batches dropped for it: lowest priority and oldest first; it may be among
+        them.
+        """
         dropped: list[Batch] = []
         with self._lock:
             lane = self._lanes.get(priority)
@@ -77,7 +79,7 @@ class BatchQueue:
         return dropped
 
     def get(self, timeout_s: float) -> Batch | None:
-        """The most important batch, or None after the timeout or once the queue is closed and empty."""
+        """The most important batch; None after the timeout, or once the queue is closed and empty."""
         with self._lock:
             if not self._messages and not self._closed:
                 self._ready.wait(timeout_s)
@@ -87,19 +89,19 @@ class BatchQueue:
         return None
 
     def done(self, batch: Batch) -> None:
-        """The batch that ``get`` gave out has been handed on, or rejected."""
+        """A batch from ``get`` has been passed on, or rejected."""
         with self._lock:
             self._finished += 1
             self._finish(batch)
 
     def finished(self, deadline_s: float) -> bool:
-        """Whether every batch that was put before this call is done, or dropped, in time."""
+        """Whether every batch that was put before this call is done, or dropped, before the deadline."""
         with self._lock:
             last = self._put
             return self._left.wait_for(lambda: self._first() > last, max(0.0, deadline_s))
 
     def is_busy(self) -> bool:
-        """Whether a batch waits or is with an encoder; reads without the lock, so it may be a moment old."""
+        """Whether a batch waits or is being encoded; reads without the lock, so it may be slightly out of date."""
         return bool(self._unfinished)
 
     def oldest(self) -> dict[str, int]:
@@ -112,7 +114,7 @@ class BatchQueue:
             return found
 
     def close(self) -> None:
-        """Wake all who wait; what is inside can still be taken."""
+        """Wake all waiting threads; queued batches can still be taken."""
         with self._lock:
             self._closed = True
             self._ready.notify_all()
@@ -128,7 +130,7 @@ class BatchQueue:
             return QueueStatus(batches, self._messages, self._bytes, self._finished, self._max_messages, self._max_bytes)
 
     def _first(self) -> int:
-        """The number of the oldest batch that is not done, or of the next one."""
+        """The sequence number of the oldest batch that is not done, or of the next one."""
         return next((number for number, _ in self._unfinished.values()), self._put + 1)
 
     def _remove(self, lane: deque[Batch]) -> Batch:
@@ -143,7 +145,7 @@ class BatchQueue:
 
 
 class EncodePool:
-    """The threads that encode batches and hand the objects to the spool.
+    """The threads that encode batches and pass the objects to the spool.
 
     New; open once; close once. Owns its threads; ``put`` may block them (a slow disk), never the intake.
     """
@@ -152,10 +154,11 @@ class EncodePool:
                  writer: SpoolWriter, marks: Sequence[Marking], observe: Observe, *,
                  preview: Preview = lambda _: None, reports: RejectionLog | None = None,
                  threads: int = THREADS) -> None:  # fmt: skip
-        """``sensors`` are the settings in force. An object goes through the ``marks`` one after the other, then to ``writer``.
+        """``sensors`` are the current settings. An object passes through the ``marks`` one after the other, then to ``writer``.
 
-        ``observe`` is shown each batch and its object, if there is one, once that is on its way; what it raises loses nothing.
-        ``preview`` may make a small one of an object, which goes the same way before it. ``reports`` says what was rejected.
+        ``observe`` receives each batch and its object, if there is one, after that was passed on; an exception in it loses
+        nothing.
+        ``preview`` may create a preview of an object, which is spooled before it. ``reports`` logs rejections.
         """
         self._queue = queue
         self._sensors = sensors
@@ -174,7 +177,7 @@ class EncodePool:
             worker.start()
 
     def close(self, deadline_s: float) -> bool:
-        """Encode what is queued, then end; False if that took longer than the deadline. Idempotent."""
+        """Encode the queued batches, then stop; False if that took longer than the deadline. Idempotent."""
         end = time.monotonic() + deadline_s
         self._queue.close()
         done = [worker.join(end - time.monotonic()) for worker in self.workers]
@@ -195,7 +198,7 @@ class EncodePool:
                 worker.stop()
 
     def _encode(self, batch: Batch) -> None:
-        first, last = (by_arrival(batch.samples[at].received_ns) for at in (0, -1))  # what is wrong may have any stamp
+        first, last = (by_arrival(batch.samples[at].received_ns) for at in (0, -1))  # an invalid message may have any stamp
         try:
             encoding = encode(batch, self._sensors[batch.sensor], self._robot, self._types)
         except BaseException:

@@ -1,4 +1,4 @@
-"""Some of the messages of a topic, verbatim, of the last minute; a message is deserialized once an encoder asks for its time."""
+"""Recent messages of a topic, verbatim; a message is deserialized when an encoder first asks for its time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any, Final
 from shadowhound_data_logger.core.clock import SECOND
 
 SPAN_NS: Final = 60 * SECOND
-"""How far back is remembered: batches, queues and slow encoders ask late."""
+"""How long messages are kept: batches, queues and slow encoders ask late."""
 
 
 @dataclass(slots=True)
 class _Kept:
-    """A message and, once somebody asked for it, what it says."""
+    """A message and, once read, its value."""
 
     stamp_ns: int
     cdr: bytes
@@ -24,10 +24,10 @@ class _Kept:
 
 
 class KeptMessages:
-    """Some messages of one topic and type: one each ``every_ns`` and the newest. One thread adds, any asks; ``_lock`` guards."""
+    """Messages of one topic and type: one per ``every_ns``, and the newest. One thread adds, any reads; ``_lock`` guards."""
 
     def __init__(self, every_ns: int, type_name: str, read: Callable[[str, bytes], Any]) -> None:
-        """``read`` makes a value of a message; None where it says nothing."""
+        """``read`` converts a message to a value; None if it has none."""
         self._every_ns = every_ns
         self.type = type_name
         self._read = read
@@ -36,7 +36,7 @@ class KeptMessages:
         self._kept: list[_Kept] = []
 
     def add(self, stamp_ns: int, cdr: bytes) -> None:
-        """A message, in the order of their times; after a step of the clock back the track starts again."""
+        """Add a message, in order of time; after a backward clock step the track starts again."""
         with self._lock:
             stamps, kept = self._stamps, self._kept
             if stamps and stamp_ns <= stamps[-1]:
@@ -53,14 +53,14 @@ class KeptMessages:
                 old = bisect_left(stamps, stamp_ns - SPAN_NS)
                 del stamps[:old], kept[:old]
 
-    def around(self, stamp_ns: int) -> list[tuple[int, Any]]:
-        """(time, value) of the two messages about a time; at an end of the track the last two, or the only one."""
+    def nearby(self, stamp_ns: int) -> list[tuple[int, Any]]:
+        """(time, value) of the two messages around a time; at an end of the track the last two, or the only one."""
         with self._lock:
             after = bisect_left(self._stamps, stamp_ns)
             first = max(0, min(after - 1, len(self._stamps) - 2))
             found = self._kept[first : first + 2]
             if after == len(self._stamps) > 2 and self._stamps[-1] - self._stamps[-2] < self._every_ns // 2:
-                found[0] = self._kept[-3]  # too near one another to tell a speed
+                found[0] = self._kept[-3]  # too close to each other for a speed
         return [(kept.stamp_ns, value) for kept in found if (value := self._value(kept)) is not None]
 
     @property

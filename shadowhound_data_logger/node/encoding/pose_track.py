@@ -1,7 +1,7 @@
-"""Where the robot was, and how full its battery was, at the time of an object: read from the messages of the last minute.
+"""The pose of the robot and its battery level at the time of an object, from the messages of the last minute.
 
-Some messages of odometry, tf, GPS and batteries are kept verbatim; only those around an object's time are ever deserialized, by
-the encoder that asks.
+Messages of odometry, tf, GPS and batteries are sampled and kept verbatim; only those around an object's time are deserialized,
+by the encoder that asks.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from shadowhound_data_logger.node.intake.consumers import Consumer, Drained
 from shadowhound_data_logger.node.recording.mission_observer import Source, Sources, battery_pct, yaw_of
 
 POSE_EVERY_NS: Final = SECOND // 10
-"""Between two poses that are kept: a straight line instead of the tightest bend that a Go2 trots is then 2 mm off."""
+"""Time between two kept poses: linear interpolation is then within 2 mm on the tightest turn of a trotting Go2."""
 BATTERY_EVERY_NS: Final = 5 * SECOND
 BATTERY_AGE_NS: Final = 30 * SECOND
-"""A charge of that age is still the robot's."""
+"""Maximum age of a battery level."""
 FIX_EVERY_NS: Final = SECOND // 10
 FIX_AGE_NS: Final = 2 * SECOND
-"""A fix of that age is still the robot's place: many receivers have one per second."""
+"""Maximum age of a fix: many receivers have one per second."""
 NO_FIX: Final = -1
-"""NavSatStatus.STATUS_NO_FIX; -2, the default since Jazzy, says nothing."""
+"""NavSatStatus.STATUS_NO_FIX; -2, the default since Jazzy, means unknown."""
 GAP_NS: Final = 3 * SECOND // 2
-"""Over a longer silence nothing is interpolated."""
+"""No interpolation across a longer gap."""
 AHEAD_NS: Final = SECOND // 4
-"""For so long the robot is taken to go on as it did: objects are encoded before the next odometry has come."""
+"""How far to extrapolate: objects are encoded before the next odometry message arrives."""
 AT_ONCE_NS: Final = SECOND // 20
-"""For so long one pose alone holds, and the robot is taken to have gone as it does before the first of several."""
+"""How long a single pose is valid, and how far to extrapolate before the first pose of several."""
 MAX_TOPICS: Final = 16
-"""Of batteries, of odometry, of GPS: who publishes decides how many there are."""
+"""Limit on topics of batteries, odometry and GPS, because publishers decide how many exist."""
 _NO_WORD: Final = re.compile(r'[^!-~]')
 
 
@@ -61,7 +61,7 @@ class _Fix(NamedTuple):
 
 
 class RobotTrack(Consumer):
-    """Knows where the robot was, and its battery, over the last minute.
+    """Tracks the pose and battery of the robot over the last minute.
 
     New; ``take`` what the intake drained, ``mark`` each object on its way to the spool, on any thread.
     """
@@ -75,10 +75,10 @@ class RobotTrack(Consumer):
         self._poses: list[tuple[Source, KeptMessages]] = []
         self._charges: list[tuple[Source, KeptMessages]] = []
         self._fixes: list[tuple[Source, KeptMessages]] = []
-        """The preferred source first. Replaced as a whole."""
+        """The preferred source first. Replaced atomically."""
 
-    def is_place(self, sensor: SensorSettings) -> bool:
-        """Whether its topics tell where the robot is: they are drained before those whose objects are marked with that."""
+    def has_pose(self, sensor: SensorSettings) -> bool:
+        """Whether its topics contain the pose of the robot: they are drained before the topics that are marked with it."""
         return any(name in {ODOMETRY, TRANSFORMS, FIX} for name in sensor.types)
 
     def take(self, drained: Drained) -> None:
@@ -92,7 +92,7 @@ class RobotTrack(Consumer):
                 kept.add(message.stamp_ns, message.cdr)
 
     def of(self, topic: str, type_name: str) -> KeptMessages | None:
-        """Where messages of a topic are kept; None where they are not needed."""
+        """The kept messages of a topic; None if they are not needed."""
         if type_name == ODOMETRY and (source := self._odometry.find(topic, type_name)) is not None:
             self._poses, kept = _added(self._poses, source, POSE_EVERY_NS, type_name, self._pose)
         elif type_name == FIX:
@@ -105,39 +105,39 @@ class RobotTrack(Consumer):
         return kept
 
     def mark(self, item: DataObject) -> DataObject:
-        """The object with what is known of the middle of its time."""
+        """The object with the pose and battery at the middle of its time."""
         marks = self.marks((item.t_start_ns + item.t_end_ns) // 2)
         return replace(item, metadata={**item.metadata, **marks}) if marks else item
 
     def marks(self, stamp_ns: int) -> dict[str, str]:
-        """Pose, place on Earth and battery at a time, as metadata; without what is unknown."""
+        """Pose, GPS position and battery at a time, as metadata; unknown values are omitted."""
         marks: dict[str, str] = {}
         if (pose := self._pose_at(stamp_ns)) is not None:
             marks[POSE] = f'{_plain(pose.x, 3)} {_plain(pose.y, 3)} {_plain(pose.yaw, 4)} {pose.frame}'
         for _, fixes in self._fixes:
-            if (fix := _fix_at(fixes.around(stamp_ns), stamp_ns)) is not None:
+            if (fix := _fix_at(fixes.nearby(stamp_ns), stamp_ns)) is not None:
                 marks[GPS] = f'{_plain(fix.latitude, 7)} {_plain(fix.longitude, 7)} {_plain(fix.altitude, 2)}'
                 break
         for _, charges in self._charges:
-            near = min(charges.around(stamp_ns), key=lambda found: abs(found[0] - stamp_ns), default=None)
+            near = min(charges.nearby(stamp_ns), key=lambda found: abs(found[0] - stamp_ns), default=None)
             if near is not None and abs(near[0] - stamp_ns) <= BATTERY_AGE_NS:
                 marks[BATTERY] = f'{near[1]:g}'
                 break
         return marks
 
     def place(self, stamp_ns: int) -> Pose | None:
-        """Where tf has the robot at a time, for missions of robots without odometry."""
+        """The pose from tf at a time, for missions of robots without odometry."""
         placed = self._transforms.at(stamp_ns)
         return None if placed is None else Pose(stamp_ns, placed.x, placed.y, placed.yaw, placed.z, placed.frame)
 
     def _pose_at(self, stamp_ns: int) -> _Pose | None:
-        """In the map, else by the odometry, else by tf without a map."""
+        """In the map if possible, otherwise from odometry, otherwise from tf without a map."""
         placed = self._transforms.at(stamp_ns)
-        of_tf = None if placed is None else _Pose(placed.x, placed.y, placed.yaw, _word(placed.frame))
+        of_tf = None if placed is None else _Pose(placed.x, placed.y, placed.yaw, _safe_frame(placed.frame))
         if placed is not None and placed.is_map:
             return of_tf
         for _, poses in self._poses:
-            found = poses.around(stamp_ns)
+            found = poses.nearby(stamp_ns)
             if found and (pose := _between(found, stamp_ns)) is not None:
                 return pose
         return of_tf
@@ -145,15 +145,15 @@ class RobotTrack(Consumer):
     def _pose(self, type_name: str, cdr: bytes) -> _Pose | None:
         try:
             message = self._types.deserialize(type_name, cdr)
-        except Rejected:  # the odometry's own objects tell of it
+        except Rejected:  # the odometry's own objects already contain it
             return None
         at, yaw = message.pose.pose.position, yaw_of(message.pose.pose.orientation)
         if not all(map(math.isfinite, (at.x, at.y, yaw))):
             return None
-        return _Pose(at.x, at.y, yaw, _word(message.header.frame_id))
+        return _Pose(at.x, at.y, yaw, _safe_frame(message.header.frame_id))
 
     def _fix(self, type_name: str, cdr: bytes) -> _Fix | None:
-        """None without a fix, and for what is no place on Earth."""
+        """None without a fix, and for an invalid position."""
         try:
             message = self._types.deserialize(type_name, cdr)
         except Rejected:
@@ -172,7 +172,7 @@ class RobotTrack(Consumer):
 
 def _added(known: list[tuple[Source, KeptMessages]], source: Source, every_ns: int, type_name: str,
            read: Callable[[str, bytes], object]) -> tuple[list[tuple[Source, KeptMessages]], KeptMessages | None]:  # fmt: skip
-    """With the messages of a source, which are those of the topic while it has one type; None where there are too many topics."""
+    """Add the messages of a source; a topic whose type changed starts again. None if there are too many topics."""
     for of, kept in known:
         if of.topic == source.topic and kept.type == type_name:
             return known, kept
@@ -184,7 +184,7 @@ def _added(known: list[tuple[Source, KeptMessages]], source: Source, every_ns: i
 
 
 def _between(found: list[tuple[int, _Pose]], stamp_ns: int) -> _Pose | None:
-    """The pose at a time between or near two others, straight on; yaw turns the shorter way."""
+    """The pose at a time, linearly interpolated or extrapolated from two others; yaw turns the shorter way."""
     (start_ns, a), (end_ns, b) = found[0], found[-1]
     if not (0 < end_ns - start_ns <= GAP_NS and start_ns - AT_ONCE_NS <= stamp_ns <= end_ns + AHEAD_NS and a.frame == b.frame):
         near_ns, near = min(found, key=lambda pose: abs(pose[0] - stamp_ns))
@@ -200,7 +200,7 @@ def _plain(value: float, digits: int) -> str:
 
 
 def _fix_at(found: list[tuple[int, _Fix]], stamp_ns: int) -> _Fix | None:
-    """The place at a time between two fixes, straight on; otherwise that of the nearest one. Longitude takes the shorter way."""
+    """The position at a time, linearly interpolated between two fixes, otherwise the nearest. Longitude takes the shorter way."""
     if not found:
         return None
     (start_ns, a), (end_ns, b) = found[0], found[-1]
@@ -213,5 +213,5 @@ def _fix_at(found: list[tuple[int, _Fix]], stamp_ns: int) -> _Fix | None:
     return _Fix(a.latitude + part * (b.latitude - a.latitude), longitude, a.altitude + part * (b.altitude - a.altitude))
 
 
-def _word(frame: str) -> str:
+def _safe_frame(frame: str) -> str:
     return _NO_WORD.sub('_', frame)[:64] or '_'

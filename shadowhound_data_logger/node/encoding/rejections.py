@@ -1,6 +1,6 @@
-"""Reports rejected messages in the log, once a minute for each topic, reason and publishing node, with a remedy.
+"""Logs rejected messages with a remedy, once per minute for each topic, reason and publishing node.
 
-The ledger counts every one of them; the log says what is wrong and who should change what, for as long as it goes on.
+The ledger counts every rejected message; the log reports what is wrong and what to change, as long as it continues.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ log = logging.getLogger(__name__)
 
 PERIOD_S: Final = 60.0
 MAX_KNOWN: Final = 1000
-"""Publishers, and pairs of reason and node, that are remembered; a robot in trouble has a few."""
+"""Maximum number of remembered publishers, and of pairs of reason and node; a robot in trouble has a few."""
 ENCODER_FAILED: Final = 'encoder_failed'
-"""Why samples are rejected whose encoder has a fault."""
+"""The reason for samples whose encoder has a bug."""
 REMEDIES: Final = {
-    'size_mismatch': 'the publisher contradicts itself, report it there; {sensor}.format: cdr stores such messages unchanged',
+    'size_mismatch': 'the message is inconsistent, report it there; {sensor}.format: cdr stores such messages unchanged',
     'unknown_type': 'install and source the package of its type; {sensor}.format: cdr needs no definition',
     'wrong_type': '{sensor}.format: json or cdr stores every type',
     'too_large': '{sensor}.format: png has no such limit',
     'unsafe_key': 'change {sensor}.key',
     'surplus': '{sensor}.format holds one message: set {sensor}.batch_s to 0, or use tar or zip',
-    ENCODER_FAILED: 'this is a defect of the logger: report it with the traceback from this log',
+    ENCODER_FAILED: 'this is a bug of the logger: report it with the traceback from this log',
 }
 """By reason."""
 _OTHERWISE: Final = '{sensor}.format: cdr stores such messages unchanged'
 NodeOf = Callable[[str, str], str]
-"""From a topic and a publisher's gid to the full name of its node; '' if it is unknown."""
+"""From a topic and a publisher's gid to the full name of its node; '' if unknown."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """What is known of one topic, reason and node."""
+    """The state of one topic, reason and node."""
 
     sensor: str
     newest: Rejection
@@ -48,7 +48,7 @@ class _Entry:
 
 
 class RejectionLog:
-    """Writes the reports. Thread-safe; ``_lock`` guards all of it."""
+    """Writes the reports. Thread-safe; ``_lock`` guards all state."""
 
     def __init__(self, node_of: NodeOf = lambda _topic, _gid: '', monotonic: Callable[[], float] = time.monotonic) -> None:
         self._node_of = node_of
@@ -59,7 +59,9 @@ class RejectionLog:
         self._due_s = 0.0
 
     def add(self, topic: str, sensor: str, rejections: Iterable[Rejection], *, is_known: bool = False) -> None:
-        """Messages of a topic were rejected: report the first of a kind now, unless it ``is_known``; further ones in a minute."""
+        """Messages of a topic were rejected: log the first of a kind immediately, unless it ``is_known``; further ones after a
+        minute.
+        """
         now_s = self._monotonic()
         with self._lock:
             for each in rejections:
@@ -76,7 +78,7 @@ class RejectionLog:
         self.poll()
 
     def poll(self) -> None:
-        """Report what waited for its minute; cheap to call often."""
+        """Log the reports that are due; cheap to call often."""
         now_s = self._monotonic()
         if now_s < self._due_s:
             return

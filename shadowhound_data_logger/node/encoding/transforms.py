@@ -1,6 +1,6 @@
-"""Where the robot was by tf: the transforms of the last minute, joined from its base to the map.
+"""The pose of the robot from tf: the transforms of the last minute, chained from its base to the map.
 
-Messages are kept verbatim, one per tenth of a second for each publisher and set of frames. Only the first one of a set, and those
+Messages are kept verbatim, one per 0.1 s for each publisher and set of frames. Only the first message of a set, and those
 with a frame between the base and the root of the tree, are deserialized, by the encoder that asks.
 """
 
@@ -27,18 +27,18 @@ BASES: Final = ('base_link', 'base_footprint', 'body')
 """Frames of the robot itself (REP 105), the preferred one first."""
 MAP, ODOM = 'map', 'odom'
 ODOM_GAP_NS, GAP_NS = 3 * SECOND // 2, 3 * SECOND
-"""Longest time between two transforms: of a frame below ``odom``, and of others, because localization is slower than odometry."""
+"""Maximum time between two transforms: of a frame below ``odom``, and of others, because localization is slower than odometry."""
 AHEAD_NS: Final = SECOND // 4
-"""For so long a frame below ``odom`` is assumed to keep moving; others stay where they are: corrections of a map jump."""
+"""How far to extrapolate a frame below ``odom``; others are not extrapolated, because corrections of a map jump."""
 MAX_KEPT: Final = 256
-"""Sets of frames: their number depends on who publishes."""
+"""Limit on sets of frames, because publishers decide how many exist."""
 MAX_DEPTH: Final = 32
-"""Frames between base and root."""
+"""Maximum frames between base and root."""
 _LENGTH: Final = (struct.Struct('>I'), struct.Struct('<I'))
 
 
 class Placed(NamedTuple):
-    """Where the base of the robot is in a frame: meters and radians."""
+    """The pose of the robot's base in a frame: meters and radians."""
 
     x: float
     y: float
@@ -68,21 +68,21 @@ class _Set:
     messages: KeptMessages
     is_static: bool
     frames: frozenset[str] | None = None
-    """None until the first was read."""
+    """None until the first message was read."""
 
 
 class TransformTrack:
-    """Knows how the frames of a robot moved in the last minute. One thread adds, any asks."""
+    """Tracks the robot's frames over the last minute. One thread adds, any thread reads."""
 
     def __init__(self, types: MessageTypes, robot: str) -> None:
-        """``robot`` is the last part of its namespace: where several robots share a tree, their frames begin with it."""
+        """``robot`` is the last part of its namespace: if several robots share a tree, it prefixes their frames."""
         self._types = types
         self._prefixes = (f'{robot}/', '') if robot else ('',)
         self._sets: Mapping[tuple[str | None, int, bytes], _Set] = {}
-        """By publisher, and by size and first frames of the message. Replaced as a whole."""
+        """By publisher, and by size and first frames of the message. Replaced atomically."""
 
     def add(self, topic: str, message: Taken) -> None:
-        """``topic`` is the full name: static transforms are those of ``tf_static``."""
+        """Add a message; ``topic`` is the full name: static transforms are on ``tf_static``."""
         key = message.publisher, len(message.cdr), _first_frames(message.cdr)
         found = self._sets.get(key)
         if found is None:
@@ -97,7 +97,7 @@ class TransformTrack:
         found.messages.add(message.stamp_ns, message.cdr)
 
     def at(self, stamp_ns: int) -> Placed | None:
-        """The base in the map, or otherwise in the frame of its odometry; None where neither is known at that time."""
+        """The base in the map, otherwise in its odometry frame; None if neither is known at that time."""
         by_frame: dict[str, list[_Set]] = {}
         for each in self._sets.values():
             if each.frames is None:
@@ -111,7 +111,7 @@ class TransformTrack:
         return None
 
     def _read(self, type_name: str, cdr: bytes) -> Mapping[str, Transform]:
-        """Transforms by frame; those that are not finite are ignored."""
+        """Transforms by frame; those that are not finite are skipped."""
         try:
             message = self._types.deserialize(type_name, cdr)
         except Rejected:
@@ -128,7 +128,7 @@ class TransformTrack:
 
 
 def _placed(by_frame: Mapping[str, list[_Set]], prefix: str, base: str, stamp_ns: int) -> Placed | None:
-    """Up the tree from the base: in the map if that is above it, otherwise in the frame of its odometry."""
+    """Walk up the tree from the base: in the map if that is above it, otherwise in its odometry frame."""
     frame, shift, turn = prefix + base, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     found = None
     for _ in range(MAX_DEPTH):
@@ -146,20 +146,20 @@ def _placed(by_frame: Mapping[str, list[_Set]], prefix: str, base: str, stamp_ns
 
 
 def _at(sets: list[_Set], frame: str, stamp_ns: int) -> Iterator[Transform]:
-    """The transform of a frame at a time, from each publisher that knows it."""
+    """The transform of a frame at a time, from each publisher of it."""
     for each in sets:
         if each.is_static:
             newest = each.messages.newest()
             if frame in newest:
                 yield newest[frame]
             continue
-        around = [(ns, value[frame]) for ns, value in each.messages.around(stamp_ns) if frame in value]
-        if around and (moved := _between(around, stamp_ns)) is not None:
+        nearby = [(ns, value[frame]) for ns, value in each.messages.nearby(stamp_ns) if frame in value]
+        if nearby and (moved := _between(nearby, stamp_ns)) is not None:
             yield moved
 
 
 def _between(found: list[tuple[int, Transform]], stamp_ns: int) -> Transform | None:
-    """Between or near two transforms of a frame."""
+    """Interpolate or extrapolate from two transforms of a frame."""
     (start_ns, a), (end_ns, b) = found[0], found[-1]
     is_odom = b.parent.rpartition('/')[2] == ODOM
     gap_ns, ahead_ns = (ODOM_GAP_NS, AHEAD_NS) if is_odom else (GAP_NS, GAP_NS)
@@ -176,7 +176,7 @@ def _between(found: list[tuple[int, Transform]], stamp_ns: int) -> Transform | N
 
 
 def _first_frames(cdr: bytes) -> bytes:
-    """The two names of the first transform, without deserializing the message; empty where there is none."""
+    """The two frame names of the first transform, without deserializing the message; empty if there is none."""
     if len(cdr) < 20 or cdr[1] > 1:
         return b''
     (length,) = _LENGTH[cdr[1]].unpack_from(cdr, 16)
@@ -188,7 +188,7 @@ def _first_frames(cdr: bytes) -> bytes:
 
 
 def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of two quaternions."""
+    """The product of two quaternions."""
     (ax, ay, az, aw), (bx, by, bz, bw) = a, b
     return np.array([
         aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,

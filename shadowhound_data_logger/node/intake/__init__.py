@@ -1,1 +1,1 @@
-"""From the middleware to the consumers: subscriptions, the takes, the sampling of each topic."""
+"""From the middleware to the consumers: subscriptions, takes, and sampling."""

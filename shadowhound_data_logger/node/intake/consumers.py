@@ -1,4 +1,4 @@
-"""The base class of every listener to the robot's messages, and what it is handed: all that the intake knows of its listeners."""
+"""The interface of consumers of the robot's messages. The intake knows its consumers only through it."""
 
 from __future__ import annotations
 
@@ -19,30 +19,31 @@ MAX_NAME: Final = 247
 
 
 class Drained(NamedTuple):
-    """What one drain took of a topic."""
+    """The messages of a topic from one drain."""
 
     topic: str
     type: str
     sensor: str
-    """The name of the sensor that has the topic; empty where none has."""
+    """The sensor of the topic; empty if it has none."""
     messages: Sequence[Taken]
-    """The oldest first, each with its sender where that is known; none came before. Where ``sensor`` is empty, numbered messages
-    may be repeats: whoever counts them leaves those out."""
+    """The oldest first, each with its publisher if known; no repeats. If ``sensor`` is empty, numbered messages may be repeats: a
+    consumer that counts them must skip those.
+    """
     lost: Losses
-    """What is estimated to have been lost before these messages, where they have no numbers; None where it is not known."""
+    """Estimated losses before these messages, if they have no sequence numbers; None if unknown."""
     now_s: float
-    """When they were drained, by the monotonic clock."""
+    """Time of the drain, by the monotonic clock."""
     paused: bool
-    """Whether messages are only counted now."""
+    """Whether messages are only counted at present."""
 
 
 def is_plain_name(topic: str) -> bool:
-    """Whether a full name is valid in ROS and not hidden (no part of it begins with ``_``)."""
+    """Whether a full name is valid in ROS and not hidden (no part starts with ``_``)."""
     return '/_' not in topic and len(topic) <= MAX_NAME and _FULL_NAME.fullmatch(topic) is not None
 
 
 class TopicChoice:
-    """Which topics a consumer wants, by its settings, the sensors and the graph. New for each set of settings."""
+    """Selects the topics of a consumer from its settings, the sensors and the graph. New for each set of settings."""
 
     def __init__(self, settings: BagSettings | EventSettings, named: Iterable[str]) -> None:
         """``named`` are the settings' topics as full names."""
@@ -51,24 +52,25 @@ class TopicChoice:
         self._exclude = re.compile(settings.exclude) if settings.exclude else None
 
     @property
-    def asks_graph(self) -> bool:
+    def needs_graph(self) -> bool:
         return self._regex is not None
 
     def names(self, topic: str) -> bool:
-        """Whether the settings name this very topic."""
+        """Whether the settings name this topic."""
         return topic in self._named
 
     def wanted(self, sensors: Iterable[str], graph: Iterable[str]) -> frozenset[str]:
-        """Full names; ``sensors`` are the topics that sensors take, ``graph`` all that there are (asked for a regex only)."""
+        """Full names; ``sensors`` are the topics of the sensors, ``graph`` all topics (needed only for a regex)."""
         if self._regex is None:
             return self._named or frozenset(sensors)
         return self._named | {topic for topic in graph if self._matches(topic)}
 
     def _matches(self, topic: str) -> bool:
-        """As rosbag2: any part of the name must match, and hidden topics (a part begins with ``_``) are left out.
+        """As rosbag2: a match anywhere in the name counts, and hidden topics (a part starts with ``_``) are skipped.
 
-        They are not left out if the expression itself has a ``/_``, as ``/_service_event$`` and ``/_action/`` have. Names that
-        are not valid in ROS, which other DDS programs may use, always are: nothing in ROS can subscribe to them.
+        They are not skipped if the expression itself contains ``/_``, as in ``/_service_event$`` and ``/_action/``. Names that
+        are
+        invalid in ROS, which other DDS programs may use, are always skipped: ROS cannot subscribe to them.
         """
         assert self._regex is not None
         is_hidden = '/_' in topic and '/_' not in self._regex.pattern
@@ -78,69 +80,69 @@ class TopicChoice:
 
 
 class Consumer(Protocol):
-    """Whoever listens to what the robot publishes: derive from it, and name it in ``Pipeline._make_stages``.
+    """A consumer of messages: derive from it, and add it in ``Pipeline._make_stages``.
 
-    The intake thread calls all of it, in the order in which messages came, and nothing in it may wait. One that raises in
-    ``choose`` or ``take`` does not get these messages; the others do, and ``failures`` counts it.
+    The intake thread makes all calls, in the order of the messages, and no call may block. If ``choose`` or ``take`` raises, only
+    this consumer misses these messages, and ``failures`` counts it.
     """
 
     wanted_topics: TopicChoice | None = None
-    """Which topics it wants; None for those that the sensors have."""
+    """The topics it wants; None for those of the sensors."""
     topics: frozenset[str] = frozenset()
-    """Of these, those that it gets now, by their full names. The intake sets them."""
+    """The wanted topics that it receives at present, as full names. Set by the intake."""
     from_start: bool = True
-    """Whether it listens to these as soon as the intake is open, or once ``Intake.listen`` says so."""
+    """Whether it receives them as soon as the intake is open, or only after ``Intake.listen``."""
     wants_latched: bool = False
-    """Whether it begins with what latched publishers of these sent before, with subscriptions of its own for that."""
+    """Whether it starts with what latched publishers sent before, through separate subscriptions."""
     failures: int = 0
-    """How often it failed to take messages."""
+    """Number of failures to take messages."""
     last_error: str = ''
 
     def enter(self, topic: str, type_name: str, sensor: str) -> None:  # noqa: ARG002
-        """Of sensors: messages of a sensor's topic begin here, of this type."""
+        """For sensors: messages of a sensor's topic start here, with this type."""
         return
 
     def choose(self, drained: Drained, account: TopicAccount) -> None:  # noqa: ARG002
-        """Of sensors, before ``take``: count in the topic's account what is not stored.
+        """For sensors, before ``take``: count in the topic's account what is not stored.
 
-        The lock of the accounts has been held since the messages were received, so that no commit sees the one without the
-        other: nothing but that is done here.
+        The lock of the accounts has been held since the messages were received, so that a commit sees both or neither. Do nothing
+        else here.
         """
         return
 
     def take(self, drained: Drained) -> None:
-        """Messages of one topic, and the gap before them."""
+        """Receive messages of one topic, and the gap before them."""
 
     def begin(self) -> None:
-        """It listens from now on; again without an ``end`` where something new begins for it here."""
+        """The consumer receives messages from now on. Called again without an ``end`` if something new starts."""
         return
 
     def leave(self, topic: str) -> None:  # noqa: ARG002 - for those who have something to do then
-        """The messages of the topic end here; should more come, they are of another type, or another beginning."""
+        """No more messages of the topic; later ones have another type or belong to another start."""
         return
 
     def tick(self, now_s: float) -> None:  # noqa: ARG002
-        """Each round, after the messages: do what is due without one."""
+        """Called each round, after the messages: do what is due without one."""
         return
 
     def flush(self) -> None:
-        """Hand on what was gathered, as if no further message came."""
+        """Pass on gathered messages, as if no more would arrive."""
         return
 
 
 def deliver(drained: Drained, consumers: Iterable[Consumer]) -> None:
-    """Each of them takes the messages, whatever happens to one."""
+    """Pass the messages to each consumer, even if one fails."""
     for consumer in consumers:
         try:
             consumer.take(drained)
-        except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
+        except Exception as error:  # noqa: BLE001 - a bug in one must not affect the others
             count_failure(consumer, drained.topic, error)
 
 
 def count_failure(consumer: Consumer, topic: str, error: Exception) -> None:
-    """Count it; the 1st, 10th, 100th, ... is said."""
+    """Count a failure; log the 1st, 10th, 100th, ..."""
     consumer.failures += 1
     consumer.last_error = f'{type(error).__name__}: {error}'
     if str(consumer.failures).strip('0') == '1':
-        text = '%s failed to take messages of %s (%d times so far); all other consumers get them: %s'
+        text = '%s failed to take messages of %s (%d times so far); all other consumers receive them: %s'
         log.error(text, type(consumer).__name__, topic, consumer.failures, error, exc_info=error)

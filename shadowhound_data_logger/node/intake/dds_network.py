@@ -1,8 +1,8 @@
-"""Which interfaces and peers the robot's DDS uses, and the Fast DDS profile that listens on the same ones.
+"""The interfaces and peers of the robot's DDS, and a Fast DDS profile that uses the same ones.
 
-Plain text in, plain text out: the variables of ROS and the configuration of Cyclone DDS on one side, XML for Fast DDS 2.6 to 3.x
-on the other. Sources: rmw_cyclonedds_cpp's ``check_create_domain``, Cyclone DDS's docs/manual/options.md, rcl's
-``discovery_options.c``, and DDSI-RTPS 2.2, 9.6.1.1, for the ports.
+Input: the variables of ROS and the configuration of Cyclone DDS. Output: XML for Fast DDS 2.6 to 3.x. Sources:
+rmw_cyclonedds_cpp's ``check_create_domain``, Cyclone DDS's docs/manual/options.md, rcl's ``discovery_options.c``, and
+DDSI-RTPS 2.2, 9.6.1.1, for the ports.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from xml.sax.saxutils import escape
 
 PORT_BASE, DOMAIN_GAIN, PARTICIPANT_GAIN, UNICAST_OFFSET = 7400, 250, 2, 10
 SPDP_GROUP: Final = '239.255.0.1'
-"""Where participants announce themselves by default."""
+"""The multicast group in which participants announce themselves by default."""
 MAX_INDEX: Final = 32
-"""The last participant of a machine that is announced to where there is no multicast; rmw_cyclonedds_cpp's own limit."""
+"""The highest participant index that is announced to without multicast; rmw_cyclonedds_cpp's own limit."""
 LOOPBACK: Final = '127.0.0.1'
 LOCALHOST_ONLY, RANGE, PEERS = 'ROS_LOCALHOST_ONLY', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS'
 CYCLONE_URI: Final = 'CYCLONEDDS_URI'
@@ -34,28 +34,28 @@ FOREIGN: Final = {
     'externaldomainid': 'Discovery/ExternalDomainId', 'externalnetworkaddress': 'General/ExternalNetworkAddress',
     'ignoredpartition': 'Partitioning/IgnoredPartitions', 'authentication': 'Security', 'keyfile': 'SSL',
 }  # fmt: skip
-"""Settings of Cyclone DDS that Fast DDS has no word for: who listens from there would find others, or nobody."""
+"""Settings of Cyclone DDS without an equivalent in Fast DDS: a listener would find other publishers, or none."""
 HARMLESS: Final = frozenset({'', 'auto', 'default', 'false', SPDP_GROUP})
-"""Values of them that change nothing."""
+"""Values of these that change nothing."""
 SIOCGIFCONF: Final = 0x8912
 IFREQ_BYTES: Final = 40
-"""netdevice(7), on machines of 64 bits: a name of 16 bytes, then an address that is its family, a port and four bytes."""
+"""netdevice(7), on 64-bit machines: a name of 16 bytes, then an address with family, port and four bytes."""
 _ADDRESS: Final = re.compile(r'(?P<host>[^\s:\[\]]+)(?::(?P<port>\d+))?')
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Where to look for publishers. ``interfaces`` are addresses of this machine; empty are all of them."""
+    """Where to look for publishers. ``interfaces`` are addresses of this machine; empty means all."""
 
     interfaces: tuple[str, ...] = ()
     multicast: bool = True
     peers: tuple[str, ...] = ()
-    """``host`` or ``host:port``, as they were given."""
+    """``host`` or ``host:port``, as given."""
     max_index: int = MAX_INDEX
     is_off: bool = False
-    """Nobody is to be found."""
+    """Discovery is off."""
     problem: str = ''
-    """Why Fast DDS cannot look where the robot does; empty where it can."""
+    """Why Fast DDS cannot use the robot's network; empty if it can."""
 
     def describe(self) -> str:
         """For a log line: ``on 127.0.0.1, without multicast, peers 10.0.0.5``."""
@@ -65,7 +65,7 @@ class Network:
 
 
 def robot_network(environ: Mapping[str, str], domain: int, *, has_range: bool) -> Network:
-    """That of a robot with Cyclone DDS. ``has_range``: its ROS knows ROS_AUTOMATIC_DISCOVERY_RANGE (Iron and later)."""
+    """The network of a robot with Cyclone DDS. ``has_range``: its ROS supports ROS_AUTOMATIC_DISCOVERY_RANGE (Iron and later)."""
     config = CycloneConfig(domain)
     for text in fragments(environ.get(CYCLONE_URI, '')):
         config.feed(text)
@@ -76,7 +76,7 @@ def robot_network(environ: Mapping[str, str], domain: int, *, has_range: bool) -
         peers += [peer for each in environ.get(PEERS, '').split(';') if (peer := each.strip())]
     names = config.interfaces or (['localhost'] if only and not has_range else [])
     here = addresses()
-    found = tuple(dict.fromkeys(address for name in names for address in _of(name, here)))
+    found = tuple(dict.fromkeys(address for name in names for address in _addresses_of(name, here)))
     problem = config.problem
     if names and not found and not problem:
         problem = f'{" and ".join(names)} of {CYCLONE_URI} has no IPv4 address here'
@@ -86,9 +86,9 @@ def robot_network(environ: Mapping[str, str], domain: int, *, has_range: bool) -
 
 
 def fragments(uri: str) -> Iterator[str]:
-    """The pieces of configuration that CYCLONEDDS_URI names or is; a file that cannot be read is none.
+    """The pieces of configuration in or named by CYCLONEDDS_URI; unreadable files are skipped.
 
-    It is a list, separated by commas, of XML and of files (``file:///etc/cyclonedds.xml`` or a bare path).
+    It is a comma-separated list of XML and files (``file:///etc/cyclonedds.xml`` or a bare path).
     """
     for piece in re.split(r',(?=\s*(?:<|file:|/))', uri):
         text = piece.strip()
@@ -97,12 +97,12 @@ def fragments(uri: str) -> Iterator[str]:
         elif text:
             try:
                 yield Path(text.removeprefix('file://')).read_text(encoding='utf-8')
-            except (OSError, ValueError):  # Cyclone DDS itself does not start then, and says so
+            except (OSError, ValueError):  # Cyclone DDS itself then fails to start and reports it
                 continue
 
 
 class CycloneConfig(HTMLParser):
-    """Reads what it needs of a configuration of Cyclone DDS, which knows no case and closes elements with ``</>`` as well."""
+    """Parses a configuration of Cyclone DDS, which is case-insensitive and also closes elements with ``</>``."""
 
     def __init__(self, domain: int) -> None:
         super().__init__()
@@ -143,13 +143,13 @@ class CycloneConfig(HTMLParser):
         elif tag == 'maxautoparticipantindex' and value.isdecimal():
             self.max_index = int(value)
         elif tag in {'transport', 'useipv6'} and lower not in {'default', 'udp', 'false'}:
-            self.problem = f'{CYCLONE_URI} has it talk {value if tag == "transport" else "IPv6"}'
+            self.problem = f'{CYCLONE_URI} makes it use {value if tag == "transport" else "IPv6"}'
         elif tag in FOREIGN and lower not in HARMLESS:
-            self.problem = f'{CYCLONE_URI} sets {FOREIGN[tag]}, which Fast DDS has no word for'
+            self.problem = f'{CYCLONE_URI} sets {FOREIGN[tag]}, which has no equivalent in Fast DDS'
 
 
 def addresses() -> list[tuple[str, str]]:
-    """(interface, IPv4 address) of this machine, those that are up."""
+    """(interface, IPv4 address) of each interface of this machine that is up."""
     room = 64
     while True:
         buffer = array.array('B', bytes(room * IFREQ_BYTES))
@@ -164,19 +164,19 @@ def addresses() -> list[tuple[str, str]]:
 
 
 def _outward() -> list[str]:
-    """The addresses by which other participants, of this machine too, know this machine; loopback where there is no other."""
+    """The addresses that other participants, also on this machine, use for this machine; loopback if there is no other."""
     own = [address for _, address in addresses()]
     return [address for address in own if not address.startswith('127.')] or own
 
 
-def _of(given: str, here: Sequence[tuple[str, str]]) -> list[str]:
-    """The addresses of this machine that the name of an interface, or an address, stands for."""
+def _addresses_of(given: str, here: Sequence[tuple[str, str]]) -> list[str]:
+    """The addresses of this machine for the name of an interface, or an address."""
     wanted = LOOPBACK if given == 'localhost' else given
     return [address for name, address in here if wanted in {name.partition(':')[0], address}]
 
 
 def _resolve(host: str) -> list[str]:
-    """Its IPv4 addresses; none where it is not known."""
+    """Its IPv4 addresses; empty if it cannot be resolved."""
     try:
         return list(dict.fromkeys(str(entry[4][0]) for entry in socket.getaddrinfo(host, None, socket.AF_INET)))
     except (OSError, UnicodeError):
@@ -184,9 +184,9 @@ def _resolve(host: str) -> list[str]:
 
 
 def announced_to(network: Network, domain: int) -> list[tuple[str, int]]:
-    """(address, port) of everybody who is told that we are there; empty where the default, multicast, does."""
+    """(address, port) of every participant that is announced to; empty if the default, multicast, is used."""
     is_inside = bool(network.interfaces) and all(address.startswith('127.') for address in network.interfaces)
-    if network.is_off or (network.multicast and not network.peers and not is_inside):  # some have no multicast inside a machine
+    if network.is_off or (network.multicast and not network.peers and not is_inside):  # some machines have no local multicast
         return []
     base = PORT_BASE + DOMAIN_GAIN * domain
     ports = [base + UNICAST_OFFSET + PARTICIPANT_GAIN * index for index in range(network.max_index + 1)]
@@ -201,14 +201,14 @@ def announced_to(network: Network, domain: int) -> list[tuple[str, int]]:
 
 
 def profile(receive_bytes: int, network: Network | None = None, domain: int = 0, *, segment_bytes: int = 0) -> str:
-    """A profile for Fast DDS: a receive buffer, shared memory where it has a size, and the interfaces and peers of a network."""
+    """A Fast DDS profile: a receive buffer, shared memory if it has a size, and the interfaces and peers of a network."""
     udp = [f'<receiveBufferSize>{receive_bytes}</receiveBufferSize>']
     builtin: list[str] = []
     if network is not None:
         allowed = network.interfaces or ([] if network.multicast else _outward())
         if allowed:
             udp.append(_wrap('interfaceWhiteList', (f'<address>{address}</address>' for address in allowed)))
-        if not network.multicast:  # keeps it from listening to multicast; Fast DDS 2 completes it by the white list
+        if not network.multicast:  # keeps it from listening to multicast; Fast DDS 2 completes it from the whitelist
             builtin.append('<metatrafficUnicastLocatorList><locator><udpv4/></locator></metatrafficUnicastLocatorList>')
         peers = announced_to(network, domain)
         if peers:
@@ -236,8 +236,9 @@ PROPERTIES: Final = """
         <propertiesPolicy><properties>
           <property><name>fastdds.type_propagation</name><value>disabled</value></property>
         </properties></propertiesPolicy>"""
-"""Types match by their names. Fast DDS 3 describes them as well, and so does a driver that is not a ROS;
-where the two cannot be compared (that of sensor_msgs/Image, for one) they never match."""
+"""Types match by name. Fast DDS 3 also exchanges type descriptions, and so do drivers without ROS; types that cannot be compared
+(sensor_msgs/Image, for one) never match.
+"""
 TRANSPORT: Final = """
       <transport_descriptor><transport_id>shadowhound_{name}</transport_id><type>{kind}</type>{rest}</transport_descriptor>"""
 TEMPLATE: Final = """\
@@ -274,7 +275,8 @@ TEMPLATE: Final = """\
   </profiles>
 </dds>
 """
-"""Announcements: docs/decisions/0004-announce-often.md; where each goes to many ports there are fewer of them.
+"""Announcements: docs/decisions/0004-announce-often.md; with many ports there are fewer of them.
 
-A reader begins with room for one message; as rmw_fastrtps has it, each takes 88 KB before its first.
-Its policy is not DYNAMIC: with Fast DDS 3.2.3 a take then crashed the process, mostly after it had been stopped and went on."""
+A reader starts with memory for one message; with rmw_fastrtps's default, each takes 88 KB before its first.
+Its policy is not DYNAMIC: with Fast DDS 3.2.3 a take then crashed the process, mostly after it had been stopped and continued.
+"""

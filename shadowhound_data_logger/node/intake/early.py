@@ -1,6 +1,6 @@
-"""Subscriptions that exist before the rest of the node is loaded, so that a start loses as little as possible.
+"""Subscriptions that are created before the rest of the node is loaded, so that a start loses as little as possible.
 
-Loading the node and recovering its spool take about a second. The middleware keeps what these subscriptions receive during that
+Loading the node and recovering its spool takes about a second. The middleware keeps what these subscriptions receive during that
 time (2 s of it, ``ros.endpoints.STALL_S``), and the intake takes it from there.
 """
 
@@ -17,13 +17,13 @@ from shadowhound_data_logger.ros.reader import PolledGroup, Reader, Subscription
 
 
 class EarlyReaders:
-    """A pair of subscriptions for each sensor whose first topic has one type, which match any publisher of it.
+    """Two subscriptions for each sensor whose first topic has one type; together they match any publisher of it.
 
-    Lifecycle: made by the main thread; from then on the intake thread owns it: ``adopt`` in any number, ``close`` once.
+    Lifecycle: made by the main thread, then owned by the intake thread: ``adopt`` any number, ``close`` once.
     """
 
     def __init__(self, node: Node, sensors: Iterable[SensorSettings]) -> None:
-        """Skips types that are not installed and subscriptions that the middleware refuses: the intake reports them."""
+        """Skips types that are not installed and subscriptions that the middleware rejects: the intake reports them."""
         self.group = PolledGroup()
         self._readers: dict[tuple[str, str], list[Reader]] = {}
         for sensor in sensors:
@@ -38,11 +38,11 @@ class EarlyReaders:
                     continue
 
     def adopt(self, topic: str, type_name: str) -> list[Reader]:
-        """The subscriptions of a topic under this type, which the caller closes; none the second time."""
+        """The subscriptions of a topic with this type, which the caller closes; empty on the second call."""
         return self._readers.pop((topic, type_name), [])
 
     def close(self) -> None:
-        """End those that were not adopted: their sensors listen to another topic or type. Idempotent."""
+        """Close those that were not adopted, because their sensors use another topic or type. Idempotent."""
         while self._readers:
             for reader in self._readers.popitem()[1]:
                 reader.close()

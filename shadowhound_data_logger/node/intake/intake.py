@@ -1,7 +1,7 @@
 """The intake thread: it alone creates, drains and destroys subscriptions, on its own clock (docs/decisions/0010).
 
-What it takes of a topic goes to its consumers (``consumers.Consumer``), in order; it knows none of them. Nothing here
-touches disk or network or parses a message.
+It passes the messages of a topic to its consumers (``consumers.Consumer``) in order. Nothing here touches disk or network or
+parses a message.
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ from shadowhound_data_logger.node.intake.consumers import Consumer
 from shadowhound_data_logger.node.intake.early import EarlyReaders
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
 from shadowhound_data_logger.node.intake.found_topics import FoundTopics
-from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberStatus, Surroundings
+from shadowhound_data_logger.node.intake.subscriber import OtherTypes, Subscriber, SubscriberContext, SubscriberStatus
 from shadowhound_data_logger.ros.endpoints import POLL_S, alternatives
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 
 REFRESH_S: Final = 0.5
-"""How often the graph is looked at: some 80 us a topic."""
+"""Interval between checks of the graph, which take some 80 us per topic."""
 PATIENCE_S: Final = 5.0
-"""A round that lasts longer is stuck: a drain takes milliseconds, a first subscription a tenth of a second."""
+"""A round that lasts longer is stuck: a drain takes milliseconds, a first subscription 0.1 s."""
 
 
 class Intake:
-    """Takes all messages, on one thread, and hands them to the consumers.
+    """Takes all messages, on one thread, and passes them to the consumers.
 
-    New; open once; close once. The thread does what is asked of it between two drains.
+    New; open once; close once. The thread handles requests between two drains.
 
-    ``sensors`` are the settings in force, shared with consumers and encoders; while it runs, this thread alone replaces entries.
+    ``sensors`` are the current settings, shared with consumers and encoders; at run time only this thread replaces entries.
     """
 
     def __init__(self, node: Node, sensors: dict[str, SensorSettings], accounts: Accounts, types: MessageTypes,  # noqa: PLR0913 - its neighbors
                  stamps: StampRule, consumers: Sequence[Consumer], *, first: Callable[[SensorSettings], bool] = lambda _: False,
                  found: FoundTopics | None = None, early: EarlyReaders | None = None) -> None:  # fmt: skip
-        """``consumers`` get what is taken; one that wants topics besides those of the sensors shares what those before it have.
+        """``consumers`` receive the messages; one that wants topics besides those of the sensors shares those of earlier
+        consumers.
 
         ``first`` selects sensors that are drained before all others; ``found`` finds sensors in the graph; ``early`` are
         subscriptions that exist already.
@@ -55,44 +56,44 @@ class Intake:
         self._consumers = consumers
         self._found = found
         self._early = early
-        self._around = around = Surroundings(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
+        self._context = context = SubscriberContext(node, early.group if early else PolledGroup(), accounts, types, stamps, early)
         self._others = OtherTypes(node, accounts)
-        self._subscribers = tuple(Subscriber(around, sensor, consumers, self._others) for sensor in sensors.values())
+        self._subscribers = tuple(Subscriber(context, sensor, consumers, self._others) for sensor in sensors.values())
         self._is_first = first
         self._by_turn = self._in_turn()
         pairs = [pair for sensor in sensors.values() for pair in zip(sensor.topics, sensor.types, strict=False)]
         named = {node.resolve_topic_name(topic): name for topic, name in pairs if name and len(alternatives(name)) == 1}
-        self._extra = [ExtraTopics(around, consumers[place:], named)
+        self._extra = [ExtraTopics(context, consumers[place:], named)
                        for place, consumer in enumerate(consumers) if consumer.wanted_topics is not None]  # fmt: skip
         self._listening = [extra for extra in self._extra if extra.consumer.from_start]
         self._requests: deque[Callable[[], None]] = deque()
         self._wake = threading.Event()
         self._next_poll_s = self._next_refresh_s = 0.0
         self.paused = False
-        """Whether messages are counted only; set by the thread."""
+        """Whether messages are only counted; set by the thread."""
         self.worker = Worker('intake', self._step, patience_s=PATIENCE_S)
 
     @property
     def topics(self) -> Sequence[str]:
-        """The resolved topics of sensors that it listens to, or would."""
+        """The resolved topics of sensors that it subscribes to, or would."""
         return [subscriber.topic for subscriber in self._subscribers if subscriber.sensor.enabled]
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """All resolved topics of the sensors that are enabled, with the type that the settings name for each, or nothing."""
+        """All resolved topics of the enabled sensors, with the type that the settings name for each, or ''."""
         return {topic: name for one in self._subscribers if one.sensor.enabled for topic, name in one.wanted.items()}
 
     @property
     def _unsampled(self) -> Sequence[Subscriber]:
-        """Of topics that no sensor has."""
+        """Subscribers to topics that no sensor has."""
         return [subscriber for extra in self._extra for subscriber in extra.own]
 
     def consumer_failures(self) -> Mapping[str, tuple[int, str]]:
-        """Of each consumer that failed to take messages: how often, and the newest error."""
+        """For each consumer that failed to take messages: the count, and the newest error."""
         return {type(each).__name__: (each.failures, each.last_error) for each in self._consumers if each.failures}
 
     def left_out(self, consumer: Consumer) -> int:
-        """Topics that a consumer would have by an expression, and does not: there are too many."""
+        """Number of topics that match a consumer's expression but are skipped, because there are too many."""
         return next((extra.left_out for extra in self._extra if extra.consumer is consumer), 0)
 
     @property
@@ -110,41 +111,41 @@ class Intake:
         self.worker.start()
 
     def close(self, deadline_s: float) -> bool:
-        """Take what waits, have it all handed on, end the subscriptions and the thread; False if that failed or took too long."""
+        """Take what waits, flush it to the consumers, close subscriptions and the thread; False if that failed or timed out."""
         if self.worker.stopping:
             return True
-        finished = self._ask(self._finish, deadline_s)
+        finished = self._call(self._finish, deadline_s)
         self.worker.stop()
         self._wake.set()
         return self.worker.join(deadline_s) and finished
 
     def flush(self, deadline_s: float, then: Callable[[], None] | None = None) -> bool:
-        """Take what waits, and have the consumers hand on what they gathered; False if that failed or took too long.
+        """Take what waits, and flush the consumers; False if that failed or timed out.
 
-        ``then`` is called by the thread: what comes after it is of another time.
+        ``then`` is called by the thread between earlier and later messages.
         """
-        return self._ask(partial(self._flush, then), deadline_s)
+        return self._call(partial(self._flush, then), deadline_s)
 
     def pause(self, deadline_s: float, *, paused: bool) -> bool:
-        """From now on count and drop what comes, or store it again; False if that failed or took too long."""
+        """From now on only count messages, or store them again; False if that failed or timed out."""
         return self.flush(deadline_s, partial(self._set_paused, paused=paused))
 
     def listen(self, consumer: Consumer, on: bool, deadline_s: float) -> bool:
-        """From now on a consumer with a choice gets its topics, or nothing more; False if that failed or took too long.
+        """Start or stop passing messages to a consumer that selects topics; False if that failed or timed out.
 
-        ``on`` while it is on already: something new begins for it here. What came before is taken before.
+        ``on`` while it is on already starts again: earlier messages are taken first.
         """
         extra = next(extra for extra in self._extra if extra.consumer is consumer)
-        return self._ask(partial(self._listen, extra, on), deadline_s)
+        return self._call(partial(self._listen, extra, on), deadline_s)
 
     def update(self, sensors: Iterable[SensorSettings]) -> None:
-        """Go on by these settings soon; sensors that are not among them stay as they are."""
+        """Apply these settings soon; sensors that are not among them stay unchanged."""
         self._post(partial(self._update, tuple(sensors)))
 
-    # -- what the thread does --------------------------------------------------------------------------------------
+    # -- on the thread ---------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """One round: wait for the next poll, follow the graph, drain every topic, do what was asked for."""
+        """One round: wait for the next poll, follow the graph, drain every topic, handle requests."""
         self._wake.wait(max(0.0, self._next_poll_s - time.monotonic()))
         self._wake.clear()
         now_s = time.monotonic()
@@ -153,7 +154,7 @@ class Intake:
         if refreshes := now_s >= self._next_refresh_s:
             self._next_refresh_s = now_s + REFRESH_S
             todo += [partial(self._find, now_s), *(partial(subscriber.refresh, now_s) for subscriber in self._by_turn)]
-        if refreshes and self._early is not None:  # after the first look at the graph
+        if refreshes and self._early is not None:  # after the first check of the graph
             todo.append(self._early.close)
             self._early = None
         todo += [partial(subscriber.drain, now_s) for subscriber in (*self._by_turn, *self._unsampled)]
@@ -168,10 +169,10 @@ class Intake:
             self._requests.popleft()()
 
     def _find(self, now_s: float) -> None:
-        """Sensors of topics that the settings do not name; they are subscribed to at the next look."""
+        """Add sensors for topics that the settings do not name; they are subscribed to at the next refresh."""
         for sensor in self._found.poll(self._sensors, now_s) if self._found is not None else ():
             self._sensors[sensor.name] = sensor
-            subscriber = Subscriber(self._around, sensor, self._consumers, self._others)
+            subscriber = Subscriber(self._context, sensor, self._consumers, self._others)
             subscriber.paused = self.paused
             self._subscribers = (*self._subscribers, subscriber)
             self._by_turn = self._in_turn()
@@ -198,7 +199,7 @@ class Intake:
         self._next_refresh_s = now_s
 
     def _listen(self, extra: ExtraTopics, on: bool) -> None:
-        """What came before is drained first: it is not of what begins, or the last of what ends."""
+        """Drain first: earlier messages belong to what ended, not to what starts."""
         now_s = time.monotonic()
         self._drain(now_s)
         is_on = extra in self._listening
@@ -230,8 +231,8 @@ class Intake:
         self._requests.append(request)
         self._wake.set()
 
-    def _ask(self, request: Callable[[], None], deadline_s: float) -> bool:
-        """Whether the thread did it in time and without a failure; it still does it when that takes longer."""
+    def _call(self, request: Callable[[], None], deadline_s: float) -> bool:
+        """Whether the thread did it in time and without a failure; if it takes longer, it still does it."""
         done = threading.Event()
         succeeded: list[bool] = []
 
@@ -247,16 +248,16 @@ class Intake:
 
 
 def until_poll(wall_s: float) -> float:
-    """Seconds from a poll to the next one, which is halfway between two multiples of ``POLL_S``: a quarter of that at least.
+    """Seconds until the next poll, which is halfway between two multiples of ``POLL_S``; at least a quarter of that.
 
-    What the sensors keep once a second then comes with one poll, 0.1 s after the second begins, and is one burst for the spool:
-    by then every topic of 10 Hz or more has sent its first message.
+    The once-per-second messages of all sensors then arrive with one poll, 0.1 s after the full second, and are one burst for the
+    spool: by then every topic of 10 Hz or more has sent its first message.
     """
     return POLL_S - ((wall_s - POLL_S / 4) % POLL_S - POLL_S / 4)
 
 
 def _each(steps: Sequence[Callable[[], None]]) -> None:
-    """Do all of them in this order, whatever happens to one; what one raised is raised in the end."""
+    """Call all of them in order, even if one raises; its exception is raised at the end."""
     with ExitStack() as stack:
         for step in reversed(steps):
             stack.callback(step)

@@ -1,7 +1,7 @@
-"""Chooses the RMW by which the node listens, from the robot's environment and before ROS is loaded, and configures it.
+"""Chooses the RMW for the node's subscriptions, from the robot's environment and before ROS is loaded, and configures it.
 
-RTPS numbers every sample, and Fast DDS hands the number on whoever sent it; Cyclone DDS keeps it to itself. So a robot with
-Cyclone DDS is listened to through Fast DDS, where that hears at least as much (docs/decisions/0017).
+RTPS numbers every sample. Fast DDS passes on the number, whatever the sender; Cyclone DDS does not. So the node listens to a
+robot with Cyclone DDS through Fast DDS, if that receives at least as much (docs/decisions/0017).
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ RMW: Final = 'RMW_IMPLEMENTATION'
 FAST_DDS, CYCLONE_DDS = 'rmw_fastrtps_cpp', 'rmw_cyclonedds_cpp'
 SETTING: Final = 'capture.rmw'
 FROM_PROFILE: Final = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
-"""Has rmw_fastrtps leave to the profile how readers and writers keep memory."""
+"""Makes rmw_fastrtps take the memory policy of readers and writers from the profile."""
 MEASURED: Final = {(6, 2): 'Humble', (8, 4): 'Jazzy', (9, 3): 'Kilted'}
-"""Versions of rmw_fastrtps_cpp through which all was heard of a robot with Cyclone DDS that its own RMW hears."""
+"""Versions of rmw_fastrtps_cpp that were measured to receive as much from a robot with Cyclone DDS as its own RMW."""
 FAST_DDS_3: Final = (9, 0)
 HAS_RANGE: Final = (7, 0)
-"""Versions of rmw_fastrtps_cpp: the first with Fast DDS 3, and the first that knows ROS_AUTOMATIC_DISCOVERY_RANGE."""
+"""Versions of rmw_fastrtps_cpp: the first with Fast DDS 3, and the first that supports ROS_AUTOMATIC_DISCOVERY_RANGE."""
 MAX_BUFFER: Final = 32 * MEBI
-"""Bytes of a receive buffer beyond which more is no use: two seconds of raw images. The kernel takes it only as it is filled."""
+"""Maximum useful receive buffer, bytes: two seconds of raw images. The kernel allocates it only as it fills."""
 SEGMENT: Final = 32 * MEBI
-"""Bytes of shared memory, as in the profile for drivers: what runs beside the node may publish images."""
+"""Bytes of shared memory, as in the profile for drivers: programs next to the node may publish images."""
 MEMORY: Final = '/dev/shm'  # noqa: S108 - where Fast DDS keeps its segments, too
 SO_MEMINFO: Final = 55
 MEMINFO: Final = struct.Struct('9I')
@@ -48,28 +48,28 @@ RECEIVE, DROPS = 1, 8
 
 @dataclass(frozen=True, slots=True)
 class Middleware:
-    """How the node listens. Made by ``choose``; ``enter`` once, before ROS is loaded; the node is made while ``profiled``."""
+    """How the node listens. Made by ``choose``; ``enter`` once, before ROS is loaded; create the node within ``profiled``."""
 
     asked: str
-    """Of the parameter ``capture.rmw``."""
+    """The parameter ``capture.rmw``."""
     robot: str
     """The RMW of the robot's environment."""
     rmw: str
     """The RMW of the node."""
     why: str
     network: Network | None = None
-    """Where it looks for publishers; None where that is the RMW's own business."""
+    """Where it looks for publishers; None if the RMW decides."""
     domain: int = 0
     variables: Mapping[str, str | None] = field(default_factory=dict)
-    """What differs for the node from the robot's environment; None is not set."""
+    """Variables that differ between the node and the robot's environment; None means unset."""
     profile_variable: str = ''
-    """What names our profile; empty where there is none of ours."""
+    """The variable that names our profile; empty if it is not used."""
     has_robot: bool = True
-    """Whether the RMW of the robot is installed here as well, so that a front can speak it."""
+    """Whether the robot's RMW is installed here as well, so that a front process can use it."""
 
     @property
     def is_foreign(self) -> bool:
-        """Whether the robot speaks another RMW: topics cross, services and parameters do not."""
+        """Whether the robot uses another RMW: topics interoperate, services and parameters do not."""
         return self.rmw != self.robot
 
     def enter(self, environ: MutableMapping[str, str]) -> None:
@@ -82,7 +82,7 @@ class Middleware:
 
     @contextmanager
     def profiled(self, environ: MutableMapping[str, str]) -> Iterator[None]:
-        """While a participant is made: our profile is in a file of this user alone, and named in the environment."""
+        """While a participant is created: our profile is in a private file, and named in the environment."""
         if not self.profile_variable:
             yield
             return
@@ -113,16 +113,16 @@ class Middleware:
 
 @dataclass(frozen=True, slots=True)
 class Sockets:
-    """What the kernel says of the UDP sockets of this process."""
+    """The kernel's view of this process's UDP sockets."""
 
     receive_bytes: int
-    """The largest receive buffer that one of them asked for and got; DDS gives all that it listens on the same."""
+    """The largest receive buffer that one of them obtained; DDS uses one size for all its sockets."""
     dropped: int
-    """Datagrams that found no room in them."""
+    """Datagrams that they dropped."""
 
 
 def requested_rmw(arguments: Sequence[str]) -> str:
-    """The parameter ``capture.rmw`` of the command line. Whatever is wrong with it is told when ROS has read it as well."""
+    """The parameter ``capture.rmw`` on the command line. Errors in it are reported when ROS reads it."""
     try:
         given = parameter(arguments, SETTING)
     except ParametersUnreadable:
@@ -131,14 +131,14 @@ def requested_rmw(arguments: Sequence[str]) -> str:
 
 
 def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
-    """The decision. Raises SettingError where it is asked for what cannot be."""
+    """Choose the RMW. Raises SettingError if the requested one cannot be used."""
     versions = dict(_installed(environ))
     robot = environ.get(RMW) or (FAST_DDS if FAST_DDS in versions or len(versions) != 1 else next(iter(versions)))
     version = versions.get(FAST_DDS, (0, 0))
     domain = int(given) if (given := environ.get('ROS_DOMAIN_ID', '')).isdecimal() else 0
     if robot.startswith('rmw_fastrtps'):
-        ours = _ours(environ, version)
-        variables: dict[str, str | None] = _of_memory(version) if ours else {}
+        ours = _profile_variable(environ, version)
+        variables: dict[str, str | None] = _memory_variables(version) if ours else {}
         return Middleware(asked, robot, robot, "the robot's own", variables=variables, profile_variable=ours)
     if asked == RMW_ROBOT:
         return Middleware(asked, robot, robot, f"the robot's own, by {SETTING}")
@@ -152,27 +152,29 @@ def choose(asked: str, environ: Mapping[str, str]) -> Middleware:
     if asked != RMW_FASTRTPS and problem:
         return Middleware(asked, robot, robot, f"the robot's own: {problem}")
     variables = {RMW: FAST_DDS}
-    ours = _ours(environ, version)
+    ours = _profile_variable(environ, version)
     if ours:
-        variables |= _of_memory(version) | {
+        variables |= _memory_variables(version) | {
             LOCALHOST_ONLY: None,
             PEERS: None,
             RANGE: 'OFF' if network.is_off else 'SYSTEM_DEFAULT',
         }
-    measured = f', by {SETTING}, though {problem}' if problem else f', and was measured with {MEASURED[version]} to hear as much'
-    why = 'Fast DDS hands on the numbers of its messages' + measured
+    measured = (
+        f', by {SETTING}, though {problem}' if problem else f', and was measured with {MEASURED[version]} to receive as much'
+    )
+    why = 'Fast DDS reports the sequence numbers of its messages' + measured
     return Middleware(asked, robot, FAST_DDS, why, network if ours else None, domain, variables, ours, robot in versions)
 
 
 def possible_buffer() -> int:
-    """Bytes of the largest receive buffer that the kernel gives a socket here (net.core.rmem_max), at most MAX_BUFFER."""
+    """The largest receive buffer that the kernel grants here (net.core.rmem_max), at most MAX_BUFFER."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, MAX_BUFFER)
         return probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel doubles it, socket(7)
 
 
 def sockets() -> Sockets:
-    """Of this process, now: what the middleware obtained, not what it was told to ask for."""
+    """The sockets at present: what the middleware obtained, not what it requested."""
     rows = list(_memory())
     return Sockets(max((row[RECEIVE] // 2 for row in rows), default=0), sum(row[DROPS] for row in rows))
 
@@ -186,17 +188,17 @@ def _memory() -> Iterator[tuple[int, ...]]:
             with socket.socket(fileno=os.dup(int(path.name))) as found:
                 if found.type is socket.SOCK_DGRAM and found.family in {socket.AF_INET, socket.AF_INET6}:
                     yield MEMINFO.unpack(found.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size))
-        except OSError:  # closed meanwhile
+        except OSError:  # closed since
             continue
 
 
 def _folder() -> str:
-    """For a file of some seconds: memory, which is there when the disk is full, else where temporary files go."""
+    """A folder for a short-lived file: in memory if possible, in case the disk is full, otherwise for temporary files."""
     return MEMORY if os.access(MEMORY, os.W_OK | os.X_OK) else tempfile.gettempdir()
 
 
 def _installed(environ: Mapping[str, str]) -> Iterator[tuple[str, tuple[int, int]]]:
-    """(RMW, version as major and minor) of what is in the sourced prefixes; the one that counts comes last."""
+    """(RMW, major and minor version) of the RMWs in the sourced prefixes; the effective one is last."""
     for prefix in reversed(environ.get('AMENT_PREFIX_PATH', '').split(':')):
         folder = Path(prefix or '/nowhere') / 'share'
         for mark in folder.glob('ament_index/resource_index/rmw_typesupport/*'):
@@ -210,24 +212,24 @@ def _installed(environ: Mapping[str, str]) -> Iterator[tuple[str, tuple[int, int
             yield mark.name, (int(match[1]), int(match[2])) if match else (0, 0)
 
 
-def _ours(environ: Mapping[str, str], version: tuple[int, int]) -> str:
-    """The variable that is to name our profile; empty where the operator told Fast DDS its transports."""
+def _profile_variable(environ: Mapping[str, str], version: tuple[int, int]) -> str:
+    """The variable for our profile; empty if the operator configured Fast DDS transports."""
     name = PROFILE_FILES[version >= FAST_DDS_3]
     theirs = environ.get(name)
     return '' if environ.get(TRANSPORTS) or (theirs and Path(theirs).name != SHIPPED) else name
 
 
-def _of_memory(version: tuple[int, int]) -> dict[str, str | None]:
-    """What has the profile decide of memory; measured with Fast DDS 3 alone."""
+def _memory_variables(version: tuple[int, int]) -> dict[str, str | None]:
+    """Lets the profile decide about memory; only measured with Fast DDS 3."""
     return {FROM_PROFILE: '1'} if version >= FAST_DDS_3 else {}
 
 
 def _impossible(robot: str, versions: Mapping[str, tuple[int, int]], environ: Mapping[str, str]) -> str:
-    """Why Fast DDS cannot listen to this robot at all; empty where it can."""
+    """Why Fast DDS cannot listen to this robot; empty if it can."""
     if robot != CYCLONE_DDS:
-        return f'Fast DDS does not speak to {robot}'
+        return f'Fast DDS does not interoperate with {robot}'
     if FAST_DDS not in versions:
         return f'{FAST_DDS} is not installed'
     if environ.get('ROS_SECURITY_ENABLE', '').lower() == 'true':
-        return 'ROS_SECURITY_ENABLE is true, and whether the two exchange secured messages has not been measured'
+        return 'ROS_SECURITY_ENABLE is true, and secured messages between the two have not been tested'
     return ''

@@ -1,7 +1,7 @@
-"""Decides which messages of the sensors' topics are kept, and which become one object: the first decisions after the take.
+"""Selects messages of the sensors' topics and groups them into batches: the first decision after the take.
 
-Plain Python, owned by the intake thread. A rule keeps messages or skips them, a ``Batcher`` puts together what becomes one
-object, the ``Sampler`` does both for each sensor and hands the batches to the encoders.
+Plain Python, owned by the intake thread. A rule keeps or skips a message, a ``Batcher`` collects the messages of one object, and
+the ``Sampler`` does both for each sensor and passes the batches to the encoders.
 """
 
 from __future__ import annotations
@@ -23,45 +23,46 @@ from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.topic_account import PAUSED, TopicAccount
 
 QUEUE_FULL: Final = 'queue_full'
-"""Why samples are dropped that the encoders' queue has no room for."""
+"""The reason for samples dropped because the encoders' queue is full."""
 SAMPLER_FAILED: Final = 'sampler_failed'
-"""Why messages are dropped of which a defect kept the sampler from choosing."""
+"""The reason for messages dropped because of a bug in the sampler."""
 STEP_BACK_NS: Final = 10 * SECOND
-"""Stamps further back than this are a clock that was set or a bag that was started again, not jitter."""
+"""Stamps further back than this mean a clock that was set or a bag that was restarted, not jitter."""
 STAMP_END: Final = 12
-"""Where a message's content begins after the CDR encapsulation (4) and the stamp of its header (8)."""
+"""Offset of a message's content after the CDR encapsulation (4) and the stamp of its header (8)."""
 
 MAX_BATCH_BYTES: Final = 4 << 20
-"""A batch is closed early at this size, so that memory is bounded whatever a topic sends; as JSON it is four times as large."""
+"""A batch is closed early at this size, so that memory is bounded for any topic; as JSON it is four times as large."""
 MAX_ARCHIVE_BYTES: Final = 16 << 20
-"""The same where messages stay about as large as they are. A second of the Go2's camera or clouds is 2 to 6 MB, of raw images
-27 MB. One such batch may be open, as much again be in the making in each encoder, and the queue holds four."""
+"""The same for formats that stay about as large as the messages. A second of the Go2's camera or clouds is 2 to 6 MB, of raw
+images 27 MB. One such batch may be open, one more in each encoder, and the queue holds four.
+"""
 MAX_BATCH_MESSAGES: Final = 10_000
-"""The same for messages so small that their bytes say little; the queue holds five such batches."""
+"""The same for messages so small that their size says little; the queue holds five such batches."""
 MAX_CLOCKS: Final = 8
-"""Clocks on one topic with a rule and a batch of their own; further ones share those of the first."""
+"""Maximum clocks on one topic with separate rules and batches; further ones share those of the first."""
 GRACE_S: Final = 2 * POLL_S
-"""How late the last message of a window may come."""
+"""How late the last message of a window may arrive."""
 
 
 class KeepRule(Protocol):
-    """Decides which messages are kept, one at a time, in the order of arrival."""
+    """Decides which messages are kept, one at a time, in order of arrival."""
 
     def keep(self, stamp_ns: int, cdr: bytes) -> bool:
         """Whether this message is stored."""
 
 
 class EveryMessage:
-    """Keeps all."""
+    """Keeps every message."""
 
     def keep(self, stamp_ns: int, cdr: bytes) -> bool:  # noqa: ARG002 - the Protocol's arguments
         return True
 
 
 class FirstOfPeriod:
-    """Keeps the first message of each whole period of UTC, so that a key by the period is unique.
+    """Keeps the first message of each whole period of UTC, so that a key with the period is unique.
 
-    ``last_kept_ns`` is the stamp of the newest durable sample: a restart inside a period keeps nothing of it twice.
+    ``last_kept_ns`` is the stamp of the newest durable sample: after a restart within a period nothing is kept twice.
     """
 
     def __init__(self, period_ns: int, last_kept_ns: int = 0) -> None:
@@ -78,10 +79,11 @@ class FirstOfPeriod:
 
 
 class OnChange:
-    """Keeps a message whose content, but for the stamp of its header, differs from the last one kept.
+    """Keeps a message whose content, except for its header's stamp, differs from the last one kept.
 
-    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with it is that one, sent again to whoever
-    subscribes, as latched messages are.
+    ``last_kept_ns`` is the stamp of the newest durable sample: a first message with this stamp is the same one, delivered again,
+    as
+    latched messages are.
     """
 
     def __init__(self, *, has_header: bool, last_kept_ns: int = 0) -> None:
@@ -108,7 +110,7 @@ def rule_for(sensor: SensorSettings, *, has_header: bool, last_kept_ns: int) -> 
 class Batcher:
     """Collects the open batch of one topic: one message each, or whole windows of ``batch_s`` in UTC.
 
-    A late sample joins the open batch; a clock that was set begins a new one.
+    A late sample joins the open batch; after the clock was set, a new batch starts.
     """
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str) -> None:
@@ -116,8 +118,8 @@ class Batcher:
         self._topic = topic
         self._type = type_name
         self._window_ns = round(sensor.batch_s * 1e9)
-        self._longest_s = sensor.batch_s
-        self._most = MAX_BATCH_MESSAGES if sensor.batch_s else 1
+        self._batch_s = sensor.batch_s
+        self._max_bytes = MAX_BATCH_MESSAGES if sensor.batch_s else 1
         self.max_bytes = MAX_ARCHIVE_BYTES if sensor.format in ARCHIVES else MAX_BATCH_BYTES
         self._samples: list[Sample] = []
         self.size = 0
@@ -126,7 +128,7 @@ class Batcher:
         self._opened_s = 0.0
 
     def add(self, sample: Sample, now_s: float) -> list[Batch]:
-        """Take a sample; returns the batches that are closed by it, in order (mostly none, at most two)."""
+        """Add a sample; returns the batches that it closes, in order (usually none, at most two)."""
         closed: list[Batch] = []
         window = sample.stamp_ns // self._window_ns if self._window_ns else 0
         if self._samples and (window > self._window or _is_elsewhere(sample.stamp_ns, self._samples[0].stamp_ns)):
@@ -136,24 +138,24 @@ class Batcher:
             self._opened_s = now_s
         self._samples.append(sample)
         self.size += len(sample.cdr)
-        if len(self._samples) == self._most or self.size >= self.max_bytes:
+        if len(self._samples) == self._max_bytes or self.size >= self.max_bytes:
             closed.append(self.close())
         return closed
 
     def is_due(self, now_s: float, grace_s: float) -> bool:
-        """Whether the window is over by the monotonic clock, though no message of the next one came."""
-        return bool(self._samples) and now_s - self._opened_s >= self._longest_s + grace_s
+        """Whether the window has ended by the monotonic clock, although no message of the next one arrived."""
+        return bool(self._samples) and now_s - self._opened_s >= self._batch_s + grace_s
 
     def __len__(self) -> int:
         return len(self._samples)
 
     @property
     def first_ns(self) -> int:
-        """Stamp of the first open sample; 0 without any."""
+        """Stamp of the first open sample; 0 if there is none."""
         return self._samples[0].stamp_ns if self._samples else 0
 
     def close(self) -> Batch:
-        """The open samples as a batch; there must be some."""
+        """The open samples as a batch; there must be at least one."""
         batch = Batch(self._sensor, self._topic, self._type, tuple(self._samples), self.size)
         self._samples = []
         self.size = 0
@@ -161,10 +163,10 @@ class Batcher:
 
 
 class Sampler(Consumer):
-    """Chooses which messages of the sensors' topics are logged, and batches them. New; ``take`` what the intake drained."""
+    """Selects the messages of the sensors' topics to log, and batches them. New; ``take`` what the intake drained."""
 
     def __init__(self, sensors: Mapping[str, SensorSettings], accounts: Accounts, types: MessageTypes, queue: BatchQueue) -> None:
-        """``sensors`` are the settings in force, by name; ``queue`` gets the batches."""
+        """``sensors`` are the current settings, by name; batches are put into ``queue``."""
         self._sensors = sensors
         self._accounts = accounts
         self._types = types
@@ -172,10 +174,10 @@ class Sampler(Consumer):
         self._sampled: dict[str, _Sampled] = {}
         self._kept_ns: dict[str, int] = {}
         self.idle = False
-        """Whether nobody wants the data now: messages are counted and skipped."""
+        """Whether the data is not needed at present: messages are counted and skipped."""
 
     def set_idle(self, *, idle: bool) -> None:
-        """Before the intake is open, or by its thread."""
+        """Call it before the intake is open, or on its thread."""
         self.idle = idle
 
     def enter(self, topic: str, type_name: str, sensor: str) -> None:
@@ -195,8 +197,8 @@ class Sampler(Consumer):
             sampled.kept_ns = kept[-1][1].stamp_ns
             sampled.open_ns = sampled.open_ns or kept[0][1].stamp_ns
         if drained.paused:
-            heard = account.gaps.newest
-            account.drop(PAUSED, len(messages), heard if any(heard) else messages[0].times, messages[-1].times)
+            received = account.gaps.newest
+            account.drop(PAUSED, len(messages), received if any(received) else messages[0].times, messages[-1].times)
         else:
             account.skipped += len(messages) - len(kept)
 
@@ -224,7 +226,7 @@ class Sampler(Consumer):
             self._close(sampled)
 
     def tick(self, now_s: float) -> None:
-        """Close the batches whose time is over, though no message of the next one came."""
+        """Close the batches whose window has ended, although no message of the next one arrived."""
         for sampled in self._sampled.values():
             self._close(sampled, now_s)
 
@@ -234,7 +236,7 @@ class Sampler(Consumer):
             self._close(sampled)
 
     def _close(self, sampled: _Sampled, due_s: float | None = None) -> None:
-        """Close the open batches; with ``due_s`` only those that are due at that time."""
+        """Close the open batches; with ``due_s`` only those due at that time."""
         closed = sampled.close(due_s)
         for batch in closed:
             self._offer(batch)
@@ -242,40 +244,40 @@ class Sampler(Consumer):
             sampled.open_ns = sampled.first_open_ns()
 
     def oldest_open(self) -> dict[str, int]:
-        """Topic -> the first stamp of what was kept of it and is not encoded yet; from any thread."""
-        # A batch goes from here to the queue, so this order sees each of them.
+        """Topic -> the first stamp of its kept messages that are not encoded yet; from any thread."""
+        # A batch moves from here to the queue, so this order misses none.
         found = {topic: sampled.open_ns for topic, sampled in list(self._sampled.items()) if sampled.open_ns}
         for topic, first_ns in self._queue.oldest().items():
             found[topic] = min(first_ns, found.get(topic, first_ns))
         return found
 
     def _offer(self, batch: Batch) -> None:
-        """To the encoders; what their queue has no room for is dropped."""
+        """Put the batch into the encoders' queue; what does not fit is dropped."""
         for lost in self._queue.put(batch, self._sensors[batch.sensor].priority):
             samples = lost.samples
             self._accounts.drop(lost.topic, QUEUE_FULL, len(samples), samples[0].times, samples[-1].times)
 
 
 _Chosen = tuple[str | None, Sample]
-"""A message that is kept, and the clock that it follows (``Taken.clock``)."""
+"""A kept message, and the clock that it follows (``Taken.clock``)."""
 
 
 class _Sampled:
-    """One topic and type of a sensor. Each clock that its publishers follow has a rule and a batch of its own."""
+    """One topic and type of a sensor. Each clock that its publishers follow has a separate rule and batch."""
 
     def __init__(self, sensor: SensorSettings, topic: str, type_name: str, has_header: bool, kept_ns: int) -> None:
         self.kept_ns = kept_ns
-        """Stamp of the newest message that was kept: no period is stored twice."""
+        """Stamp of the newest kept message: no period is stored twice."""
         self.open_ns = 0
-        """Stamp of the first message that was kept and is not in the queue yet; 0 where there is none."""
+        """Stamp of the first kept message that is not in the queue yet; 0 if there is none."""
         self.chosen: Sequence[_Chosen] = ()
-        """Of the drain under way, what is kept."""
+        """Messages kept from the current drain."""
         self._topic, self._type, self._has_header = topic, type_name, has_header
         self._clocks: dict[str | None, _Sampling] = {}
         self._sensor = sensor
 
     def of(self, clock: str | None) -> _Sampling:
-        """What messages of a clock go through."""
+        """The rule and batcher for a clock."""
         found = self._clocks.get(clock)
         if found is None:
             for name, each in list(self._clocks.items()):
@@ -288,7 +290,7 @@ class _Sampled:
         return found
 
     def add(self, clock: str | None, sample: Sample, now_s: float) -> list[Batch]:
-        """Take a sample that is kept; returns the batches that are closed by it."""
+        """Add a kept sample; returns the batches that it closes."""
         batcher = self.of(clock).batcher
         closed = batcher.add(sample, now_s)
         if len(self._clocks) > 1 and sum(each.batcher.size for each in self._clocks.values()) >= batcher.max_bytes:
@@ -296,7 +298,7 @@ class _Sampled:
         return closed
 
     def close(self, due_s: float | None = None) -> list[Batch]:
-        """The open batches; with ``due_s`` those that are due at that time."""
+        """The open batches; with ``due_s`` those due at that time."""
         batchers = [each.batcher for each in self._clocks.values() if len(each.batcher)]
         return [batcher.close() for batcher in batchers if due_s is None or batcher.is_due(due_s, GRACE_S)]
 
@@ -305,7 +307,7 @@ class _Sampled:
         return min((each.batcher.first_ns for each in self._clocks.values() if len(each.batcher)), default=0)
 
     def follow(self, sensor: SensorSettings) -> None:
-        """Use other settings from now on; the open batches stay."""
+        """Apply other settings; the open batches stay."""
         if sensor.rate_hz != self._sensor.rate_hz and not sensor.on_change:
             for each in self._clocks.values():
                 each.rule = self._rule(sensor)
@@ -317,7 +319,7 @@ class _Sampled:
 
 @dataclass(slots=True)
 class _Sampling:
-    """What the messages of one clock go through."""
+    """The rule and batcher for one clock."""
 
     rule: KeepRule
     batcher: Batcher

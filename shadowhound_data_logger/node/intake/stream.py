@@ -1,7 +1,7 @@
-"""The messages of one topic and type on their way from the take to its consumers. Plain Python, owned by the intake thread.
+"""The messages of one topic and type between take and consumers. Plain Python, owned by the intake thread.
 
-A stream names who sent each message, leaves out what came twice, and estimates what was lost between messages without numbers.
-What is left goes to the consumers of the topic (``consumers.py``).
+A stream identifies the publisher of each message, skips repeats, and estimates losses between messages without sequence
+numbers. The rest is passed to the consumers of the topic (``consumers.py``).
 """
 
 from __future__ import annotations
@@ -26,24 +26,25 @@ from shadowhound_data_logger.spool.gaps import EXACT
 log = logging.getLogger(__name__)
 
 MAX_RECENT: Final = 10_000
-"""Messages without a sender's gid that are remembered, to know what a second subscription delivers again."""
+"""Remembered messages without a publisher's gid, to detect what a second subscription delivers again."""
 DEAD_S: Final = 15.0
-"""A publisher that was killed stays in the graph for less: Cyclone DDS gives it up after ten seconds."""
+"""A publisher that was killed stays in the graph for less: Cyclone DDS drops it after ten seconds."""
 NEW_S: Final = 2.0
-"""The graph may know a publisher so long before its first message is taken, and its predecessor's last one."""
+"""How long the graph may know a publisher before its first message is taken, and its predecessor's last one."""
 
 
 class Senders:
-    """Who sent a message, where the middleware gives its number but not its sender's gid (Jazzy and older).
+    """Identifies the publisher of a message if the middleware reports its number but not its gid (Jazzy and older).
 
-    With one publisher in the graph it is that one. Its successor is told from it before the graph shows the change: its
-    numbers start again while the time of sending goes on. When the old numbers go on as well, there are two of them.
+    With one publisher in the graph it is that one. Its successor is detected before the graph shows the change: its numbers
+    restart
+    while the time of sending advances. If the old numbers continue as well, there are two publishers.
     """
 
     def __init__(self) -> None:
         self.gids: list[str] = []
         self.changed_s = -inf
-        """When one came that was not there before, by the monotonic clock; the first ones are not counted."""
+        """When the last new publisher appeared, by the monotonic clock; the first ones do not count."""
         self.several_s: float | None = None
         """Since when there are several."""
         self._successors = 0
@@ -52,7 +53,7 @@ class Senders:
         self._sent_ns = 0
 
     def poll(self, gids: list[str], now_s: float = 0.0) -> None:
-        """What the graph says now."""
+        """Update the publishers from the graph."""
         self.several_s = None if len(gids) < 2 else now_s if self.several_s is None else self.several_s
         if gids and gids != self.gids:
             if self.gids and not set(gids) <= set(self.gids):
@@ -61,7 +62,7 @@ class Senders:
             self._successors = 0
 
     def name(self, number: int | None, sent_ns: int) -> str | None:
-        """A name for the sender of this message; None where there is more than one, or no number."""
+        """The publisher of this message; None if there is more than one, or no number."""
         if number is None or len(self.gids) != 1:
             return None
         if self._successors and self._number < self._number_before < number:
@@ -75,15 +76,15 @@ class Senders:
 
 
 class RecentMessages:
-    """What came lately without a sender's gid, to know what a second of our subscriptions delivers again."""
+    """Recent messages without a publisher's gid, to detect what a second subscription delivers again."""
 
     def __init__(self) -> None:
         self._recent: dict[tuple[int, int], None] = {}
 
     def has(self, message: Taken) -> bool:
-        """Whether it came already: sent at the same time, same number or content.
+        """Whether it was received before: same time of sending, same number or content.
 
-        Asked also while the graph knows one sender, whose name the middleware does not give: a second one may appear.
+        Also called while the graph has one publisher, whose gid the middleware does not report: a second one may appear.
         """
         mark = (message.source_ns, crc32(message.cdr) if message.number is None else message.number)
         if mark in self._recent:
@@ -95,24 +96,24 @@ class RecentMessages:
 
 
 class Arrivals:
-    """When messages without numbers came, as an estimate of what is lost between them wants to know it."""
+    """Arrival times of messages without numbers, for estimating losses."""
 
     def __init__(self) -> None:
-        self._heard_s: float | None = None
-        self._looked_s: float | None = None
+        self._received_s: float | None = None
+        self._polled_s: float | None = None
 
     def poll(self, now_s: float) -> None:
-        """All that waited was taken."""
-        self._looked_s = now_s
+        """Everything that waited was taken."""
+        self._polled_s = now_s
 
-    def hear(self, senders: Senders, now_s: float) -> ArrivalContext:
-        """Some came."""
-        looked_s = now_s if self._looked_s is None else self._looked_s
-        since_s = now_s if self._heard_s is None else self._heard_s
-        self._heard_s = now_s
+    def arrived(self, senders: Senders, now_s: float) -> ArrivalContext:
+        """Messages arrived."""
+        polled_s = now_s if self._polled_s is None else self._polled_s
+        since_s = now_s if self._received_s is None else self._received_s
+        self._received_s = now_s
         is_only = len(senders.gids) == 1
         return ArrivalContext(
-            now_s=now_s, silent_s=max(0.0, looked_s - since_s), is_only=is_only,
+            now_s=now_s, silent_s=max(0.0, polled_s - since_s), is_only=is_only,
             gid=senders.gids[0] if is_only else '',
             is_shared=senders.several_s is not None and now_s - senders.several_s > DEAD_S,
             has_new=senders.changed_s > since_s - NEW_S,
@@ -120,7 +121,7 @@ class Arrivals:
 
 
 class MessageTimes:
-    """The times of one topic's messages: when they were sent, and their stamps if these can be trusted (``core/stamps.py``)."""
+    """The times of one topic's messages: time of sending, and stamps if they can be trusted (``core/stamps.py``)."""
 
     def __init__(self, type_name: str, types: MessageTypes, stamps: StampRule) -> None:
         self._has_header = types.has_header(type_name)
@@ -128,7 +129,7 @@ class MessageTimes:
         self._tracks = StampTracks(stamps)
 
     def date(self, message: Taken, publisher: str | None) -> tuple[Taken, Sequence[str]]:
-        """The message with its publisher and its times, and why the arrival had to stand in for one of these."""
+        """The message with its publisher and its times, and the reasons why its arrival replaced one of these."""
         cdr, source_ns, _, _, received_ns, *_ = message
         stamp_ns = header_stamp_ns(cdr) if self._has_header else 0
         track = self._tracks.of(publisher)
@@ -142,7 +143,7 @@ class MessageTimes:
         return known._replace(source_ns=sent.ns), tuple({sent.refused, dated.refused} - {''})
 
     def report(self) -> StampReport | None:
-        """What is unusual about the stamps now."""
+        """Unusual stamps at present."""
         return self._tracks.report()
 
 
@@ -150,7 +151,7 @@ class TopicStream:
     """A topic that no sensor has: its consumers count what they want of it. New for each topic and type."""
 
     def __init__(self, topic: str, type_name: str, types: MessageTypes, stamps: StampRule, consumers: Sequence[Consumer]) -> None:
-        """The first of ``consumers`` gets all of it, the others as far as the topic is one of theirs."""
+        """The first of ``consumers`` receives everything, the others only if they want the topic."""
         self._topic = topic
         self._type = type_name
         self._owner, self._others = consumers[0], consumers[1:]
@@ -160,7 +161,7 @@ class TopicStream:
         self._estimate = TopicEstimate()
 
     def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
-        """Hand on messages, in the order in which they came."""
+        """Pass on messages, in order of arrival."""
         fresh: list[Taken] = []
         unnumbered: dict[str, list[int]] = {}
         for message in taken:
@@ -171,17 +172,17 @@ class TopicStream:
             fresh.append(self._times.date(message, publisher)[0])
             if publisher is None or number is None:
                 unnumbered.setdefault(gid or '', []).append(source_ns)
-        lost = self._estimate.observe(unnumbered, self._arrivals.hear(senders, now_s)).lost if unnumbered else None
+        lost = self._estimate.observe(unnumbered, self._arrivals.arrived(senders, now_s)).lost if unnumbered else None
         if fresh:
             drained = Drained(self._topic, self._type, '', fresh, lost, now_s, paused)
             deliver(drained, [self._owner, *(each for each in self._others if self._topic in each.topics)])
 
     def poll(self, now_s: float) -> None:
-        """All that waited was taken."""
+        """Everything that waited was taken."""
         self._arrivals.poll(now_s)
 
     def close(self) -> None:
-        """No more of it comes."""
+        """No more messages arrive."""
         self._owner.leave(self._topic)
         for consumer in self._others:
             if self._topic in consumer.topics:
@@ -199,8 +200,8 @@ class SensorStream:
         self._type = type_name
         self._entry = accounts.entry(topic)
         self._consumers = consumers
-        self._of_sensors = [consumer for consumer in consumers if consumer.wanted_topics is None]
-        self._of_own_topics = [consumer for consumer in consumers if consumer.wanted_topics is not None]
+        self._sensor_consumers = [consumer for consumer in consumers if consumer.wanted_topics is None]
+        self._topic_consumers = [consumer for consumer in consumers if consumer.wanted_topics is not None]
         self._recent = RecentMessages()
         self._arrivals = Arrivals()
         self._counter: CounterField | None = None
@@ -208,11 +209,11 @@ class SensorStream:
         with self._entry as account:
             account.type = type_name
             account.estimate.expect(self._expected(sensor, types))
-        for consumer in self._of_sensors:
+        for consumer in self._sensor_consumers:
             consumer.enter(topic, type_name, sensor.name)
 
     def _expected(self, sensor: SensorSettings, types: MessageTypes) -> Expectation:
-        """What is declared of the sensor's messages: a counter in them, else how often they come."""
+        """The expected messages of the sensor: a counter in them, otherwise their rate."""
         if sensor.counter:
             try:
                 self._counter = types.counter(self._type, sensor.counter)
@@ -222,7 +223,7 @@ class SensorStream:
         return Expectation(period=SECOND / sensor.expected_hz if sensor.expected_hz else 0.0)
 
     def add(self, taken: Sequence[Taken], senders: Senders, now_s: float, *, paused: bool) -> None:
-        """Count messages, in the order in which they came, and hand on those that are not repeats."""
+        """Count messages, in order of arrival, and pass on those that are not repeats."""
         fresh: list[Taken] = []
         unnumbered: dict[str, list[int]] = {}
         counter, date = self._counter, self._times.date
@@ -242,33 +243,35 @@ class SensorStream:
                 if publisher is None or number is None:
                     unnumbered.setdefault(gid or '', []).append(source_ns if counter is None else counter.read(cdr))
             newest = fresh[-1].times if fresh else NO_TIMES
-            lost = account.observe(unnumbered, self._arrivals.hear(senders, now_s), newest) if unnumbered else None
+            lost = account.observe(unnumbered, self._arrivals.arrived(senders, now_s), newest) if unnumbered else None
             is_refuted = bool(unnumbered) and account.estimate.refuted
             if fresh:
                 drained = Drained(self._topic, self._type, self._sensor, fresh, lost, now_s, paused)
-                for consumer in self._of_sensors:
+                for consumer in self._sensor_consumers:
                     try:
                         consumer.choose(drained, account)
-                    except Exception as error:  # noqa: BLE001 - a defect of one is none of the others'
+                    except Exception as error:  # noqa: BLE001 - a bug in one must not affect the others
                         failed[consumer] = error
                 account.gaps.newest = newest
                 account.stamps = self._times.report()
         if is_refuted and not self._is_refuted:
             self._is_refuted = True
-            text = '%s: messages come more often than expected_hz says: their rate is learned instead'
+            text = '%s: messages arrive more often than expected_hz: their rate is learned instead'
             log.warning(text, self._topic)
         for consumer, defect in failed.items():
             count_failure(consumer, self._topic, defect)
         if fresh:
-            deliver(drained, [each for each in self._of_sensors if each not in failed] if failed else self._of_sensors)
-            deliver(drained, [each for each in self._of_own_topics if self._topic in each.topics])
+            deliver(
+                drained, [each for each in self._sensor_consumers if each not in failed] if failed else self._sensor_consumers
+            )
+            deliver(drained, [each for each in self._topic_consumers if self._topic in each.topics])
 
     def poll(self, now_s: float) -> None:
-        """All that waited was taken."""
+        """Everything that waited was taken."""
         self._arrivals.poll(now_s)
 
     def close(self) -> None:
-        """No more of it comes."""
+        """No more messages arrive."""
         for consumer in self._consumers:
             if consumer.wanted_topics is None or self._topic in consumer.topics:
                 consumer.leave(self._topic)

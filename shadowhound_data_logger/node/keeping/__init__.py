@@ -1,1 +1,1 @@
-"""What stays on the robot until it is requested, and the rules that uploads wait for."""
+"""Objects kept on the robot until requested, and the rules that uploads wait for."""

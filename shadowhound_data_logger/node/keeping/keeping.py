@@ -1,4 +1,4 @@
-"""Which of the node's objects stay on the robot until somebody asks for them, and the previews of them that are sent at once."""
+"""Decides which objects stay on the robot until requested, and creates their previews, which are uploaded immediately."""
 
 from __future__ import annotations
 
@@ -22,49 +22,49 @@ from shadowhound_data_logger.core.untrusted import open_image
 log = logging.getLogger(__name__)
 
 PREVIEW_BYTES: Final = 5 << 10
-"""Of a preview, at most: with one a second 41 kbit/s a camera."""
+"""Maximum size of a preview: one per second is 41 kbit/s per camera."""
 PREVIEW_SIZE: Final = 192, 192
-"""Pixels that a preview fits into."""
+"""Maximum size of a preview in pixels."""
 DECODED_SIZE: Final = 160, 120
-"""A JPEG is decoded at a half, a quarter or an eighth of its size, of which this still is a part: 640 x 480 at a quarter."""
+"""A JPEG is decoded at 1/2, 1/4 or 1/8 of its size, not below this: 640 x 480 at 1/4."""
 QUALITIES: Final = (60, 40, 20)
 PRIORITY: Final = 2
-"""Of previews: they are what somebody chooses by."""
+"""Priority of previews: they are what users choose by."""
 _UNREADABLE: Final = (OSError, ValueError, zipfile.BadZipFile, tarfile.TarError, LookupError, NotImplementedError)
 
 
 class Keeping:
-    """Marks what is uploaded on request, and makes previews of it.
+    """Marks objects to be uploaded on request, and creates their previews.
 
-    New; ``mark`` and ``preview`` from any thread, after the mission's marks. ``_lock`` guards when previews were made.
+    New; ``mark`` and ``preview`` from any thread, after the mission's marks. ``_lock`` guards the times of previews.
     """
 
     def __init__(self, settings: KeepSettings, sensors: Mapping[str, SensorSettings], robot: str) -> None:
-        """``sensors`` are the settings in force."""
+        """``sensors`` are the current settings."""
         self._always = always_shipped(settings)
         self._period_ns = round(settings.preview_s * SECOND)
         self._sensors = sensors
         self._robot = robot
         self._lock = threading.Lock()
         self._periods: dict[str, int] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def mark(self, item: DataObject) -> DataObject:
-        """The object, with the mark if it stays here."""
+        """The object, marked if it is kept."""
         sensor = self._sensors.get(item.sensor)
         if sensor is None or sensor.ship != ON_REQUEST or item.metadata.get(meta.MISSION_TYPE) in self._always:
             return item
         return replace(item, metadata={**item.metadata, meta.SHIP: meta.ON_REQUEST})
 
     def preview(self, item: DataObject) -> DataObject | None:
-        """A small picture of an object that stays here, the first of each period; None of anything else."""
+        """A preview of a kept object, for the first of each period; otherwise None."""
         if not item.is_on_request or item.held or not isinstance(item.body, bytes) or not self._is_due(item):
             return None
         try:
-            body = _small(_picture(item.body, item.content_type))
+            body = _preview_jpeg(_image_in(item.body, item.content_type))
         except _UNREADABLE as error:
-            if item.sensor not in self._told:
-                self._told.add(item.sensor)
+            if item.sensor not in self._logged:
+                self._logged.add(item.sensor)
                 log.warning('there are no previews of %s: %s', item.sensor, error)
             return None
         if body is None:
@@ -90,18 +90,18 @@ class Keeping:
 
 
 def keeps_bag(settings: BagSettings, keep: KeepSettings, state: BagState) -> bool:
-    """Whether the slices of a bag stay on the robot until somebody asks for them; those of events never do."""
+    """Whether the slices of a bag are kept until requested; those of events never are."""
     mission = state.mission
     return settings.ship == ON_REQUEST and (mission is None or mission.type not in always_shipped(keep))
 
 
 def always_shipped(settings: KeepSettings) -> frozenset[str]:
-    """Types of missions of which nothing stays on the robot."""
+    """Types of missions whose data is never kept back."""
     return frozenset(filter(None, settings.missions))
 
 
-def _picture(body: bytes, content_type: str) -> bytes | None:
-    """The picture that an object is, or the first of an archive; None where it has none."""
+def _image_in(body: bytes, content_type: str) -> bytes | None:
+    """The image in an object, or the first image of an archive; None if there is none."""
     if content_type in {'image/jpeg', 'image/png'}:
         return body
     if content_type == 'application/zip':
@@ -116,11 +116,11 @@ def _picture(body: bytes, content_type: str) -> bytes | None:
     return None
 
 
-def _small(picture: bytes | None) -> bytes | None:
-    """The picture as a JPEG of at most ``PREVIEW_BYTES``; None for one that has no colors or greys, such as depth."""
-    if picture is None:
+def _preview_jpeg(image: bytes | None) -> bytes | None:
+    """The image as a JPEG of at most ``PREVIEW_BYTES``; None if it has neither color nor gray, such as depth."""
+    if image is None:
         return None
-    with open_image(picture) as opened:
+    with open_image(image) as opened:
         if opened.mode not in {'RGB', 'L', 'RGBA', 'P'}:
             return None
         opened.draft('RGB', DECODED_SIZE)

@@ -1,4 +1,4 @@
-"""Judges the rules that uploads wait for (``upload.when`` and its like) by messages, network, time and mission."""
+"""Evaluates the rules that uploads wait for (``upload.when`` and others) from messages, network, time and mission."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ from shadowhound_data_logger.node.recording.mission_observer import number_at
 log = logging.getLogger(__name__)
 
 STALE_S: Final = 60.0
-"""A number is unknown again where no newer message came for so long, unless its publisher is latched and there."""
+"""A value becomes unknown after this long without a message, unless its publisher is latched and present."""
 KEEP_WHEN: Final = 'keep.when'
 INTERFACES: Final = Path('/sys/class/net')
 SSID_BYTES: Final = 32
 """IEEE 802.11-2020, 9.4.2.2."""
 _SIOCGIWESSID: Final = 0x8B1B
-"""linux/wireless.h: the name of the network of an interface, which anybody may ask for."""
+"""linux/wireless.h: reads the SSID of an interface, without special rights."""
 
 
 class NewestMessages(Consumer):
-    """Keeps the newest message of each topic that rules ask. ``take`` by the intake, the rest by any thread."""
+    """Keeps the newest message of each topic used in rules. ``take`` by the intake, the rest by any thread."""
 
     def __init__(self, topics: Collection[str]) -> None:
-        """Full names, one at least."""
+        """Full names, at least one."""
         self.wanted_topics = TopicChoice(EventSettings(), topics)
         self.newest: dict[str, tuple[str, Taken, float]] = {}
-        """Topic -> type, message, and when it was drained by the monotonic clock."""
+        """Topic -> type, message, and time of the drain by the monotonic clock."""
 
     def take(self, drained: Drained) -> None:
         self.newest[drained.topic] = drained.type, drained.messages[-1], drained.now_s
 
 
 class UploadRules:
-    """Says once a second which rules do not hold, and why.
+    """Reports once per second which rules are not true, and why.
 
     New; ``poll`` on the main thread.
     """
@@ -71,30 +71,30 @@ class UploadRules:
         self._mission = mission
         topics = {node.resolve_topic_name(topic) for rule in self._rules.values() for topic in rule.topics()}
         self._messages = NewestMessages(topics) if topics else None
-        self._closed: Mapping[str, str] = dict.fromkeys(self._rules, 'it has not been judged yet')
+        self._closed: Mapping[str, str] = dict.fromkeys(self._rules, 'it has not been evaluated yet')
         self._unpublished_since_s: dict[str, float] = {}
         self.stuck: Mapping[str, str] = {}
-        """Rules that do not hold since nobody has published what they ask for a while: what to do. Replaced as a whole."""
+        """Rules that are not true because their topics have had no publisher for a while: what to do. Replaced atomically."""
 
     @property
     def consumers(self) -> Sequence[Consumer]:
-        """That the intake serves: none where no rule asks a topic."""
+        """The consumers for the intake; empty if no rule uses a topic."""
         return () if self._messages is None else (self._messages,)
 
     @property
     def closed(self) -> Mapping[str, str]:
-        """The rules that do not hold: why. At first none does, because nothing is known."""
+        """The rules that are not true: why. Initially all, because nothing is known."""
         return self._closed
 
     def poll(self) -> Mapping[str, str]:
-        """Judge them; returns ``closed``."""
+        """Evaluate the rules; returns ``closed``."""
         now_s, closed = time.monotonic(), {}
         for name, rule in self._rules.items():
             holds, why = rule.evaluate(self, now_s)
             if not holds:
                 closed[name] = why
             if holds is (name in self._closed):
-                log.info('%s %s: %s', name, 'holds' if holds else 'does not hold', why)
+                log.info('%s %s: %s', name, 'holds' if holds else 'is not true', why)
         self._closed = closed
         stuck = {name: text for name in closed if (text := self._stuck(name, now_s))}
         for name, text in stuck.items():
@@ -104,7 +104,7 @@ class UploadRules:
         return closed
 
     def _stuck(self, rule: str, now_s: float) -> str:
-        """Why a rule that does not hold never will: its topics without a publisher for ``STALE_S``; empty if it may."""
+        """Why a rule can never become true: its topics had no publisher for ``STALE_S``; empty if it can."""
         topics = sorted(map(self._node.resolve_topic_name, self._rules[rule].topics()))
         for topic in topics:
             if self._node.count_publishers(topic):
@@ -114,20 +114,20 @@ class UploadRules:
             return ''
         return f'{rule} waits for {", ".join(silent)}, which nobody publishes: start what publishes it, or change {rule}'
 
-    # -- what rules ask ----------------------------------------------------------------------------------------------
+    # -- the facts of rules ------------------------------------------------------------------------------------------
 
     def number(self, topic: str, path: Sequence[str]) -> float | str:
         full = self._node.resolve_topic_name(topic)
         found = self._messages.newest.get(full) if self._messages is not None else None
         if found is None:
-            return f'no message of {full} came yet'
-        type_name, message, heard_s = found
+            return f'no message of {full} was received yet'
+        type_name, message, received_s = found
         offered = profiles_offered(self._node, full, type_name)
-        age_s = time.monotonic() - heard_s
+        age_s = time.monotonic() - received_s
         if not offered:
-            return f'nobody publishes {full} any more'
+            return f'{full} is no longer published'
         if age_s > STALE_S and not any(int(each.durability) == int(DurabilityPolicy.TRANSIENT_LOCAL) for each in offered):
-            return f'no message of {full} came for {age_s:.0f} s'
+            return f'no message of {full} for {age_s:.0f} s'
         try:
             value = number_at(self._types.deserialize(type_name, message.cdr), list(path))
         except Rejected as error:
@@ -149,9 +149,9 @@ class UploadRules:
 
 
 def wifi_networks(interfaces: Path = INTERFACES, ask: Callable[..., Any] = fcntl.ioctl) -> Collection[str] | str:
-    """Names of the WiFi networks that this machine is in; a text says why they are not known.
+    """Names of the WiFi networks that this machine is connected to; a text with the reason if they are unknown.
 
-    By wireless extensions, which the kernel offers for cfg80211 as well (CONFIG_CFG80211_WEXT); no rights are needed.
+    Uses wireless extensions, which the kernel also offers for cfg80211 (CONFIG_CFG80211_WEXT); no special rights are needed.
     """
     try:
         names = sorted(path.name for path in interfaces.iterdir() if (path / 'wireless').is_dir() or (path / 'phy80211').exists())
@@ -165,7 +165,7 @@ def wifi_networks(interfaces: Path = INTERFACES, ask: Callable[..., Any] = fcntl
             try:
                 ask(asked.fileno(), _SIOCGIWESSID, request, True)
             except OSError as error:
-                failed = f'the system does not tell the network of {name}: {error.strerror}'
+                failed = f'the system does not report the network of {name}: {error.strerror}'
             else:
                 found.add(essid.tobytes()[:SSID_BYTES].rstrip(b'\0').decode('utf-8', 'replace'))
     return failed if failed and not found else found - {''}

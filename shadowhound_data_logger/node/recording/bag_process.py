@@ -1,9 +1,9 @@
-"""Records one bag by hand, beside whatever else runs, and delivers it. A separate process.
+"""Records one bag on request and uploads it, in a separate process.
 
-    python -m shadowhound_data_logger.node.recording.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
+   python -m shadowhound_data_logger.node.recording.bag_process NAME --duration 60 [--topic /imu ...] [--regex ...]
 
-Its last line on standard output is JSON: what became of the bag. ``bags.record`` starts it, for the command line and for agents.
-Recorded is as the node does it, slice by slice into the spool, with subscriptions of its own; SIGINT ends it early, and whole.
+Its last line on standard output is JSON: the result. ``bags.record`` starts it, for the command line and for agents. It records
+as the node does, slice by slice into the spool, with separate subscriptions; SIGINT ends it early with a complete bag.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ from shadowhound_data_logger.stores.base import ObjectStore
 
 NODE: Final = 'shadowhound_bag_record'
 DISCOVERY_S: Final = 3.0
-"""Longest wait for the first publisher of anything wanted, and for the first message: the duration counts from there."""
+"""Maximum wait for the first publisher of a wanted topic, and for the first message: the duration starts there."""
 MORE_S: Final = 0.5
-"""For the others, once one is known."""
+"""Wait for the others, once one is known."""
 STEP_S: Final = 0.1
 CLOSE_S: Final = 5.0
 DAMAGED_S: Final = 0.5
-"""For the same where the spool takes nothing any more."""
+"""The same if the spool rejects all writes."""
 RECOVERY_S: Final = 30.0
 
 log = logging.getLogger(__name__)
@@ -78,19 +78,19 @@ class _IndexLostError(SpoolError):
 
 @dataclass(frozen=True, slots=True)
 class _Wanted:
-    """What is to be recorded."""
+    """The bag to record."""
 
     name: str
     duration_s: float
     deadline_s: float
     cut_off: str = ''
-    """The bag that was recorded when the index was lost; empty for the first."""
+    """The bag that was being recorded when the index was lost; empty for the first."""
     end_s: float = math.inf
-    """When the recording ends, once a message came."""
+    """End of the recording, once a message arrived."""
 
 
 class ManifestWriter(SpoolWriter):
-    """The spool's writer, which remembers the manifests of the bags that ended: not only ours, older ones are made whole too."""
+    """A spool writer that remembers the manifests of bags that ended: ours, and older ones that are completed."""
 
     def __init__(self, spool: Spool) -> None:
         super().__init__(spool)
@@ -103,7 +103,7 @@ class ManifestWriter(SpoolWriter):
         super().put(*items, rows=rows, wait=wait)
 
     def manifest_of(self, began_as: str) -> Manifest | None:
-        """That of the bag which began under this name; it has another one where the clock was set meanwhile."""
+        """The manifest of the bag that started with this name, which may have been renamed when the clock was set."""
         for manifest in self._manifests:
             clock = manifest.clock
             if manifest.bag == began_as or (clock is not None and unsynced_mark(clock.boot_id, clock.boot_ns) in began_as):
@@ -112,7 +112,7 @@ class ManifestWriter(SpoolWriter):
 
 
 def main() -> int:
-    """The program; 0 when the store has the bag, 1 when the spool has it or nothing was recorded, 2 for bad settings."""
+    """The program; 0: the store has the bag, 1: the spool has it or nothing was recorded, 2: invalid settings."""
     given = _arguments(sys.argv[1:])
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     stop = StopSignals()
@@ -121,15 +121,15 @@ def main() -> int:
         node = Node(NODE)
     guard = PortGuard()
     try:
-        said = _record(node, given, stop)
+        result = _record(node, given, stop)
     except DataLoggerError as error:
-        said = {'error': str(error)}
+        result = {'error': str(error)}
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
         guard.close()
-    print(json.dumps(said), flush=True)  # noqa: T201
-    return 0 if said.get('delivered') else 1
+    print(json.dumps(result), flush=True)  # noqa: T201
+    return 0 if result.get('delivered') else 1
 
 
 def _arguments(given: Sequence[str]) -> argparse.Namespace:
@@ -146,23 +146,23 @@ def _arguments(given: Sequence[str]) -> argparse.Namespace:
 def _record(node: Node, given: argparse.Namespace, stop: StopSignals) -> dict[str, Any]:
     name = check_name(given.name, 'the mission')
     is_chosen = given.topic or given.regex
-    topics = given.topic if is_chosen else _topics_there(node, given.robot, stop)
+    topics = given.topic if is_chosen else _published_topics(node, given.robot, stop)
     parameters = {'robot': given.robot, 'bag.topics': topics or [''], 'bag.regex': given.regex if is_chosen or topics else '.*'}
     settings = Settings.load(parameters, os.environ)
     wanted = _Wanted(name, given.duration, given.deadline)
-    with _alone(settings), closing(open_store(settings.store, settings.upload)) as store:
+    with _exclusive(settings), closing(open_store(settings.store, settings.upload)) as store:
         while True:
             try:
                 return _record_bag(node, settings, store, wanted, stop)
             except _IndexLostError as lost:
                 wanted = replace(wanted, cut_off=lost.bag, end_s=lost.end_s)
-                log.warning('%s: %s is made whole, and another bag follows it', lost, lost.bag)
+                log.warning('%s: %s is completed, and another bag follows it', lost, lost.bag)
 
 
 def _record_bag(node: Node, settings: Settings, store: ObjectStore, wanted: _Wanted, stop: StopSignals) -> dict[str, Any]:
-    """Raises _IndexLostError where the spool has to be opened anew."""
+    """Raises _IndexLostError if the spool must be opened again."""
     with ExitStack() as opened:
-        # An owner of its own: what a killed one left open is for the next one to settle, and none of the node's.
+        # A separate owner: what a killed process left open is completed by the next one, not by the node.
         owner = f'{settings.robot} {RECORDS}'
         spool = Spool(settings.spool_path, settings.spool, SystemClock.of_this_machine(), owner)
         spool.open()
@@ -183,13 +183,13 @@ def _record_bag(node: Node, settings: Settings, store: ObjectStore, wanted: _Wan
         if manifest is None:
             topics = [topic for topic in settings.bag.topics if topic]
             raise BagError('nothing was published on the topics that were to be recorded', topics=topics,
-                           remedy=f'`ros2 topic list`; asked for was {" ".join(topics) or settings.bag.regex}')  # fmt: skip
+                           remedy=f'`ros2 topic list`; requested was {" ".join(topics) or settings.bag.regex}')  # fmt: skip
         waiting = _wait_for_delivery(settings, writer, workers, manifest.bag, wanted.deadline_s)
-        return _told(manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
+        return _result(manifest, dropped, waiting=waiting, last_error=uploader.status().last_error)
 
 
 def _close(spool: Spool, writer: SpoolWriter) -> None:
-    """The accounts of a spool whose index is lost are lost as well: that was told."""
+    """Accounts of a spool whose index is lost are lost as well, which was reported."""
     try:
         spool.close()
     except SpoolError:
@@ -198,7 +198,7 @@ def _close(spool: Spool, writer: SpoolWriter) -> None:
 
 
 def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: SpoolWriter) -> Recorder:
-    """Writer, intake and recorder, opened; they are closed in the opposite order."""
+    """Open writer, intake and recorder; they are closed in reverse order."""
     clock, accounts = SystemClock.of_this_machine(), writer.spool.accounts
     queue = BagQueue()
     bags = BagConsumer(node, settings.bag, accounts, queue)
@@ -216,8 +216,8 @@ def _open_recorder(opened: ExitStack, node: Node, settings: Settings, writer: Sp
     return recorder
 
 
-def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
-    """Of each sensor of a Unitree the first topic that is published, otherwise its first; none where the robot is another one."""
+def _published_topics(node: Node, robot: str, stop: StopSignals) -> list[str]:
+    """For each sensor of a Unitree its first published topic, otherwise its first; empty for another robot."""
     sensors = [sensor.topics for sensor in Settings.load({'robot': robot}, {}).sensors if sensor.enabled]
     end_s = time.monotonic() + DISCOVERY_S
     while time.monotonic() < end_s and not stop.received:
@@ -232,7 +232,7 @@ def _topics_there(node: Node, robot: str, stop: StopSignals) -> list[str]:
 
 def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worker], wanted: _Wanted,
                 stop: StopSignals) -> tuple[str, int]:  # fmt: skip
-    """Record; the name of the bag when it began, and how many messages were dropped meanwhile."""
+    """Record; returns the bag's initial name, and how many messages were dropped."""
     recorder.on_mission(MissionOf(wanted.name, None, None))
     done, bag = recorder.start()
     if not done:
@@ -250,7 +250,7 @@ def _until_over(recorder: Recorder, writer: SpoolWriter, workers: Sequence[Worke
     if not done and writer.damaged:
         raise _IndexLostError(bag, end_s)
     if not done:
-        raise BagError(f'{bag} could not be ended: {text}', remedy='the next `shadowhound-data bag record` makes it whole')
+        raise BagError(f'{bag} could not be closed: {text}', remedy='the next `shadowhound-data bag record` completes it')
     return bag, dropped
 
 
@@ -263,18 +263,18 @@ def _wait_for_recovery(recorder: Recorder, writer: ManifestWriter, workers: Sequ
 
 def _wait_for_delivery(settings: Settings, writer: SpoolWriter, workers: Sequence[Worker], bag: str,
                        deadline_s: float) -> bool:  # fmt: skip
-    """Until nothing of the bag is in the spool any more; whether something still is."""
+    """Wait until nothing of the bag is left in the spool; return whether something still is."""
     end_s = time.monotonic() + deadline_s
     writer.prompt = True
     writer.flush(CLOSE_S)
-    while (waiting := _waits(settings, bag)) and time.monotonic() < end_s:  # a second signal ends the process: the bag is safe
+    while (waiting := _waits(settings, bag)) and time.monotonic() < end_s:  # a second signal exits the process: the bag is safe
         time.sleep(STEP_S)
         _supervise(workers)
     return waiting
 
 
-def _told(manifest: Manifest, dropped: int, *, waiting: bool, last_error: str) -> dict[str, Any]:
-    """What became of the bag."""
+def _result(manifest: Manifest, dropped: int, *, waiting: bool, last_error: str) -> dict[str, Any]:
+    """The result as JSON."""
     return {
         'robot': manifest.robot, 'bag': manifest.bag,
         'messages': sum(sum(each.recorded.values()) for each in manifest.slices),
@@ -294,13 +294,13 @@ def _supervise(workers: Iterable[Worker]) -> None:
 
 
 @contextmanager
-def _alone(settings: Settings) -> Iterator[None]:
-    """One at a time: another one's open slice would look like that of a dead process."""
+def _exclusive(settings: Settings) -> Iterator[None]:
+    """Only one at a time: the open slice of another one would look like that of a dead process."""
     folder = settings.home / RECORDS
     folder.mkdir(parents=True, exist_ok=True)
     with flock(folder / f'{settings.robot}.lock', wait=False) as is_mine:
         if not is_mine:
-            raise BagError(f'another `bag record` records {settings.robot} already', remedy='wait for its end')
+            raise BagError(f'another `bag record` is already recording {settings.robot}', remedy='wait until it ends')
         yield
 
 

@@ -1,7 +1,7 @@
-"""Hands the messages of a bag to its queue, as they came, and counts them in the bag's accounts. Owned by the intake thread.
+"""Passes the messages of a bag to its queue unchanged, and counts them in the bag's accounts. Owned by the intake thread.
 
-A topic of a sensor comes from its one subscription, any other from one of the bag's own. While nothing is recorded it costs a
-look at an empty set for each drain.
+A sensor's topic arrives through its one subscription, any other through a separate one. While nothing is recorded, each drain
+costs one lookup in an empty set.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from shadowhound_data_logger.spool.accounts import Accounts
 from shadowhound_data_logger.spool.topic_account import BAG, PAUSED, TopicAccount
 
 MAX_OFFERS: Final = 1000
-"""Publishers whose offers are remembered."""
+"""Maximum number of publishers whose offered QoS is remembered."""
 INFINITE_NS: Final = (1 << 63) - 10**9
-"""A lifespan from here on is none: middlewares differ in the last digits."""
+"""A lifespan from here on is infinite: middlewares differ in the last digits."""
 MAX_AGAIN: Final = 10_000
-"""Latched messages that a recording has again, of all publishers; each of these sends what it kept, some at most."""
+"""Maximum latched messages that a recording receives again, of all publishers; each sends at most a few."""
 
 
 class BagConsumer(Consumer):
-    """Hands what a recording wants to its queue. New; it listens while something is recorded (``Intake.listen``)."""
+    """Passes the messages of a recording to its queue. New; active while something is recorded (``Intake.listen``)."""
 
     from_start = False
     wants_latched = True
@@ -36,19 +36,19 @@ class BagConsumer(Consumer):
     def __init__(self, node: Node, settings: BagSettings, accounts: Accounts, queue: BagQueue) -> None:
         self.wanted_topics = TopicChoice(settings, [node.resolve_topic_name(topic) for topic in settings.topics if topic])
         self._before: dict[str, dict[str, int]] = {}
-        self._again: set[tuple[str, str, int]] = set()
+        self._to_repeat: set[tuple[str, str, int]] = set()
         self._accounts = accounts
         self._queue = queue
         self._offers = Offers(node)
 
     def begin(self) -> None:
-        """A recording begins: what earlier ones had of latched topics belongs into it as well."""
+        """A recording starts: it also receives latched messages that earlier recordings had."""
         self._offers.clear()
-        self._again.clear()
+        self._to_repeat.clear()
         self._before = self._accounts.last_numbers(BAG)
 
     def take(self, drained: Drained) -> None:
-        """Count messages that are not repeats, and hand them on."""
+        """Count messages that are not repeats, and pass them on."""
         topic, type_name = drained.topic, drained.type
         paused = drained.paused or self._queue.paused
         with self._accounts.entry(f'{BAG}{topic}') as account:
@@ -68,26 +68,26 @@ class BagConsumer(Consumer):
         if paused:
             self._queue.count_dropped(topic, PAUSED, len(fresh))
         qos, latched = self._offers.of(topic, type_name, fresh[-1].publisher)
-        if not paused or latched:  # slices after the pause begin with what was latched in it
+        if not paused or latched:  # slices after the pause start with messages latched during it
             dropped = self._queue.put(MessageBatch(topic, type_name, qos, fresh, latched, paused))
             if dropped and not paused:
                 self._accounts.drop(f'{BAG}{topic}', QUEUE_FULL, dropped, fresh[-dropped].times, fresh[-1].times)
 
     def _is_earlier(self, topic: str, message: Taken, account: TopicAccount) -> bool:
-        """Whether it is a latched message that an earlier recording had already, and that this one has not yet: counted again."""
+        """Whether it is a latched message that an earlier recording had, and this one does not have yet: counted again."""
         last = self._before.get(f'{BAG}{topic}', {}).get(message.publisher or '')
         if last is None or message.number is None or message.number > last:
             return False
         mark = topic, message.publisher or '', message.number
-        if mark in self._again or len(self._again) >= MAX_AGAIN:
+        if mark in self._to_repeat or len(self._to_repeat) >= MAX_AGAIN:
             return False
-        self._again.add(mark)
+        self._to_repeat.add(mark)
         account.receive_again(mark[1], message.number)
         return True
 
 
 class Offers:
-    """What the publishers of topics offer. New; owned by the intake thread."""
+    """The QoS offered by the publishers of topics. New; owned by the intake thread."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -97,9 +97,10 @@ class Offers:
         self._known.clear()
 
     def of(self, topic: str, type_name: str, publisher: str | None) -> tuple[str, int]:
-        """The offered QoS as rosbag2 writes it, as of the first message of this publisher; how many publishers are latched now.
+        """The offered QoS as rosbag2 writes it, as of this publisher's first message; and how many publishers are latched at
+        present.
 
-        The second is asked again for each message of a topic that has latched publishers; those publish rarely.
+        The latter is queried for each message of a topic with latched publishers; those publish rarely.
         """
         key = topic, type_name, publisher
         if (known := self._known.get(key)) is not None and not known[1]:
@@ -114,7 +115,7 @@ class Offers:
 
 
 def profiles_offered(node: Node, topic: str, type_name: str) -> list[QoSProfile]:
-    """By the publishers of a topic with this type."""
+    """The QoS profiles offered by the publishers of a topic with this type."""
     found = node.get_publishers_info_by_topic(topic)
     return [info.qos_profile for info in found if info.topic_type == type_name]
 

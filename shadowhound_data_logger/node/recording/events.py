@@ -1,6 +1,6 @@
-"""The events' part of the node: hands messages to the ring and to the conditions, and makes bags of them.
+"""Passes messages to the event ring and the conditions, and writes events to bags.
 
-Messages come from the one subscription that serves objects and bags as well.
+Messages arrive through the same subscriptions as those of objects and bags.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from shadowhound_data_logger.spool.topic_account import PAUSED
 
 
 class EventConsumer(Consumer):
-    """Hands messages to the ring and the conditions; it counts nothing and copies nothing."""
+    """Passes messages to the ring and the conditions; it counts nothing and copies nothing."""
 
     def __init__(self, node: Node, settings: EventSettings, ring: Ring, claims: EventAccounts) -> None:
         watched = [(node.resolve_topic_name(each.test.source), each) for each in conditions(settings.conditions)]
@@ -44,7 +44,7 @@ class EventConsumer(Consumer):
         self._offers = Offers(node)
 
     def take(self, drained: Drained) -> None:
-        """Take in messages; repeats are left out by whoever writes them."""
+        """Take messages; repeats are skipped when they are written."""
         topic, messages, now_s = drained.topic, drained.messages, time.monotonic()
         if topic in self.inbox.conditions:
             self.inbox.put(topic, drained.type, messages, now_s)
@@ -60,9 +60,9 @@ class EventConsumer(Consumer):
 
 
 class EventBuffer:
-    """Keeps the latest messages for events: the ring, its consumer, and the recording of events.
+    """Keeps the newest messages for events: the ring, its consumer, and the recording of events.
 
-    Life: New; open once; ``close`` after the intake.
+    Lifecycle: New; open once; ``close`` after the intake.
     """
 
     def __init__(self, node: Node, settings: Settings, place: BagContext, recovery: BagRecovery,
@@ -75,12 +75,12 @@ class EventBuffer:
 
     @property
     def consumers(self) -> Sequence[EventConsumer]:
-        """That the intake serves: none where nothing is kept."""
+        """The consumers for the intake; empty if nothing is kept."""
         return () if self.consumer is None else (self.consumer,)
 
     @property
     def workers(self) -> Sequence[Worker]:
-        """Those that have something to do."""
+        """The workers in use."""
         return *self.events.workers, *([self._watch.worker] if self._watch is not None else [])
 
     def open(self) -> None:
@@ -89,19 +89,19 @@ class EventBuffer:
             self._watch.open()
 
     def close(self, deadline_s: float) -> bool:
-        """End the event that goes on; False when that took too long."""
+        """End the current event; False if that took too long."""
         end_s = time.monotonic() + deadline_s
         watched = self._watch is None or self._watch.close(deadline_s)
         return self.events.close(max(0.0, end_s - time.monotonic())) and watched
 
     def update(self, settings: EventSettings) -> None:
-        """Go on by other settings, as far as they are live."""
+        """Apply the live part of other settings."""
         self.events.update(settings)
         if self._watch is not None:
             self._watch.update(settings.log_event)
 
     def on_mission(self, mission: MissionOf | None) -> None:
-        """The mission that is active now."""
+        """The active mission changed."""
         self.events.on_mission(mission)
         if self._watch is not None:
             self._watch.on_mission(mission)

@@ -1,6 +1,6 @@
-"""The node's part in a mission: finds the active one, logs the robot's state to it, and marks objects with it.
+"""The node's part in a mission: finds the active one, logs the robot's state to its run, and marks objects with it.
 
-It learns of missions from the disk alone. While none is active an encoder asks one attribute, and the thread one folder's time.
+It finds missions on the disk only. While none is active an encoder reads one attribute, and the thread one folder's time.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from shadowhound_data_logger.policies.folder import PolicyFolder
 log = logging.getLogger(__name__)
 
 LOOK_S: Final = 0.25
-"""How late it notices a mission's start and end."""
+"""How late it detects a mission's start and end."""
 WRITE_S: Final = 1.0
 FLUSH_S: Final = 5.0
-"""What the robot said in the mission has that long to get through intake and encoders at its end."""
+"""At the end of a mission, the time for its last messages to pass intake and encoders."""
 PATIENCE_S: Final = 30.0
 CLOSE_S: Final = 2.0
 
@@ -42,20 +42,20 @@ CLOSE_S: Final = 2.0
 class MissionWatch:
     """Joins the robot's active mission: marks objects with it, and logs to its run.
 
-    Life: New; open once; ``stop`` before the intake is closed, ``close`` after the encoders. Owns the thread ``mission``.
+    Lifecycle: New; open once; ``stop`` before the intake is closed, ``close`` after the encoders. Owns the thread ``mission``.
 
-    ``mark`` and ``observe`` are called by the encoders; they see the mission as a whole, as it is replaced.
+    ``mark`` and ``observe`` are called by the encoders; the mission that they see is replaced atomically.
     """
 
     def __init__(self, settings: Settings, intake: Intake, sampler: Sampler, queue: BatchQueue, observer: MissionObserver,
-                 tell: Callable[[MissionStatus], None]) -> None:  # fmt: skip
-        """``tell`` is called with ``status()`` whenever it changes."""
+                 on_change: Callable[[MissionStatus], None]) -> None:  # fmt: skip
+        """``on_change`` is called with ``status()`` whenever it changes."""
         self._settings = settings.mission
         self._intake = intake
         self._sampler = sampler
         self._queue = queue
         self._observer = observer
-        self._tell = tell
+        self._on_change = on_change
         self._finder = MissionFinder(settings.home, settings.robot)
         self._policies = PolicyFolder(settings.home)
         self._mission: ActiveMission | None = None
@@ -67,25 +67,25 @@ class MissionWatch:
         self.worker = Worker('mission', self._step, patience_s=PATIENCE_S)
 
     def open(self) -> None:
-        """Before the intake is opened: with ``mission.capture: mission`` it stores nothing before it is told to."""
+        """Call it before the intake is opened: with ``mission.capture: mission`` nothing is stored until a mission starts."""
         if self._settings.capture == 'mission':
             self._sampler.set_idle(idle=True)
         self.worker.start()
 
     def stop(self) -> None:
-        """From now on what is active stays so."""
+        """From now on the active mission does not change."""
         self.worker.stop()
         self._wake.set()
         self.worker.join(FLUSH_S)
 
     def close(self) -> None:
-        """Write what is left; a mission that goes on is joined again by the next start."""
+        """Write what is left; the next start of the node joins a mission that continues."""
         if self._log is not None:
             self._log.close()
             self._log = None
 
     def status(self) -> MissionStatus:
-        """The active mission, as ``~/mission`` reports it; false if there is none."""
+        """The active mission, as published on ``~/mission``; false if there is none."""
         mission = self._mission
         if mission is None:
             return MissionStatus()
@@ -95,16 +95,16 @@ class MissionWatch:
     # -- for the encoders ------------------------------------------------------------------------------------------
 
     def mark(self, item: DataObject) -> DataObject:
-        """The object with the ids of the mission that it began in."""
+        """The object with the ids of the mission that was active when it began."""
         mission, last = self._mission, self._last
         if mission is not None and mission.has(item.t_start_ns):
             return replace(item, metadata={**item.metadata, **self._marks})
-        if last is not None and last[0].has(item.t_start_ns):  # it was on its way to us when the mission ended
+        if last is not None and last[0].has(item.t_start_ns):  # it was in the pipeline when the mission ended
             return replace(item, metadata={**item.metadata, **last[1]})
         return item
 
     def observe(self, batch: Batch, item: DataObject | None) -> None:
-        """Take from a batch what is logged; ``item`` is what it was encoded as."""
+        """Log facts from a batch; ``item`` is its encoded object."""
         node_log = self._log
         if node_log is not None:
             for fact in self._observer.facts(batch, item):
@@ -120,14 +120,14 @@ class MissionWatch:
             if found is not None:
                 self._join(found)
         elif found is not None and meta.RUN_ID not in self._marks and self._find_run(found):
-            self._tell(self.status())
+            self._on_change(self.status())
         if self._log is not None and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + WRITE_S
             self._log.write()
         self._wake.wait(LOOK_S)
 
     def _join(self, mission: ActiveMission) -> None:
-        """From now on; what was taken before is closed first, so that no object is of before and of the mission."""
+        """Join a mission: close the open batches first, so that no object spans its start."""
         self._marks = {meta.MISSION_ID: mission.id, meta.MISSION_TYPE: mission.mission_type}
         self._find_run(mission)
         if self._settings.join:
@@ -142,10 +142,10 @@ class MissionWatch:
         if not self._set_idle(idle=False):
             log.warning('the intake did not begin mission %s within %.0f s; it will as soon as it can', mission.id, FLUSH_S)
         log.info('mission %s is active', mission.id)
-        self._tell(self.status())
+        self._on_change(self.status())
 
     def _leave(self, mission: ActiveMission) -> None:
-        """Close what is open, so that all of the mission is encoded, and let go of its journal."""
+        """Leave a mission: close the open batches, so that all of it is encoded, and close its journal."""
         noticed_ns = now_ns(THIS_MACHINE)
         self._mission = over = ended(mission)
         end_s = time.monotonic() + FLUSH_S
@@ -157,7 +157,7 @@ class MissionWatch:
         self._last = replace(over, end_ns=noticed_ns if over.end_ns is None else over.end_ns), self._marks
         self._mission, self._marks = None, {}
         log.info('mission %s has ended', mission.id)
-        self._tell(MissionStatus())
+        self._on_change(MissionStatus())
 
     def _set_idle(self, *, idle: bool) -> bool:
         if self._settings.capture == 'mission':

@@ -1,7 +1,8 @@
-"""What the node sees of the robot during a mission: read from batches that were just encoded, by the encoders' threads.
+"""Extracts what a mission logs from batches that were just encoded, on the encoders' threads.
 
-It is not a listener: those get each message from the intake (``consumers.py``).
-Only what is logged is deserialized: one message a period of the battery's and the thermometer's topic, every pose that is kept.
+It is not a consumer of the intake (``consumers.py``). Only what is logged is deserialized: one message per period of the
+battery's
+and the thermometer's topic, and every kept pose.
 """
 
 from __future__ import annotations
@@ -31,21 +32,21 @@ POSE, FRAMES = 'pose', 'frames'
 JPEG: Final = 'image/jpeg'
 BATTERY_STATE: Final = 'sensor_msgs/msg/BatteryState'
 _ROUNDING: Final = 1e-6
-"""Of a full battery in float32."""
+"""Float32 rounding of a full battery."""
 
 
 class Source(NamedTuple):
-    """A topic that gives a value."""
+    """A topic that provides a value."""
 
     rank: int
     """0 for the preferred one."""
     topic: str
     path: list[str]
-    """Of the field."""
+    """Path of the field."""
 
 
 class Sources:
-    """Where a value comes from, by a mission's setting: alternatives that are topics, or message types for any topic of them."""
+    """Sources of a value, from a mission's setting: alternatives that are topics, or message types for any topic with them."""
 
     def __init__(self, given: str, resolve: Callable[[str], str]) -> None:
         self._by_topic: dict[str, tuple[int, list[str]]] = {}
@@ -57,7 +58,7 @@ class Sources:
                 self._by_topic.setdefault(resolve(name), (rank, path))
 
     def find(self, topic: str, type_name: str) -> Source | None:
-        """Of a topic (full name) with messages of a type; None where it gives no value."""
+        """The source for a topic (full name) and type; None if it provides no value."""
         found = self._by_topic.get(topic) or self._by_type.get(type_name)
         return None if found is None else Source(found[0], topic, found[1])
 
@@ -67,13 +68,13 @@ class MissionObserver:
 
     New; ``facts`` of each batch, on any thread. A topic that cannot be read is logged once.
 
-    Two threads that have batches of one topic may both take a value of one period: there is one more then.
+    Two threads with batches of one topic may both take a value of one period: then there is one more.
     """
 
     def __init__(self, settings: MissionSettings, sensors: Mapping[str, SensorSettings], robot: str, types: MessageTypes,
                  resolve: Callable[[str], str], marks: Callable[[int], Mapping[str, str]] = lambda _: {},
                  place: Callable[[int], Pose | None] = lambda _: None) -> None:  # fmt: skip
-        """``resolve`` makes a topic's full name, as the node's namespace and remappings want it.
+        """``resolve`` makes a topic's full name, with the node's namespace and remappings.
 
         ``marks`` and ``place`` are those of ``RobotTrack``.
         """
@@ -82,23 +83,23 @@ class MissionObserver:
         self._types = types
         self._period_ns = max(1, round(settings.period_s * SECOND))
         self._marks = marks
-        self._place = place
+        self._pose_from_tf = place
         self._frames = Sources(settings.frames, str)
         self._frame_ns = max(1, round(settings.frame_every_s * SECOND))
         self._odometry = Sources(settings.odometry, resolve)
         self._fields = {BATTERY: Sources(settings.battery, resolve), TEMPERATURE: Sources(settings.temperature, resolve)}
         self._chosen: dict[str, Source] = {}
-        """Metric -> the most preferred of its sources that was heard."""
+        """Metric -> the most preferred of its sources that was received."""
         self._periods: dict[tuple[str, int], int] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def facts(self, batch: Batch, item: DataObject | None = None) -> Iterator[MissionFact]:
-        """What there is to log of a batch; ``item`` is the object that was made of it, None where there is none."""
+        """What to log from a batch; ``item`` is its encoded object, None if there is none."""
         try:
             if batch.type == ODOMETRY and self._choose(POSE, self._odometry, batch):
                 yield from (self._pose(sample) for sample in batch.samples)
             elif batch.type == TRANSFORMS and POSE not in self._chosen:
-                yield from filter(None, (self._place(sample.stamp_ns) for sample in self._some(batch, SECOND // 10)))
+                yield from filter(None, (self._pose_from_tf(sample.stamp_ns) for sample in self._some(batch, SECOND // 10)))
             chosen = {key: self._choose(key, sources, batch) for key, sources in self._fields.items()}
             if fields := {key: source.path for key, source in chosen.items() if source is not None}:
                 for sample in self._some(batch, self._period_ns):
@@ -111,10 +112,10 @@ class MissionObserver:
                     if picture is not None:
                         yield Frame(sample.stamp_ns, picture, self._marks(sample.stamp_ns))
         except Rejected as error:
-            self._tell(batch.topic, str(error))
+            self._log_once(batch.topic, str(error))
 
     def _choose(self, key: str, sources: Sources, batch: Batch, name: str = '') -> Source | None:
-        """The source that a batch is of, unless a preferred one was heard, or another topic of the same type.
+        """The source that the batch belongs to, unless a preferred one was received, or another topic of the same type.
 
         ``name`` is what the setting names, by default the topic.
         """
@@ -125,7 +126,7 @@ class MissionObserver:
         return found
 
     def _jpeg(self, batch: Batch, sample: Sample, item: DataObject | None) -> bytes | None:
-        """The one that was just made of the message for the sensor's own object, else one of its own; None for no JPEG."""
+        """The JPEG of the sensor's object for this message, otherwise encode one; None if that is impossible."""
         if item is not None and len(batch.samples) == 1 and item.content_type == JPEG and isinstance(item.body, bytes):
             return item.body
         payload = encode_jpeg(Job(batch, self._sensors[batch.sensor], self._robot, self._types), sample)
@@ -157,20 +158,20 @@ class MissionObserver:
             raw = number_at(message, path)
             value = battery_pct(message, path) if key == BATTERY else raw
             if raw is None:
-                self._tell(key, f'{type_name} has no number {".".join(path)}')
+                self._log_once(key, f'{type_name} has no number {".".join(path)}')
             elif value is not None and math.isfinite(value):
                 yield Reading(sample.stamp_ns, key, value)
             elif math.isfinite(raw):
-                self._tell(key, f'{type_name} has {".".join(path)} = {raw:g}, which is not between 0 and 1')
+                self._log_once(key, f'{type_name} has {".".join(path)} = {raw:g}, which is not between 0 and 1')
 
-    def _tell(self, what: str, text: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
+    def _log_once(self, what: str, text: str) -> None:
+        if what not in self._logged:
+            self._logged.add(what)
             log.warning('%s is not logged to the mission: %s', what, text)
 
 
 def number_at(message: Any, path: list[str]) -> float | None:
-    """The number at the end of the path; None where there is none."""
+    """The number at the end of the path; None if there is none."""
     found = message
     try:
         for name in path:
@@ -181,10 +182,10 @@ def number_at(message: Any, path: list[str]) -> float | None:
 
 
 def battery_pct(message: Any, path: list[str]) -> float | None:
-    """The number at the end of the path as the charge in percent; None for a charge that is unknown.
+    """The number at the end of the path as a charge in percent; None if it is unknown.
 
-    ``sensor_msgs/msg/BatteryState.percentage`` is 0 to 1, and NaN where it is not measured. A value beyond is not what the
-    message defines, so what its publisher means is unknown.
+    ``sensor_msgs/msg/BatteryState.percentage`` is 0 to 1, and NaN if not measured. Other values do not follow the message's
+    definition, so they count as unknown.
     """
     value = number_at(message, path)
     if value is None or not _is_share(message, path):
@@ -201,5 +202,5 @@ def _is_share(message: Any, path: list[str]) -> bool:
 
 
 def yaw_of(turn: Any) -> float:
-    """The angle about z of a quaternion, radians within [-pi, pi]."""
+    """The angle about z of a quaternion, radians in [-pi, pi]."""
     return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y * turn.y + turn.z * turn.z))

@@ -1,6 +1,6 @@
-"""Finds triggers of events: a number that crosses a threshold, or what the active mission's agent logs.
+"""Detects triggers of events: a number that crosses a threshold, or an event logged by the active mission's agent.
 
-Messages are deserialized here, off the intake, some of them only (``Inbox``). Of missions it reads the disk.
+Messages are deserialized here, not in the intake, and only some of them (``Inbox``). Missions are read from the disk.
 """
 
 from __future__ import annotations
@@ -31,67 +31,68 @@ from shadowhound_data_logger.node.recording.mission_observer import number_at
 log = logging.getLogger(__name__)
 
 SEEN: Final = 10
-"""Messages of one drain that conditions look at, evenly chosen: 50 a second."""
+"""Messages per drain that conditions check, evenly spaced: 50 per second."""
 LARGE_BYTES: Final = 64 << 10
-"""Of a topic with larger messages they look at the newest alone."""
+"""On topics with larger messages, only the newest is checked."""
 REARM_S: Final = 1.0
-"""Shortest time in which a condition must not hold before it triggers again."""
+"""Minimum time for which a condition must be false before it triggers again."""
 LATE_NS: Final = 10 * 10**9
-"""What an agent logged longer ago is not a trigger: the node has just been started, or the clock was set."""
+"""Older events of an agent are not triggers: the node has just been started, or the clock was set."""
 LOOK_S: Final = 0.2
 PATIENCE_S: Final = 30.0
 DETAIL_BYTES: Final = 1000
-"""Of what an agent logged with an event, in the manifest."""
+"""Maximum size of the data an agent logged with an event, in the manifest."""
 CONDITION, LOG_EVENT = 'condition', 'log_event'
 """What triggered."""
 Trigger = Callable[[str, str, str, float], Answer]
 
 
 class Inbox:
-    """Messages that conditions are to look at. ``put`` by the intake, ``take`` by one other thread; the oldest fall out."""
+    """Messages for the conditions. ``put`` by the intake, ``take`` by one other thread; the oldest are dropped."""
 
     def __init__(self, watched: Iterable[tuple[str, Condition]]) -> None:
         """Conditions with the full names of their topics."""
         self.conditions: dict[str, list[Condition]] = {}
         for topic, condition in watched:
             self.conditions.setdefault(topic, []).append(condition)
-        self._heard: dict[str, deque[tuple[float, str, Taken]]] = {topic: deque(maxlen=2 * SEEN) for topic in self.conditions}
-        self._fewest = {topic: all(each.test.hold_s for each in found) for topic, found in self.conditions.items()}
+        self._received: dict[str, deque[tuple[float, str, Taken]]] = {topic: deque(maxlen=2 * SEEN) for topic in self.conditions}
+        self._single = {topic: all(each.test.hold_s for each in found) for topic, found in self.conditions.items()}
 
     def put(self, topic: str, type_name: str, taken: Sequence[Taken], now_s: float) -> None:
-        """A condition that has to hold for a time is content with one message of a drain."""
-        few = self._fewest[topic] or len(taken[-1].cdr) > LARGE_BYTES
+        """A condition with a hold time needs only one message per drain."""
+        few = self._single[topic] or len(taken[-1].cdr) > LARGE_BYTES
         step = len(taken) if few else -(-len(taken) // SEEN)
-        heard = self._heard[topic]
+        received = self._received[topic]
         if few:
-            heard.clear()
-        heard.extend((now_s, type_name, message) for message in taken[(len(taken) - 1) % step :: step])
+            received.clear()
+        received.extend((now_s, type_name, message) for message in taken[(len(taken) - 1) % step :: step])
 
     def take(self, topic: str) -> Iterable[tuple[float, str, Taken]]:
-        """When it was drained, of which type, and the message; oldest first."""
-        heard = self._heard[topic]
-        while heard:
+        """Time of the drain, type and message; oldest first."""
+        received = self._received[topic]
+        while received:
             try:
-                yield heard.popleft()
+                yield received.popleft()
             except IndexError:  # the intake has just cleared it
                 return
 
 
-class Judge:
-    """Watches one condition. New; ``poll`` at one number after the other. One thread.
+class ConditionState:
+    """Evaluates one condition. New; ``poll`` with each number. One thread.
 
-    It triggers once it has held for its time, and again only after it has not held for as long, a second at least: a number
-    that trembles about its threshold makes one event.
+    It triggers once the condition has been true for its time, and again only after it has been false for as long, at least a
+    second:
+    a number that oscillates around its threshold makes one event.
     """
 
     def __init__(self, condition: Condition) -> None:
         self.condition = condition
         self._armed = True
         self._since_s: float | None = None
-        """Since when it is as it is now: true while armed, false else; None while it is the other way round."""
+        """Since when it has been true while armed, false otherwise; None while it is the opposite."""
 
     def poll(self, value: float, now_s: float) -> bool:
-        """Whether this number, of that time by the monotonic clock, triggers. NaN triggers nothing."""
+        """Whether this number, at that time of the monotonic clock, triggers. NaN triggers nothing."""
         if not math.isfinite(value):
             return False
         if bool(self.condition.test.holds(value)) is not self._armed:
@@ -107,23 +108,23 @@ class Judge:
 
 
 class Logged(NamedTuple):
-    """What an agent said with ``log_event``."""
+    """An event logged by an agent with ``log_event``."""
 
     name: str
     age_ns: int
-    """How long ago it was said."""
+    """Time since it was logged."""
     data: Any
 
 
 class JournalTail:
-    """Reads what is added to the journal of a mission. New; ``new`` again and again. One thread."""
+    """Reads what is appended to the journal of a mission. New; call ``new`` repeatedly. One thread."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offset = 0
 
     def new(self, now_ns: int) -> Iterator[Logged]:
-        """The events since the last call; what was logged long ago is left out. A journal that cannot be read has none."""
+        """The events since the last call; old ones are skipped. An unreadable journal has none."""
         try:
             if self._path.stat().st_size <= self._offset:
                 return
@@ -139,23 +140,23 @@ class JournalTail:
 
 
 class EventWatch:
-    """Looks for triggers of events: conditions, and what agents log.
+    """Watches for triggers of events: conditions, and events logged by agents.
 
-    Life: New; open once; ``on_mission`` from any thread; close once. Owns the thread ``event-watch``.
+    Lifecycle: New; open once; ``on_mission`` from any thread; close once. Owns the thread ``event-watch``.
     """
 
     def __init__(self, inbox: Inbox, types: MessageTypes, home: Path, clock: Clock, log_event: str, trigger: Trigger) -> None:
-        """``log_event`` is a regular expression for names of what an agent logs; empty for none."""
+        """``log_event`` is a regular expression for names of events logged by agents; empty for none."""
         self._inbox = inbox
         self._types = types
         self._home = home
         self._clock = clock
         self._trigger = trigger
-        self._judges = {topic: [Judge(each) for each in found] for topic, found in inbox.conditions.items()}
+        self._conditions = {topic: [ConditionState(each) for each in found] for topic, found in inbox.conditions.items()}
         self._wanted = _compiled(log_event)
         self._missions: Sequence[str] = ()
         self._tails: dict[str, JournalTail] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self._wake = threading.Event()
         self.worker = Worker('event-watch', self._step, patience_s=PATIENCE_S)
 
@@ -168,37 +169,37 @@ class EventWatch:
         return self.worker.join(deadline_s)
 
     def update(self, log_event: str) -> None:
-        """Go on by another expression."""
+        """Apply another expression."""
         self._wanted = _compiled(log_event)
 
     def on_mission(self, mission: MissionOf | None) -> None:
-        """The mission that is active now."""
+        """The active mission changed."""
         self._missions = (mission.mission_id,) if mission is not None and mission.mission_id else ()
 
     def _step(self) -> None:
         self._wake.wait(LOOK_S)
-        for topic, judges in self._judges.items():
+        for topic, states in self._conditions.items():
             for now_s, type_name, message in self._inbox.take(topic):
-                self._judge(topic, type_name, message.cdr, judges, now_s)
+                self._evaluate(topic, type_name, message.cdr, states, now_s)
         self._follow()
 
-    def _judge(self, topic: str, type_name: str, cdr: bytes, judges: Sequence[Judge], now_s: float) -> None:
+    def _evaluate(self, topic: str, type_name: str, cdr: bytes, states: Sequence[ConditionState], now_s: float) -> None:
         try:
             message = self._types.deserialize(type_name, cdr)
         except Rejected as error:
-            self._tell(topic, f'{topic} tells no condition anything: {error}')
+            self._log_once(topic, f'{topic} cannot be used in conditions: {error}')
             return
-        for judge in judges:
-            condition = judge.condition
+        for state in states:
+            condition = state.condition
             test = condition.test
             value = number_at(message, test.path.split('.'))
             if value is None:
-                self._tell(condition.name, f'{type_name} has no number {test.path} ({test.text})')
-            elif judge.poll(value, now_s):
+                self._log_once(condition.name, f'{type_name} has no number {test.path} ({test.text})')
+            elif state.poll(value, now_s):
                 self._trigger(condition.name, CONDITION, f'{test.text}: {value:g}', 0.0)
 
     def _follow(self) -> None:
-        """Read what agents logged; the journal of a mission that is over once more."""
+        """Read the events of agents; the journal of a mission that ended is read once more."""
         missions = self._missions
         for name in missions:
             if name not in self._tails:
@@ -211,10 +212,10 @@ class EventWatch:
             if name not in missions:
                 del self._tails[name]
 
-    def _tell(self, what: str, text: str) -> None:
-        """Once."""
-        if what not in self._told:
-            self._told.add(what)
+    def _log_once(self, what: str, text: str) -> None:
+        """Log once."""
+        if what not in self._logged:
+            self._logged.add(what)
             log.warning('%s', text)
 
 

@@ -1,6 +1,6 @@
-"""What a running node can be asked to do, each defined once: services, parameters and the control socket all use it.
+"""The commands of a running node, each defined once for services, parameters and the control socket.
 
-A request and its answer are plain values, as JSON has them: ``{"do": "flush"}`` is answered by ``{"ok": true, "robot": "thor",
+A request and its answer are plain JSON values: ``{"do": "flush"}`` is answered by ``{"ok": true, "robot": "thor",
 "message": "..."}`` or ``{"ok": false, "robot": "thor", "error": "..."}``.
 """
 
@@ -25,22 +25,22 @@ from shadowhound_data_logger.spool.act_record import ActRecord
 log = logging.getLogger(__name__)
 
 FLUSH_S: Final = 5.0
-"""A caller is told what has not been done by then; it takes a fraction of that unless the disk is slow."""
-MANUAL: Final = 'manual'
-"""Name of an event that somebody asked for and did not name."""
-ASKERS: Final = ('command', 'service', 'page')
-"""By whom it is said to have been triggered."""
+"""Timeout of a flush, reported to the caller; it takes a fraction of that unless the disk is slow."""
+DEFAULT_NAME: Final = 'manual'
+"""Name of a requested event without a name."""
+TRIGGERED_BY: Final = ('command', 'service', 'page')
+"""Possible triggers, as recorded in the event."""
 MAX_NAME: Final = 100
-"""Letters of an event's name."""
+"""Maximum letters of an event's name."""
 YIELD_S: Final = 5.0
-"""For so long uploads yield to whoever watches, unless it is asked for again: a live page that was killed slows nothing down."""
+"""How long uploads yield to viewers after a request: a live page that was killed slows nothing down."""
 WHO: Final = 'who'
-"""With any request: whom somebody asks for, to be said in the log, in the ledger and in the manifest of an event."""
+"""In any request: the requester, for the log, the ledger and the manifest of an event."""
 MAX_NOTE: Final = 1000
-"""Letters of what is said of it."""
+"""Maximum letters of a note."""
 
 
-class Settable(Protocol):
+class ParameterAccess(Protocol):
     """The parameters of the node."""
 
     def get(self, names: list[str]) -> dict[str, Any]: ...
@@ -53,18 +53,20 @@ class _Command:
     do: Callable[..., Answer | dict[str, Any]]
     arguments: Mapping[str, type] = field(default_factory=dict)
     quiet: bool = False
-    """Whether a success is worth no line in the log: it only tells something, or whoever does it says so."""
+    """Whether a success is not logged: it only reads something, or its implementation logs it."""
     takes_who: bool = False
 
 
 class Commands:
-    """Everything that the node can be asked to do.
+    """All commands of the node.
 
-    Used by the main thread alone: one command is done after the other, and a flush may take ``FLUSH_S``.
+    Used by the main thread only: commands are handled one at a time, and a flush may take ``FLUSH_S``.
     """
 
-    def __init__(self, stages: Stages, parameters: Settable, status: Status, acts: ActRecord, robot: str, node: str) -> None:
-        """``acts`` keeps what somebody with a name asked for; ``node`` is the full name under which ROS knows the node."""
+    def __init__(
+        self, stages: Stages, parameters: ParameterAccess, status: Status, acts: ActRecord, robot: str, node: str
+    ) -> None:
+        """``acts`` records requests with a named requester; ``node`` is the logger's full public name in ROS."""
         self._stages = stages
         self._parameters = parameters
         self._status = status
@@ -87,22 +89,22 @@ class Commands:
             'set': _Command(self._set, {'values': dict}, quiet=True),
             'get': _Command(self._get, {'names': list}, quiet=True),
             'parameters': _Command(self._list, quiet=True),
-            'status': _Command(self._tell_status, quiet=True),
-            'mission': _Command(self._tell_mission, quiet=True),
+            'status': _Command(self._get_status, quiet=True),
+            'mission': _Command(self._get_mission, quiet=True),
             'diagnostics': _Command(self._diagnose, quiet=True),
             'describe': _Command(self._describe, quiet=True),
             'compare': _Command(self._compare, {'found': dict}, quiet=True),
         }
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Do what is asked, and say what became of it; whatever goes wrong with it, the node goes on."""
+        """Handle a request and return the answer; the node continues whatever fails."""
         try:
             done = self._do(request)
         except DataLoggerError as error:
             done = False, str(error)
-        except Exception as error:  # whoever asks must not be able to end the node
+        except Exception as error:  # a request must not be able to stop the node
             log.exception('%r failed', request.get('do'))
-            done = False, f'it failed, which is a defect of this program: {type(error).__name__}: {error}'
+            done = False, f'it failed because of a bug in this program: {type(error).__name__}: {error}'
         if isinstance(done, dict):
             return {'ok': True, 'robot': self._robot, **done}
         if who := _who(request):
@@ -128,10 +130,10 @@ class Commands:
             log.log(logging.INFO if done[0] else logging.WARNING, '%s%s: %s', who and f'{who}: ', name, done[1])
         return done
 
-    # -- what they do ----------------------------------------------------------------------------------------------
+    # -- implementations -------------------------------------------------------------------------------------------
 
     def _flush(self, deadline_s: float = FLUSH_S) -> Answer:
-        """Spool all that was taken or waits to be; whether that worked, and what became durable, in words."""
+        """Spool everything taken so far; returns whether that succeeded, and a text with what became durable."""
         end_s = time.monotonic() + deadline_s
         writer = self._stages.writer
         before = writer.written()
@@ -147,38 +149,38 @@ class Commands:
         return True, f'{_count(objects, "object")} with {_count(messages, "message")} spooled'
 
     def _pause(self, *, paused: bool) -> Answer:
-        """Begin or end a pause; whether it is in force, and what became of the open batches, in words."""
+        """Start or end a pause; returns whether it is in effect, and a text about the open batches."""
         intake = self._stages.intake
         if paused is intake.paused:
             return True, 'paused already' if paused else 'not paused'
         end_s = time.monotonic() + FLUSH_S
         if not intake.pause(FLUSH_S, paused=paused):
-            return False, f'the intake did not do it within {FLUSH_S:g} s; it does as soon as it can'
+            return False, f'the intake did not do it within {FLUSH_S:g} s; it will as soon as it can'
         if not paused:
             return True, 'messages are stored again'
         _, spooled = self._flush(end_s - time.monotonic())
         return True, f'paused: messages are counted and not stored, delivery continues; {spooled}'
 
-    def _trigger(self, name: str = MANUAL, note: str = '', by: str = ASKERS[0], who: str = '') -> Answer:
-        """Begin an event, or make the one that goes on last longer; names the bag."""
+    def _trigger(self, name: str = DEFAULT_NAME, note: str = '', by: str = TRIGGERED_BY[0], who: str = '') -> Answer:
+        """Start an event, or extend the current one; the answer names the bag."""
         if not 0 < len(name) <= MAX_NAME or len(note) > MAX_NOTE:
-            return False, f'an event has a name of 1 to {MAX_NAME} letters, and a note of up to {MAX_NOTE}'
-        if by not in ASKERS:
-            return False, f'an event is triggered by {" or ".join(ASKERS)}, not {by[:MAX_NAME]!r}'
+            return False, f'an event needs a name of 1 to {MAX_NAME} letters, and a note of up to {MAX_NOTE}'
+        if by not in TRIGGERED_BY:
+            return False, f'an event is triggered by {" or ".join(TRIGGERED_BY)}, not {by[:MAX_NAME]!r}'
         return self._stages.event_buffer.events.trigger(name, by, note, who=who)
 
-    def _pull(self, want: Mapping[str, Any] | None = None, cancel: str = '', by: str = MANUAL) -> Answer | dict[str, Any]:
-        """Ask for what is kept here, or take a request back."""
+    def _pull(self, want: Mapping[str, Any] | None = None, cancel: str = '', by: str = DEFAULT_NAME) -> Answer | dict[str, Any]:
+        """Request kept data, or cancel a request."""
         requests = self._stages.requests
         if requests is None:
-            return False, 'nothing is kept here: ship of all sensors and of bag is always'
+            return False, 'no data is kept here: ship of all sensors and of bag is always'
         try:
             return {'id': requests.cancel(cancel, by) if cancel else requests.ask(want or {}, by)}
         except RequestRefused as error:
             return False, str(error)
 
     def _yield(self, max_mbps: float = 0.0) -> Answer:
-        """Leave the link to whoever watches the robot, for some seconds."""
+        """Leave the link to viewers for some seconds."""
         if not 0.0 < max_mbps < float('inf'):
             return False, 'yield takes max_mbps, which is above 0'
         self._stages.uploader.yield_to(max_mbps, YIELD_S)
@@ -197,16 +199,16 @@ class Commands:
     def _list(self) -> dict[str, Any]:
         return {'parameters': self._parameters.described()}
 
-    def _tell_status(self) -> Answer | dict[str, Any]:
-        """Of up to a second ago."""
+    def _get_status(self) -> Answer | dict[str, Any]:
+        """The status, at most a second old."""
         status = self._status.latest
         return {'status': as_plain(status)} if status else (False, 'there is no status yet')
 
-    def _tell_mission(self) -> dict[str, Any]:
+    def _get_mission(self) -> dict[str, Any]:
         return {'mission': fields_of(self._stages.mission.status())}
 
     def _diagnose(self) -> Answer | dict[str, Any]:
-        """What /diagnostics says of up to a second ago."""
+        """The entries of /diagnostics, at most a second old."""
         status = self._status.latest
         return {'diagnostics': plain_entries(status, self._status.earlier)} if status else (False, 'there is no status yet')
 
@@ -214,7 +216,7 @@ class Commands:
         return {'node': self._node, 'pid': os.getpid(), 'version': self._status.version, 'commands': list(self._known)}
 
     def _compare(self, found: Mapping[str, Any] | None = None) -> Answer | dict[str, Any]:
-        """Of the front: the publishers that the robot's RMW finds beyond ours."""
+        """For the front: publishers that the robot's RMW finds and ours does not."""
         unheard = self._stages.unheard
         return unheard.compare(found or {}) if unheard is not None else (False, 'the node listens through the RMW of the robot')
 
@@ -227,5 +229,5 @@ def _count(number: int, noun: str) -> str:
 
 
 def _who(request: Mapping[str, Any]) -> str:
-    """For whom it is asked; empty where nobody says so."""
+    """The requester; empty if not given."""
     return printable(str(request.get(WHO, '')))[:MAX_NAME]

@@ -1,6 +1,6 @@
-"""The control socket (``spool/control.py``): takes requests from other processes of this user, and has the main thread do them.
+"""The control socket (``spool/control.py``): receives requests from other processes of this user for the main thread.
 
-Whatever a client sends, or does not send or read, costs it its connection at most: lines, clients and times are bounded.
+A client that misbehaves only loses its connection: lines, clients and times are bounded.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ log = logging.getLogger(__name__)
 
 MAX_CLIENTS: Final = 16
 IDLE_S: Final = 60.0
-"""Within which a client that is connected sends a whole line; the front does every second."""
+"""Maximum time for a connected client to send a complete line; the front sends one per second."""
 READ_S: Final = 5.0
-"""Within which it reads an answer."""
+"""Maximum time for it to read an answer."""
 BACKLOG: Final = 64
 CANCEL_S: Final = 0.2
-"""For a client to read that the node closes."""
+"""Time for clients to read that the node closes."""
 OPEN_S: Final = 2.0
-"""For how long the start of the node waits for the socket; on a disk that takes it that lasts a few milliseconds."""
+"""How long the node's startup waits for the socket; normally a few milliseconds."""
 LOCK: Final = 'control.lock'
 _Request = Mapping[str, Any]
 Waiting = tuple[_Request, 'Future[dict[str, Any]]']
@@ -42,15 +42,14 @@ Waiting = tuple[_Request, 'Future[dict[str, Any]]']
 class ControlSocket:
     """Serves commands to programs without ROS, through a Unix socket in the spool.
 
-    Life: New; open once, by the robot's one node; ``handle_requests`` by the main thread whenever ``wake`` was called; close
-    once.
+    Lifecycle: New; open once, by the robot's only node; ``handle_requests`` by the main thread after each ``wake``; close once.
 
-    Owns the thread ``control``, which reads and writes; what is asked for waits in a queue for the main thread.
+    Owns the thread ``control``, which reads and writes; requests wait in a queue for the main thread.
     """
 
     def __init__(self, spool: Path, robot: str, wake: Callable[[], None], *, idle_s: float = IDLE_S,
                  answer_s: float = ANSWER_S, read_s: float = READ_S) -> None:  # fmt: skip
-        """``wake`` tells the main thread, from the other one, that somebody asks for something."""
+        """``wake`` notifies the main thread, from the other one, of a request."""
         self._spool = spool
         self._robot = robot
         self._wake = wake
@@ -65,11 +64,11 @@ class ControlSocket:
         self.worker = Worker('control', self._step)
 
     def open(self) -> None:
-        """Decide on the name, and listen; a disk that takes no socket now is asked again by the thread."""
+        """Choose the name, and listen; if the disk rejects the socket, the thread tries again."""
         is_first = self._opened.enter_context(flock(self._spool / LOCK, wait=False))
         own = name_of(self._robot)
         self._name = NAME if is_first else own
-        if is_first:  # one of the same robot, which shared the spool then, may have been killed
+        if is_first:  # a node of the same robot that shared the spool may have been killed
             (self._spool / own).unlink(missing_ok=True)
         self.worker.start()
         if not self._listening.wait(OPEN_S):
@@ -77,18 +76,18 @@ class ControlSocket:
 
     @property
     def path(self) -> Path:
-        """Where it is, once it is open."""
+        """Its path, once it is open."""
         return self._spool / self._name
 
     def handle_requests(self, do: Callable[[_Request], dict[str, Any]]) -> None:
-        """Have all that is asked for done, one after the other; ``do`` returns what to answer."""
+        """Handle all waiting requests, one after the other; ``do`` returns the answer."""
         while self._waiting:
             request, answer = self._waiting.popleft()
-            if answer.set_running_or_notify_cancel():  # else whoever asked was told already that it takes too long
+            if answer.set_running_or_notify_cancel():  # otherwise the client already has the answer that it takes too long
                 answer.set_result(do(request))
 
     def close(self) -> None:
-        """Ask nothing more of the main thread; clients that still wait are told."""
+        """Pass no more requests to the main thread; waiting clients get an answer."""
         self.worker.stop()
         loop, over = self._loop, self._over
         if loop is not None and over is not None:
@@ -115,23 +114,23 @@ class ControlSocket:
                 await self._over.wait()
         finally:
             server.close()
-            while self._clients:  # until Python 3.12 wait_for forgets a cancellation that comes together with its result
+            while self._clients:  # until Python 3.12 wait_for loses a cancellation that arrives together with its result
                 for client in self._clients:
                     client.cancel()
                 await asyncio.wait(set(self._clients), timeout=CANCEL_S)
 
     async def _begin(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """A client, from its first line to its end."""
+        """Serve a client, from its first line to its end."""
         this = asyncio.current_task()
         assert this is not None
         self._clients.add(this)
         writer.transport.set_write_buffer_limits(0)  # so that ``drain`` waits until all is read
         try:
             if len(self._clients) > MAX_CLIENTS:
-                await self._tell(writer, self._refused(f'{MAX_CLIENTS} clients are connected, which is the most there may be'))
+                await self._tell(writer, self._refused(f'{MAX_CLIENTS} clients are connected, which is the maximum'))
             else:
                 await self._converse(reader, writer)
-        except (OSError, asyncio.TimeoutError):  # it went away, or reads nothing
+        except (OSError, asyncio.TimeoutError):  # it disconnected, or does not read
             pass
         except asyncio.CancelledError:  # the node closes
             with suppress(OSError, asyncio.TimeoutError):
@@ -141,19 +140,19 @@ class ControlSocket:
             writer.transport.abort() if writer.transport.get_write_buffer_size() else writer.close()
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One request after the other, until it ends or does what it must not."""
+        """Handle requests one after the other, until the client ends or breaks the rules."""
         while True:
             try:
                 line = await asyncio.wait_for(reader.readuntil(b'\n'), self._idle_s)
             except asyncio.IncompleteReadError as error:
                 if error.partial:
-                    await self._tell(writer, self._refused('a request ends with the end of its line'))
+                    await self._tell(writer, self._refused('a request must end with a newline'))
                 return
             except asyncio.LimitOverrunError:
                 await self._tell(writer, self._refused(f'a request has at most {MAX_REQUEST_BYTES} bytes'))
                 return
             except asyncio.TimeoutError:
-                await self._tell(writer, self._refused(f'no whole line came for {self._idle_s:g} s'))
+                await self._tell(writer, self._refused(f'no complete line was received for {self._idle_s:g} s'))
                 return
             try:
                 request = _parsed(line)
@@ -171,7 +170,7 @@ class ControlSocket:
         try:
             return await asyncio.wait_for(asyncio.wrap_future(answer), self._answer_s)
         except asyncio.TimeoutError:
-            text = f'the node did not get to it within {self._answer_s:g} s; what it has begun it does as soon as it can'
+            text = f'the node did not finish it within {self._answer_s:g} s; it continues with what it has started'
             return self._refused(text)
 
     async def _tell(self, writer: asyncio.StreamWriter, answer: Mapping[str, Any]) -> None:
@@ -186,9 +185,9 @@ def _parsed(line: bytes) -> _Request:
     """Raises ValueError."""
     try:
         request = json.loads(line)
-        json.dumps(request, ensure_ascii=False).encode()  # half a surrogate pair could be told to nobody
+        json.dumps(request, ensure_ascii=False).encode()  # an unpaired surrogate could not be sent
     except RecursionError as error:
-        raise ValueError('it is nested too deep') from error
+        raise ValueError('it is nested too deeply') from error
     if not isinstance(request, dict):
         raise ValueError('it is not an object')  # noqa: TRY004 - one error for whatever is wrong with a line
     return request
@@ -196,7 +195,7 @@ def _parsed(line: bytes) -> _Request:
 
 @contextmanager
 def _listening(spool: Path, name: str) -> Iterator[socket.socket]:
-    """A socket that listens, and appears under its name only then; it takes the place of one that a dead node left behind."""
+    """A listening socket, which appears under its name only then, and replaces one that a dead node left behind."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC) as listener:
         os.fchmod(listener.fileno(), 0o600)  # before it is bound, so that its file never has another mode
         part = f'{name}.part'

@@ -1,10 +1,10 @@
 """The status as ``/diagnostics``: one entry for each topic, the spool, the store, the clock, the workers and the node itself.
 
-Levels: WARN for what needs a look (messages missed, dropped or rejected lately, whatever the watchdog finds to stand still,
-the store away, a spool that fills up, a clock that is not set or stepped lately), ERROR for what needs a hand (a thread that
-fails or failed lately, objects in quarantine lately, credentials that are refused, publishers that the robot finds and the node
-does not), STALE for a topic that nobody publishes. Plain values; ``interface`` makes the message of them,
-while somebody listens.
+Levels: WARN for what should be checked (messages recently missed, dropped or rejected, stalls, an unreachable store, a spool that
+fills up, a clock that is not set or stepped recently), ERROR for what needs action (a thread that fails or failed recently,
+objects
+recently quarantined, rejected credentials, publishers that the robot finds and the node does not), STALE for a topic without a
+publisher. Plain values; ``interface`` converts them to a message if there are subscribers.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from shadowhound_data_logger.core.status import (
 )
 
 FULL: Final = 0.8
-"""Share of its limit from which on the spool is worth a look."""
+"""Share of its limit above which the spool is a warning."""
 STEPPED_S: Final = 60.0
-"""For how long a step of the clock is worth a look."""
+"""How long a step of the clock is a warning."""
 OK, WARN, ERROR, STALE = range(4)
-"""As diagnostic_msgs/msg/DiagnosticStatus has them."""
+"""As in diagnostic_msgs/msg/DiagnosticStatus."""
 Entry = tuple[str, int, str, Mapping[str, Any]]
-"""Name, level, message, and figures."""
+"""Name, level, message, and values."""
 
 
 def plain_entries(status: NodeStatus, earlier: NodeStatus | None) -> list[dict[str, Any]]:
-    """All entries as plain values; ``earlier`` is a status of a few seconds before: what grew since then is new."""
+    """All entries as plain values; ``earlier`` is the status of a few seconds before: increases since then are recent."""
     return [
         {'name': name, 'level': level, 'message': text, 'values': {key: _text(value) for key, value in figures.items()}}
         for name, level, text, figures in entries(status, earlier or status)
@@ -79,7 +79,7 @@ def _bag(bag: BagStatus, before: BagStatus) -> Entry:
     if bag.refused:
         return 'bag', ERROR, f'{bag.bag} records nothing now: {bag.refused}', figures
     if bag.bag == before.bag and bag.dropped > before.dropped:
-        return 'bag', WARN, f'{bag.bag} dropped {bag.dropped - before.dropped} messages lately', figures
+        return 'bag', WARN, f'{bag.bag} dropped {bag.dropped - before.dropped} messages recently', figures
     return 'bag', OK, f'{bag.bag} is {"paused" if bag.paused else "recorded"}', figures
 
 
@@ -93,9 +93,9 @@ def _events(events: EventStatus, before: EventStatus) -> Entry:
         return 'events', ERROR, f'{events.bag} is not written: {events.refused}', figures
     dropped = sum(row.dropped for row in events.topics.values()) - sum(row.dropped for row in before.topics.values())
     if dropped > 0:
-        return 'events', WARN, f'{dropped} messages of an event were dropped lately', figures
+        return 'events', WARN, f'{dropped} messages of an event were dropped recently', figures
     if events.bag:
-        return 'events', OK, f'{events.bag} is written', figures
+        return 'events', OK, f'writing {events.bag}', figures
     return 'events', OK, f'the last {events.seconds:g} s are kept', figures
 
 
@@ -109,7 +109,7 @@ def _topic(row: TopicStatus, before: TopicStatus, stall: str) -> tuple[int, str]
     if about > 0:
         grown.insert(0, f'~{about} missed')
     if grown:
-        return WARN, f'{", ".join(grown)} lately'
+        return WARN, f'{", ".join(grown)} recently'
     if row.stamps:
         return WARN, describe(row.stamps)
     if row.other_types:
@@ -124,7 +124,7 @@ def _topic(row: TopicStatus, before: TopicStatus, stall: str) -> tuple[int, str]
 def _spool(spool: SpoolStatus, before: SpoolStatus) -> Entry:
     evicted, figures = spool.evicted - before.evicted, fields_of(spool)
     if evicted > 0:
-        return 'spool', ERROR, f'{evicted} objects were evicted lately: the disk or the spool is full', figures
+        return 'spool', ERROR, f'{evicted} objects were evicted recently: the disk or the spool is full', figures
     share = spool.bytes / spool.max_bytes if spool.max_bytes else 0.0
     text = f'{spool.pending} objects wait for delivery, {share:.0%} of its limit is used'
     return 'spool', WARN if share > FULL else OK, text, figures
@@ -134,22 +134,22 @@ def _store(store: StoreStatus, before: StoreStatus, stall: str) -> tuple[int, st
     state = store.state.replace('_', ' ')
     quarantined = store.quarantined - before.quarantined
     if quarantined > 0:
-        return ERROR, f'{quarantined} objects went to quarantine lately: {store.last_error}'
+        return ERROR, f'{quarantined} objects were quarantined recently: {store.last_error}'
     if store.state == 'paused':
         return ERROR, f'{state}: {store.last_error}'
     if store.state == 'store_down':
         return WARN, f'{state}: {store.last_error}'
     if store.waits_for:
-        return OK, f'{state}; ' + '; '.join(f'{name} does not hold: {why}' for name, why in store.waits_for.items())
+        return OK, f'{state}; ' + '; '.join(f'{name} is not true: {why}' for name, why in store.waits_for.items())
     if store.blocked_buckets:
-        return WARN, f'{state}; buckets that take nothing: {", ".join(store.blocked_buckets)}'
+        return WARN, f'{state}; buckets that reject everything: {", ".join(store.blocked_buckets)}'
     return (WARN, stall) if stall else (OK, state)
 
 
 def _clock(clock: ClockState) -> Entry:
     figures = fields_of(clock)
     if not clock.is_set:
-        what = 'objects go to _unsynced' if clock.gave_up else 'objects wait for their date'
+        what = 'objects are uploaded under _unsynced' if clock.gave_up else 'objects wait for their date'
         return 'clock', WARN, f'not set for {clock.unset_s:.0f} s: {what}', figures
     if clock.last_step_age_s is not None and clock.last_step_age_s < STEPPED_S:
         return 'clock', WARN, f'stepped by {clock.last_step_s:g} s {clock.last_step_age_s:.0f} s ago', figures
@@ -159,9 +159,9 @@ def _clock(clock: ClockState) -> Entry:
 def _workers(status: NodeStatus, earlier: NodeStatus) -> Entry:
     workers = status.workers
     failing = [f'{name} fails: {row.last_error}' for name, row in workers.items() if row.failing]
-    failing += [f'{name} failed lately and works again: {row.last_error}' for name, row in workers.items()
+    failing += [f'{name} failed recently and works again: {row.last_error}' for name, row in workers.items()
                 if not row.failing and row.failures > earlier.workers.get(name, row).failures]  # fmt: skip
-    failing += [f'{name} failed lately to take messages: {row.last_error}' for name, row in status.consumers.items()
+    failing += [f'{name} recently failed to take messages: {row.last_error}' for name, row in status.consumers.items()
                 if row.failures > earlier.consumers.get(name, ConsumerStatus()).failures]  # fmt: skip
     stuck = [f'{name}: {text}' for name, text in status.stalls.items() if name in workers or name == 'encode']
     figures: dict[str, Any] = {}
@@ -174,7 +174,7 @@ def _workers(status: NodeStatus, earlier: NodeStatus) -> Entry:
 
 
 def _text(value: Any) -> str:
-    """A figure for people to read; empty if it is unknown."""
+    """A value as text; empty if unknown."""
     plain = as_plain(value)
     if isinstance(plain, dict):
         return ', '.join(f'{key}: {part}' for key, part in plain.items())

@@ -1,11 +1,10 @@
-"""The front: a small process in the robot's own RMW, beside a node that listens through another one.
+"""The front: a small process in the robot's own RMW, next to a node that listens through another one.
 
-Messages cross from one vendor's DDS to the other's, services and parameters do not. So the front has the public name of the node,
-its services, parameters, ``~/mission`` and ``/diagnostics``, and has the node do what is asked for, through the control socket.
-The node starts it, and starts it again when it ends; the front ends when the node does, whatever ended that. Nothing that is
-logged depends on it.
+Messages interoperate between the DDS vendors, services and parameters do not. So the front has the public name of the node, its
+services, parameters, ``~/mission`` and ``/diagnostics``, and forwards requests to the node through the control socket. The node
+starts it, and restarts it when it exits; the front exits when the node does, for whatever reason. Logging does not depend on it.
 
-    python -m shadowhound_data_logger.node.reporting.front SOCKET PID [ROS arguments of the node]
+   python -m shadowhound_data_logger.node.reporting.front SOCKET PID [ROS arguments of the node]
 """
 
 from __future__ import annotations
@@ -37,32 +36,32 @@ from shadowhound_data_logger.ros.reader import endpoints
 from shadowhound_data_logger.spool.control import Connection
 
 COMPARE_S: Final = 2.0
-"""How often it looks at the publishers of what is logged, or more seldom: it takes at most so much of the time."""
+"""Interval between comparisons of publishers, or longer: they take at most this share of the time."""
 COMPARE_SHARE, LONGEST_COMPARE_S = 0.05, 20.0
 MAX_REPORTED, MAX_LETTERS = 64, 150
 """Publishers in a report, and letters of a name: together they fit into a request."""
 LOOK_S: Final = 1.0
-"""How often it asks what is new, and so finds out that the node is no more."""
+"""Interval of polling the node, which also detects that it has exited."""
 STEADY_S: Final = 60.0
-"""A front that has lived for so long is one that works."""
+"""A front that has run for this long is working."""
 LONGEST_PAUSE_S: Final = 60.0
-"""Between two starts of one that ends again and again: each takes half a second of CPU."""
+"""Maximum pause between restarts of a front that exits repeatedly: each takes half a second of CPU."""
 POLL_S: Final = 1.0
 END_S: Final = 2.0
-"""For one that is told to end; it is killed then."""
+"""Time to exit on request; then it is killed."""
 SECRET: Final = ('AWS_', 'MLFLOW_', 'NOTIFY_', 'WATCHDOG_')
-"""Beginnings of variables that are the node's alone."""
+"""Prefixes of variables that are only for the node."""
 PACKAGE: Final = str(Path(__file__).resolve().parents[2])
 
 
 class Front:
-    """Starts the front process for the node and watches it.
+    """Starts the front process for the node and supervises it.
 
-    Life: New; open once; ``stop``, and ``close`` when there is time to wait. Owns the thread ``front``.
+    Lifecycle: New; open once; ``stop``, and ``close`` when there is time to wait. Owns the thread ``front``.
     """
 
     def __init__(self, arguments: Sequence[str], environ: Mapping[str, str]) -> None:
-        """``arguments`` are those of ROS that the node was started with, ``environ`` is what it was before we changed it."""
+        """``arguments`` are the ROS arguments of the node, ``environ`` its environment before our changes."""
         self._arguments = arguments
         path = os.pathsep.join(filter(None, (environ.get('PYTHONPATH'), PACKAGE)))
         self._environ = {name: value for name, value in environ.items() if not name.startswith(SECRET)} | {'PYTHONPATH': path}
@@ -77,7 +76,7 @@ class Front:
         self.worker.start()
 
     def stop(self) -> None:
-        """Tell it to end; does not wait."""
+        """Request its exit; does not wait."""
         self.worker.stop()
         self._over.set()
 
@@ -86,17 +85,17 @@ class Front:
         self.worker.join(2 * END_S)
 
     def _step(self) -> None:
-        """Start one where there is none, and see that it lives; raises DataLoggerError when it ended."""
+        """Start a front if there is none, and check that it runs; raises DataLoggerError when it exited."""
         if self._process is None:
             command = [sys.executable, '-m', __name__, str(self._socket), str(os.getpid()), *self._arguments]
-            # A session of its own: Ctrl-C in a terminal is for the node, which has to end first.
+            # A separate session: Ctrl-C in a terminal is for the node, which must exit first.
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=self._environ, start_new_session=True)
         steady_s = time.monotonic() + STEADY_S
         while not self._over.wait(POLL_S):
             if self._process.poll() is not None:
                 code, self._process = self._process.returncode, None
                 how = f'with exit code {code}' if code >= 0 else f'by signal {-code}'
-                raise DataLoggerError(f'it ended {how}', remedy='meanwhile the command line does the same: shadowhound-data node')
+                raise DataLoggerError(f'it exited {how}', remedy='until then use the command line: shadowhound-data node')
             if time.monotonic() >= steady_s or not self.worker.failing:
                 return
         self._end(self._process)
@@ -114,7 +113,7 @@ class Front:
 class PublicNode:
     """Offers the logger's services in the front process: a ROS node with the logger's public name.
 
-    Made once the node answers; ``poll`` every second.
+    Created once the node answers; ``poll`` every second.
     """
 
     def __init__(self, connection: Connection, node: Node) -> None:
@@ -122,29 +121,29 @@ class PublicNode:
         self._connection = connection
         self._node = node
         self.lost = ''
-        """Why the node cannot be asked any more; empty while it can."""
+        """Why the node cannot be reached any more; empty while it can."""
         self._follows = False
         self._mission: Mapping[str, Any] = {}
         self._topics: Sequence[str] = ()
         self._gids: frozenset[str] = frozenset()
         self._reported: frozenset[str] = frozenset()
-        """Of these a report goes on to tell, however many others come meanwhile."""
+        """Publishers that each report must include, however many others appear."""
         self._compare_s = 0.0
         described: list[Described] = connection.ask('parameters')['parameters']
         self._live = [each['name'] for each in described if not each['read_only']]
         for each in described:
             declare(node, each)
         node.add_on_set_parameters_callback(self._set)
-        self._interface = Interface(node, self._ask)
+        self._interface = Interface(node, self._handle)
         self._interface.open()
 
     def poll(self) -> None:
-        """Follow what has changed in the node (the active mission, parameters that the command line set), and tell how it is."""
-        answer = self._ask({'do': 'mission'})
+        """Follow changes of the node (active mission, parameters set elsewhere), and publish diagnostics."""
+        answer = self._handle({'do': 'mission'})
         if answer['ok'] and answer['mission'] != self._mission:
             self._mission = answer['mission']
-            self._interface.tell_mission(self._mission)
-        answer = self._ask({'do': 'get', 'names': self._live})
+            self._interface.publish_mission(self._mission)
+        answer = self._handle({'do': 'get', 'names': self._live})
         if answer['ok']:
             self._follow(answer['values'])
         if time.monotonic() >= self._compare_s:
@@ -152,7 +151,7 @@ class PublicNode:
         self._interface.publish_diagnostics()
 
     def _compare(self) -> None:
-        """Tell the node which publishers of its topics it has not found, as far as that is known here."""
+        """Report publishers of the node's topics that it has not found."""
         began_s = time.monotonic()
         found: dict[str, list[list[str]]] = {}
         room = MAX_REPORTED
@@ -164,13 +163,13 @@ class PublicNode:
             if others:
                 found[topic] = [[each.gid, _ascii(each.type), _ascii(each.node)] for each in others]
         self._reported = frozenset(gid for each in found.values() for gid, _, _ in each)
-        answer = self._ask({'do': 'compare', 'found': found})
+        answer = self._handle({'do': 'compare', 'found': found})
         if answer['ok']:
             self._topics, self._gids = answer['topics'], frozenset(answer['gids'])
         self._compare_s = began_s + min(LONGEST_COMPARE_S, max(COMPARE_S, (time.monotonic() - began_s) / COMPARE_SHARE))
 
-    def _ask(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """As ``Commands.answer``; that nobody answers is an answer as well."""
+    def _handle(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
+        """As ``Commands.answer``; an unreachable node is an answer as well."""
         try:
             return self._connection.ask(**request)
         except NodeUnavailable as error:
@@ -178,11 +177,11 @@ class PublicNode:
             return {'ok': False, 'robot': '', 'error': self.lost}
 
     def _set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Whether the node takes these values."""
+        """Whether the node accepts these values."""
         values = {each.name: plain(each.value) for each in parameters if each.name.partition('.')[0] not in NOT_SETTINGS}
         if self._follows or not values:
             return SetParametersResult(successful=True)
-        answer = self._ask({'do': 'set', 'values': values})
+        answer = self._handle({'do': 'set', 'values': values})
         return SetParametersResult(successful=answer['ok'], reason='' if answer['ok'] else answer['error'])
 
     def _follow(self, values: Mapping[str, Any]) -> None:
@@ -196,24 +195,24 @@ class PublicNode:
 
 
 def _ascii(name: str) -> str:
-    """As ROS has names; who is not a ROS may have others."""
+    """Names as in ROS; programs without ROS may have others."""
     return name[:MAX_LETTERS].encode('ascii', 'replace').decode()
 
 
 def main() -> int:
-    """The process; it ends with the node, or when it is told to."""
+    """The process; it exits with the node, or on request."""
     socket, pid, arguments = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
     try:
         with closing(Connection(socket.parent, socket.name)) as connection:
-            if connection.ask('describe')['pid'] == pid:  # another one starts a front of its own
+            if connection.ask('describe')['pid'] == pid:  # another one starts its own front
                 _serve(connection, arguments)
-    except (OSError, NodeUnavailable, RuntimeError) as error:  # the last one of rcl, where there is no such RMW
-        print(f'the front ends: {error}', file=sys.stderr)  # noqa: T201 - it may have no logger yet
-    return 1  # as far as the node still is there, this was not an end that it asked for
+    except (OSError, NodeUnavailable, RuntimeError) as error:  # the last case is rcl's, if this RMW is not installed
+        print(f'the front exits: {error}', file=sys.stderr)  # noqa: T201 - it may have no logger yet
+    return 1  # if the node still runs, it did not request this exit
 
 
 def _serve(connection: Connection, arguments: Sequence[str]) -> None:
-    """Until the node, or this process, is to end."""
+    """Serve until the node or this process stops."""
     rclpy.init(args=[sys.argv[0], *arguments])
     node = Node(NODE)
     executor = SingleThreadedExecutor()
@@ -227,7 +226,7 @@ def _serve(connection: Connection, arguments: Sequence[str]) -> None:
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + LOOK_S
                 public.poll()
-    except (ExternalShutdownException, KeyboardInterrupt, RuntimeError):  # rcl raises the last one in the middle of its shutdown
+    except (ExternalShutdownException, KeyboardInterrupt, RuntimeError):  # rcl raises the last one during its shutdown
         if rclpy.ok():
             raise
     finally:

@@ -1,6 +1,6 @@
 """Builds the status of the node (``core.status``) once per second on the main thread, and writes its file.
 
-``shadowhound-data status`` reads it from ``spool/status-<robot>.json``; ``diagnostics`` makes a message of it.
+``shadowhound-data status`` reads it from ``spool/status-<robot>.json``; ``diagnostics`` converts it to a message.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ log = logging.getLogger(__name__)
 
 PERIOD_S: Final = 1.0
 WINDOW_S: Final = 5.0
-"""Rates are over so long, and what is new is new for so long."""
+"""The window of rates, and of what counts as recent."""
 SOCKETS_S: Final = 10.0
-"""How often the system is asked what became of the middleware's sockets."""
+"""Interval between queries of the middleware's sockets."""
 _NOTHING: Final = Totals()
 
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """The stages that the status asks."""
+    """The stages that the status reads."""
 
     spool: Spool
     intake: Intake
@@ -81,14 +81,14 @@ class Stages:
     middleware: Middleware
     front: Front | None = None
     unheard: Unheard | None = None
-    """None where the node listens through the RMW of the robot."""
+    """None if the node uses the robot's RMW."""
     requests: RequestServer | None = None
-    """None where nothing is kept until somebody asks for it."""
+    """None if no data is kept until requested."""
     rules: UploadRules | None = None
 
     @property
     def workers(self) -> Sequence[Worker]:
-        """All threads of the node but the main one."""
+        """All threads of the node except the main one."""
         own = [self.intake.worker, self.writer.worker, self.mission.worker, self.control.worker]
         own += [self.front.worker] if self.front is not None else []
         own += [self.requests.worker] if self.requests is not None else []
@@ -98,7 +98,7 @@ class Stages:
 class Status:
     """Gathers the state of all stages, and writes it to the status file.
 
-    New; ``poll`` once a second, ``write`` what it found. ``earlier`` is the status of up to ``WINDOW_S`` before the last.
+    New; ``poll`` once per second, ``write`` its result. ``earlier`` is the status of up to ``WINDOW_S`` before the last.
     """
 
     def __init__(self, stages: Stages, settings: Settings, clock: ClockWatch, target: str,
@@ -119,7 +119,7 @@ class Status:
 
     @property
     def latest(self) -> NodeStatus | None:
-        """The last one."""
+        """The newest status."""
         return self._past[-1][2] if self._past else None
 
     @property
@@ -156,7 +156,7 @@ class Status:
         return status
 
     def write(self, status: NodeStatus) -> None:
-        """Replace the status file atomically. A disk that refuses it is logged once."""
+        """Replace the status file atomically. A failure is logged once."""
         try:
             with replacing(self._path, mode=0o600) as file:
                 file.write(dumps(status))
@@ -192,7 +192,7 @@ class Status:
                            rate_hz=rate_hz, age_s=age_s)  # fmt: skip
 
     def _middleware(self, now_s: float) -> MiddlewareStatus:
-        """Its sockets are looked up less often: that takes a third of the time of the whole status."""
+        """Its sockets are queried less often: that takes a third of the time of the complete status."""
         unheard = self._stages.unheard
         if now_s >= self._sockets_due_s:
             self._sockets_due_s = now_s + SOCKETS_S
@@ -200,12 +200,12 @@ class Status:
         return replace(self._sockets, unheard=unheard.rows() if unheard is not None else None)
 
     def _bag(self) -> BagStatus:
-        """The recording, with the messages of this session by topic."""
+        """The recording, with this session's messages by topic."""
         return replace(self._stages.recorder.status(), topics=self._stages.spool.accounts.totals(BAG),
                        left_out=self._stages.intake.left_out(self._stages.bags))  # fmt: skip
 
     def _events(self) -> EventStatus:
-        """Ring and events, with the messages of events of this session by topic."""
+        """Ring and events, with this session's event messages by topic."""
         left_out = sum(self._stages.intake.left_out(each) for each in self._stages.event_buffer.consumers)
         return replace(self._stages.event_buffer.events.status(), topics=self._stages.spool.accounts.totals(EVENT),
                        left_out=left_out)  # fmt: skip

@@ -24,7 +24,7 @@ from shadowhound_data_logger.formats.types import MessageTypes
 from shadowhound_data_logger.node.intake import extra_topics as module
 from shadowhound_data_logger.node.intake.consumers import TopicChoice
 from shadowhound_data_logger.node.intake.extra_topics import ExtraTopics
-from shadowhound_data_logger.node.intake.subscriber import Surroundings
+from shadowhound_data_logger.node.intake.subscriber import SubscriberContext
 from shadowhound_data_logger.ros.reader import PolledGroup
 from shadowhound_data_logger.spool.accounts import Accounts
 
@@ -61,7 +61,7 @@ class Recording:
                                          leave=lambda _: None)  # fmt: skip
         self.group = PolledGroup()
         stamps = StampRule(SystemClock.of_this_machine())
-        around = Surroundings(node, self.group, Accounts(), MessageTypes(), stamps)
+        around = SubscriberContext(node, self.group, Accounts(), MessageTypes(), stamps)
         self.extra = ExtraTopics(around, [self.bags], {})
         self.now_s = time.monotonic()
 
@@ -149,7 +149,7 @@ def test_names_that_come_and_go_are_few(robot: Node, recording: Recording, monke
 def test_which_topics(named: tuple[str, ...], regex: str, exclude: str, wanted: tuple[str, ...]) -> None:
     """Those that are named, or match and are neither excluded nor hidden (unless the regex has /_); otherwise the sensors'."""
     choice = TopicChoice(BagSettings(regex=regex, exclude=exclude), named)
-    assert choice.asks_graph is bool(regex)
+    assert choice.needs_graph is bool(regex)
     assert choice.wanted(SENSORS, GRAPH) == set(wanted)
 
 

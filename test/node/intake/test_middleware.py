@@ -118,7 +118,7 @@ def test_the_first_prefix_counts(tmp_path: Path) -> None:
     [
         ({'rmw_cyclonedds_cpp': '4.0.2'}, CYCLONE, 'is not installed'),
         ({'rmw_fastrtps_cpp': '99.1.0'}, CYCLONE, '99.1 has not been tested with it'),
-        (KILTED, {'RMW_IMPLEMENTATION': 'rmw_zenoh_cpp'}, 'does not speak to rmw_zenoh_cpp'),
+        (KILTED, {'RMW_IMPLEMENTATION': 'rmw_zenoh_cpp'}, 'does not interoperate with rmw_zenoh_cpp'),
         (KILTED, {**CYCLONE, 'ROS_SECURITY_ENABLE': 'true'}, 'ROS_SECURITY_ENABLE'),
         (KILTED, {**CYCLONE, 'CYCLONEDDS_URI': '<Discovery><Tag>x</Tag></Discovery>'}, 'Discovery/Tag'),
     ],

@@ -55,7 +55,7 @@ def test_no_network(interfaces: Path, tmp_path: Path) -> None:
 def test_a_system_that_does_not_tell(interfaces: Path) -> None:
     refused = OSError(95, 'Operation not supported')
     found = wifi_networks(interfaces, Kernel({'wlan0': refused, 'wlan1': refused}))
-    assert found == 'the system does not tell the network of wlan1: Operation not supported'
+    assert found == 'the system does not report the network of wlan1: Operation not supported'
     assert wifi_networks(interfaces, Kernel({'wlan0': refused, 'wlan1': b'lab'})) == {'lab'}
     assert isinstance(wifi_networks(interfaces / 'nowhere'), str)
 

@@ -173,7 +173,7 @@ def test_a_condition_triggers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('text', 'cdr', 'said'), [
     ('low: /x:nothing < 20', float64(1.0), 'has no number nothing'),
-    ('low: /x:data < 20', b'\0\1\0\0\0', 'tells no condition anything'),
+    ('low: /x:data < 20', b'\0\1\0\0\0', 'cannot be used in conditions'),
 ])  # fmt: skip
 def test_what_tells_nothing_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, cdr: bytes,
                                          said: str) -> None:  # fmt: skip

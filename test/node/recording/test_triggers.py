@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from shadowhound_data_logger.core.expression import conditions
 from shadowhound_data_logger.missions.journal import Journal
 from shadowhound_data_logger.node.recording.mission_observer import BATTERY_STATE, battery_pct, number_at
-from shadowhound_data_logger.node.recording.triggers import LATE_NS, JournalTail, Judge
+from shadowhound_data_logger.node.recording.triggers import LATE_NS, ConditionState, JournalTail
 
 NOW_NS = 1_760_788_800 * 10**9
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -20,7 +20,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 def fired(text: str, values: list[float], period_s: float = 1.0) -> list[int]:
     """The places of the values, a period apart, at which the condition triggered."""
     (condition,) = conditions([text])
-    judge = Judge(condition)
+    judge = ConditionState(condition)
     return [place for place, value in enumerate(values) if judge.poll(value, place * period_s)]
 
 
@@ -50,7 +50,7 @@ def test_what_is_no_number_tells_nothing() -> None:
 def test_the_charge_of_a_battery_state_is_compared_as_the_message_has_it() -> None:
     """From 0 to 1: only ``battery_pct`` is converted."""
     (condition,) = conditions(['low: battery:percentage < 0.3'])
-    judge, kind = Judge(condition), STORE.types[BATTERY_STATE]
+    judge, kind = ConditionState(condition), STORE.types[BATTERY_STATE]
     stamp, none = STORE.types['builtin_interfaces/msg/Time'](0, 0), np.empty(0, np.float32)
     told = []
     for share in (0.73, 0.25, float('nan')):

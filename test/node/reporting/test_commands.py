@@ -240,7 +240,7 @@ def test_what_cannot_be_done_is_an_answer(request_: Mapping[str, Any], words: st
 def test_a_defect_in_a_command_is_an_answer(caplog: pytest.LogCaptureFixture) -> None:
     """The node goes on; the log has the traceback."""
     done, words = ask(Stages().commands(), 'bag split')
-    assert (done, words) == (False, 'it failed, which is a defect of this program: OSError: the disk burns')
+    assert (done, words) == (False, 'it failed because of a bug in this program: OSError: the disk burns')
     assert caplog.records[-1].exc_info
 
 
@@ -323,7 +323,7 @@ def test_somebody_at_the_robot_asks_for_what_it_keeps() -> None:
     """The answer has the id of the request; what nobody can ask for is refused, and where nothing is kept all is."""
     stages = Stages()
     assert ask(stages.commands(), 'pull', want={'sensor': 'camera'}) == (
-        False, 'nothing is kept here: ship of all sensors and of bag is always'
+        False, 'no data is kept here: ship of all sensors and of bag is always'
     )  # fmt: skip
     spool: Any = None
     stages.requests = RequestServer(spool, spool, KeepSettings(), 'thor', FakeClock(), put=spool, released=spool, cutter=spool)

@@ -175,7 +175,7 @@ def test_half_a_line_is_none(serve: Callable[..., Serving]) -> None:
         client.sendall(b'{"do": "flush"}')
         client.shutdown(socket.SHUT_WR)
         (refused,) = heard(client)
-    assert 'ends with the end of its line' in refused['error']
+    assert 'must end with a newline' in refused['error']
     assert serving.asked == []
 
 
@@ -190,7 +190,7 @@ def test_a_client_has_to_send_a_line(serve: Callable[..., Serving], drips: bool)
                     client.sendall(b' ')
                     time.sleep(SHORT_S / 20)
         (refused,) = heard(client)
-    assert f'no whole line came for {SHORT_S:g} s' in refused['error']
+    assert f'no complete line was received for {SHORT_S:g} s' in refused['error']
     assert works(serving)
 
 
@@ -215,7 +215,7 @@ def test_there_are_so_many_clients_at_most(serve: Callable[..., Serving]) -> Non
     answers = [json.loads(client.makefile().readline()) for client in clients]
     assert [answer['ok'] for answer in answers].count(True) == MAX_CLIENTS
     assert {answer['error'] for answer in answers if not answer['ok']} == {
-        f'{MAX_CLIENTS} clients are connected, which is the most there may be'
+        f'{MAX_CLIENTS} clients are connected, which is the maximum'
     }
     for client in clients:
         client.close()
@@ -229,7 +229,7 @@ def test_an_answer_has_a_deadline(serve: Callable[..., Serving]) -> None:
     with serving.hold, closing(Connection(serving.spool, 'control.sock', WAIT_S)) as connection:
         answer = connection.ask('flush')
     assert not answer['ok']
-    assert f'did not get to it within {SHORT_S:g} s' in answer['error']
+    assert f'did not finish it within {SHORT_S:g} s' in answer['error']
     assert works(serving)
     assert len(serving.asked) == 1
 

@@ -43,7 +43,7 @@ class Watch:
         self.imu['age_s'] = None if self.heard_s is None else self.now_s - self.heard_s
         return dict(self.dog.poll(parse(NodeStatus, self.status), self.now_s))
 
-    def hear(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
+    def observe(self, messages: int = 1, times: int = 1, every_s: float = 1.0) -> None:
         """So many messages before each of so many looks."""
         for _ in range(times):
             self.imu['received'] += messages
@@ -74,35 +74,35 @@ def stages(watch: Watch) -> Watch:
 def test_a_topic_that_stops_while_its_publisher_lives(watch: Watch, caplog: pytest.LogCaptureFixture) -> None:
     """Told after five seconds, with its rate and the cause, once; and when it goes on, that too."""
     caplog.set_level(logging.INFO)
-    watch.hear(100, times=20)
+    watch.observe(100, times=20)
     found = watch.wait(6)
-    assert found == {'/imu': 'silent for 6 s after 100 Hz, though its publisher is there; poll at the program that publishes it'}
+    assert found == {'/imu': 'silent for 6 s after 100 Hz, though its publisher is there; check the program that publishes it'}
     assert '/imu' in watch.poll()
-    watch.hear(100)
+    watch.observe(100)
     assert watch.wait(5) == {}
     assert [record.getMessage() for record in caplog.records] == [f'/imu: {found["/imu"]}', '/imu: working again']
 
 
 def test_a_slow_topic_is_given_its_time(watch: Watch) -> None:
     """Ten of its own periods: one that comes every three seconds is not missed for half a minute."""
-    watch.hear(times=12, every_s=3.0)
+    watch.observe(times=12, every_s=3.0)
     assert '/imu' in watch.wait(31)
 
 
 def test_a_connection_that_is_gone_is_another_cause(watch: Watch) -> None:
     """The publisher is in the graph, the subscription is matched with none."""
-    watch.hear(times=20)
+    watch.observe(times=20)
     watch.imu['matched'] = 0
-    assert 'look at the network' in watch.wait(11)['/imu']
+    assert 'check the network' in watch.wait(11)['/imu']
 
 
 def test_topics_without_a_rhythm_are_never_missed(watch: Watch) -> None:
     """A latched map that came once, a button, a burst at the start: nobody knows when the next one is due."""
-    watch.hear()
+    watch.observe()
     assert watch.wait(600) == {}
-    watch.hear(7)
-    watch.hear(1, every_s=200.0)
-    watch.hear(3, times=8)
+    watch.observe(7)
+    watch.observe(1, every_s=200.0)
+    watch.observe(3, times=8)
     assert watch.wait(600) == {}
 
 
@@ -110,18 +110,18 @@ def test_topics_that_may_be_silent_are_not_missed(watch: Watch) -> None:
     """Those kept on change and those that are latched, whether they came evenly before or never came."""
     watch.imu['may_be_silent'] = True
     assert watch.wait(100) == {}
-    watch.hear(times=30)
+    watch.observe(times=30)
     assert watch.wait(100) == {}
 
 
 def test_a_publisher_that_left_is_not_missed(watch: Watch) -> None:
     """That nobody publishes it any more is told as such; a new publisher begins a new rhythm."""
-    watch.hear(times=20)
+    watch.observe(times=20)
     watch.imu['publishers'] = watch.imu['matched'] = 0
     assert watch.wait(60) == {}
     watch.imu['publishers'] = watch.imu['matched'] = 1
-    assert 'connected for 31 s and not one message' in watch.wait(32)['/imu']
-    watch.hear()
+    assert 'connected for 31 s but no message' in watch.wait(32)['/imu']
+    watch.observe()
     assert watch.wait(100) == {}
 
 
@@ -140,7 +140,7 @@ def test_a_topic_that_nobody_can_listen_to_here(watch: Watch) -> None:
 
 def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
     """Nor when it is switched on again: what it did before does not count."""
-    watch.hear(100, times=20)
+    watch.observe(100, times=20)
     watch.imu['enabled'] = False
     assert watch.wait(60) == {}
     watch.imu['enabled'] = True
@@ -150,7 +150,7 @@ def test_a_topic_that_is_off_is_not_missed(watch: Watch) -> None:
 @pytest.mark.parametrize('trouble', [{'busy_s': 6.0}, {'failing': True}])
 def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: dict[str, Any]) -> None:
     """Then all topics seem to be silent, and none of them is at fault."""
-    watch.hear(100, times=20)
+    watch.observe(100, times=20)
     watch.workers['intake'] |= trouble
     for _ in range(20):
         assert set(watch.poll()) <= {'intake'}
@@ -158,8 +158,8 @@ def test_an_intake_that_takes_nothing_is_the_one_cause(watch: Watch, trouble: di
 
 @pytest.mark.parametrize(
     ('name', 'busy_s', 'words'),
-    [('intake', 5.1, 'takes no messages for 5 s'), ('spool-writer', 12.1, 'its disk does not answer'),
-     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions are not followed for 31 s'),
+    [('intake', 5.1, 'has taken no messages for 5 s'), ('spool-writer', 12.1, 'its disk does not respond'),
+     ('encode-0', 61.0, 'one batch has taken 61 s'), ('mission', 31.0, 'missions have not been followed for 31 s'),
      ('event-writer', 31.0, 'nothing more is written to its bag for 31 s')],
 )  # fmt: skip
 def test_a_round_that_hangs(stages: Watch, name: str, busy_s: float, words: str) -> None:
@@ -190,8 +190,8 @@ def test_a_pool_that_encodes_nothing(stages: Watch) -> None:
     ('store', 'words'),
     [
         ({'state': 'shipping', 'in_flight': 4}, '4 uploads hang'),
-        ({'state': 'shipping', 'deferred': 2, 'last_error': 'broken'}, '2 objects fail again and again: broken'),
-        ({'state': 'idle'}, 'a defect of this program'),
+        ({'state': 'shipping', 'deferred': 2, 'last_error': 'broken'}, '2 objects fail repeatedly: broken'),
+        ({'state': 'idle'}, 'a bug in this program'),
     ],
 )
 def test_a_drain_that_sends_nothing(stages: Watch, store: dict[str, Any], words: str) -> None:

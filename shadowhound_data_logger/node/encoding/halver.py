@@ -1,4 +1,4 @@
-"""Half of the pictures and clouds of an object that the robot keeps, for ``shipping/thinning.py``."""
+"""Halves the rate of images and clouds in an object kept on the robot, for ``shipping/thinning.py``."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ _ALWAYS: Final = 1 << 63
 _UNREADABLE: Final = (ValueError, LookupError, zipfile.BadZipFile, tarfile.TarError, NotImplementedError, EOFError)
 
 
-class Halving:
-    """Call it with an object; one thread. What it wrote is there until the next call, and gone with ``bags.kept.sweep``."""
+class Halver:
+    """Call it with an object; one thread. Its output exists until the next call, and is deleted by ``bags.kept.sweep``."""
 
-    def __init__(self, home: Path, robot: str, least_hz: float) -> None:
-        """Nothing goes below ``least_hz``."""
+    def __init__(self, home: Path, robot: str, min_hz: float) -> None:
+        """No topic is thinned below ``min_hz``."""
         self._folder = home / CUTTING / robot / 'thinned'
-        self._least_hz = least_hz
+        self._min_hz = min_hz
 
     def __call__(self, item: ThinnableObject) -> Thinned | None:
-        """As ``ship.thinning.Halve``. Raises BagDamaged for what cannot be read, OSError."""
+        """As ``ship.thinning.Halve``. Raises OSError, and BagDamaged for an unreadable object."""
         try:
             if item.path.suffix == '.mcap':
                 return self._slice(item)
@@ -47,7 +47,7 @@ class Halving:
             raise BagDamaged(str(error), path=str(item.path)) from error
 
     def _archive(self, item: ThinnableObject) -> Thinned | None:
-        if not may_halve(item.samples, span_of(item.samples * item.step, item.t_start_ns, item.t_end_ns), self._least_hz):
+        if not may_halve(item.samples, span_of(item.samples * item.step, item.t_start_ns, item.t_end_ns), self._min_hz):
             return None
         samples = list(_samples(item.path, item.content_type).items())
         if len(samples) != item.samples:
@@ -86,10 +86,10 @@ class Halving:
         return Thinned(FileBody(path, info.bytes, info.sha256), info.messages, dict(lost))
 
     def _halvable(self, index: McapIndex) -> set[int]:
-        """Channels with pictures or clouds of which half may go."""
+        """Channels with images or clouds that can be halved."""
         return {
             number for number, channel in index.channels.items()
-            if channel.type in BULK and may_halve(index.counts.get(number, 0), index.t_end_ns - index.t_start_ns, self._least_hz)
+            if channel.type in BULK and may_halve(index.counts.get(number, 0), index.t_end_ns - index.t_start_ns, self._min_hz)
         }  # fmt: skip
 
 
@@ -115,12 +115,12 @@ def _files(path: Path, content_type: str) -> Iterator[tuple[str, bytes]]:
 
 
 def _members(kept: Mapping[str, Mapping[str, bytes]], samples: Mapping[str, Mapping[str, bytes]]) -> Iterator[ArchiveFile]:
-    """As the encoder has them: a repeat names the file that it repeats, of which the first one left has the content."""
+    """Archive members as the encoder writes them: a repeat names its original; the first one left has the content."""
     first: dict[str, str] = {}
     for sample, files in kept.items():
-        said = orjson.loads(files[f'{sample}.json'])
-        stamp_ns = int(said['stamp_ns'])
-        of = said.pop('repeat_of', None)
+        found = orjson.loads(files[f'{sample}.json'])
+        stamp_ns = int(found['stamp_ns'])
+        of = found.pop('repeat_of', None)
         if of is None:
             name, body = next((name, body) for name, body in files.items() if not name.endswith('.json'))
             origin = name
@@ -128,8 +128,8 @@ def _members(kept: Mapping[str, Mapping[str, bytes]], samples: Mapping[str, Mapp
             origin, body = of, samples[of.partition('.')[0]][of]
             name = f'{sample}.{of.partition(".")[2]}'
         if origin in first:
-            said['repeat_of'] = first[origin]
+            found['repeat_of'] = first[origin]
         else:
             first[origin] = name
             yield ArchiveFile(name, stamp_ns, body)
-        yield ArchiveFile(f'{sample}.json', stamp_ns, orjson.dumps(said))
+        yield ArchiveFile(f'{sample}.json', stamp_ns, orjson.dumps(found))
