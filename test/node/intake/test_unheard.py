@@ -45,8 +45,8 @@ def test_it_is_said_after_a_while_and_ends_when_it_is_heard(caplog: pytest.LogCa
     assert robot.texts == {}
     robot.wait(4 * STEP_S)
     assert robot.texts == {
-        '/imu': '/imu is not fully received: rmw_theirs finds a publisher (of /go2_driver) that rmw_ours, by which the node listens, '
-        'has not found; what it sends is not logged'
+        '/imu': '/imu is not fully received: rmw_theirs finds a publisher (of /go2_driver) that rmw_ours, by which '
+        'the node listens, has not found; what it sends is not logged'
     }
     (told,) = caplog.records
     assert told.levelno == logging.ERROR
