@@ -10,10 +10,10 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from shadowhound_data_logger.cli.common import ExitCode, exit_code, the_store
+from shadowhound_data_logger.cli.common import ExitCode, exit_code, the_home, the_store
 from shadowhound_data_logger.cli.output import number, plain, print_json, print_page, shown_time
 from shadowhound_data_logger.cli.progress import progress
-from shadowhound_data_logger.shipping.audit import KEYS, THREADS, Audit, audit
+from shadowhound_data_logger.shipping.audit import KEYS, THREADS, Audit, AuditProgress, audit
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.status import targets
 from shadowhound_data_logger.stores.verify import KINDS
@@ -22,15 +22,13 @@ from shadowhound_data_logger.stores.verify import KINDS
 def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> ExitCode:
     """Ask the store that the environment names; 0 if all objects are there unchanged, otherwise 1."""
     with the_store(THREADS) as store, closing(Deliveries(spool)) as deliveries:
-        deliveries.open(f'{"deep" if deep else "head"} {store.describe()}', again=again)
-        earlier, known = deliveries.verified(), deliveries.known()
-        with progress('read back' if deep else 'checked', known, of='objects') as bar:
-            bar.have(earlier)
-            found = audit(deliveries, store, deep=deep, tell=bar.have)
-        said = _said(found, deliveries, store.describe(), deep=deep, earlier=earlier)
+        deliveries.open()
+        question = f'{deliveries.first_session()} {store.describe()} {deep}'
+        with (AuditProgress(the_home() / 'verify', question, again=again) as earlier,
+              progress('read back' if deep else 'checked', deliveries.known(), of='objects') as bar):  # fmt: skip
+            found = audit(deliveries.pages(), earlier, store, deep=deep, tell=bar.have)
+        said = _said(found, deliveries, store.describe(), deep=deep)
         said['delivered_to'] = targets(spool)
-        if found.away is None:
-            deliveries.finish()
     if as_json:
         print_json(said)
     else:
@@ -38,11 +36,11 @@ def verify_delivered(spool: Path, *, deep: bool, again: bool, as_json: bool) -> 
     return exit_code(finding=not said['ok'])
 
 
-def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool, earlier: int) -> dict[str, Any]:
+def _said(found: Audit, deliveries: Deliveries, store: str, *, deep: bool) -> dict[str, Any]:
     return {
         'store': store, 'deep': deep, 'since_ns': deliveries.since_ns(),
         'known': deliveries.known(), 'forgotten': deliveries.forgotten(),
-        'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
+        'asked': found.asked, 'asked_earlier': found.earlier, 'sound': found.earlier + found.sound,
         'findings': findings(found),
         'unreachable': None if found.away is None else str(found.away), 'ok': found.away is None and not found.counts,
     }  # fmt: skip

@@ -39,7 +39,7 @@ from shadowhound_data_logger.cli.progress import progress
 from shadowhound_data_logger.cli.question import asking, by_option, question, quietly, report_skipped
 from shadowhound_data_logger.core.clock import SECOND, SystemClock, utc
 from shadowhound_data_logger.core.times import moment
-from shadowhound_data_logger.shipping.audit import Audit, audit
+from shadowhound_data_logger.shipping.audit import Audit, AuditProgress, audit
 from shadowhound_data_logger.stores import open_reader
 from shadowhound_data_logger.stores.verify import KINDS
 
@@ -93,14 +93,10 @@ def lake_verify(*, flags: Mapping[str, Any], catalog: Path | None, deep: bool, a
     with closing(open_reader(store)) as target:
         where = target.describe()
         asked = json.dumps([where, deep, catalog and str(catalog.resolve()), flags], sort_keys=True)
-        with library.Unfinished(rows, the_home() / 'verify', asked, again=again) as left:
-            earlier = left.earlier()
-            with progress('read back' if deep else 'checked', len(rows), of='objects') as bar:
-                bar.have(earlier)
-                found = audit(left, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
-            if found.away is None:
-                left.finish()
-    said = {'store': where, 'catalog': catalog and str(catalog), **_said(rows, found, lacking, earlier, deep=deep)}
+        with (AuditProgress(the_home() / 'verify', asked, again=again) as earlier,
+              progress('read back' if deep else 'checked', len(rows), of='objects') as bar):  # fmt: skip
+            found = audit(rows.pages(), earlier, target, deep=deep, threads=THREADS, keys=None, tell=bar.have)
+    said = {'store': where, 'catalog': catalog and str(catalog), **_said(rows, found, lacking, deep=deep)}
     said['took_s'] = round(time.monotonic() - begun_s, 3)
     said['left_out'] = [asdict(one) for one in left_out]
     said['ok'] = said['ok'] and not said['left_out']
@@ -238,14 +234,14 @@ def _share(part: float, whole: float) -> str:
     return '100 %' if part == whole else f'{min(99.9, max(0.1, 100 * part / whole)):.1f} %'
 
 
-def _said(rows: Rows, found: Audit, lacking: list[Any], earlier: int, *, deep: bool) -> dict[str, Any]:
+def _said(rows: Rows, found: Audit, lacking: list[Any], *, deep: bool) -> dict[str, Any]:
     piled = findings(found)
     if lacking:
         first = [{'bucket': one.bucket, 'key': one.key, 'detail': f'{one.size} bytes'} for one in lacking]
         piled[UNLISTED] = {'count': len(first), 'first': first}
     return {
-        'deep': deep, 'known': len(rows), 'asked': found.asked, 'asked_earlier': earlier, 'sound': earlier + found.sound,
-        'unproved': rows.unverified(),
+        'deep': deep, 'known': len(rows), 'asked': found.asked, 'asked_earlier': found.earlier,
+        'sound': found.earlier + found.sound, 'unproved': rows.unverified(),
         'findings': piled, 'unreachable': None if found.away is None else str(found.away),
         'ok': found.away is None and not piled and len(rows) > 0,
     }  # fmt: skip

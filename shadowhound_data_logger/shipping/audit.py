@@ -6,28 +6,100 @@ next time.
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Final
 
+from shadowhound_data_logger.core.durable_files import lock
 from shadowhound_data_logger.core.errors import AccessDenied, StoreError
 from shadowhound_data_logger.core.model import ObjectInfo
 from shadowhound_data_logger.stores.base import ObjectStore
 from shadowhound_data_logger.stores.verify import Finding, check_object
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+log = logging.getLogger(__name__)
+
 THREADS: Final = 8
 KEYS: Final = 20
 """Keys listed of each kind of finding; all are counted."""
+DIGEST_BYTES: Final = 16
+SUFFIX: Final = '.valid'
+KEEP_S: Final = 7 * 86_400.0
+"""How long an interrupted audit can be continued."""
 
 
-class Delivered(Protocol):
-    """What an audit asks for, and where it notes how far it came."""
+class AuditProgress:
+    """What an interrupted audit found valid, which the next run of the same audit skips: a file with 16 bytes per object.
 
-    def pages(self) -> Iterator[list[tuple[int, ObjectInfo]]]: ...
+    Lifecycle: enter once; used by one audit; ``finish`` when all is checked; exit once. Without a writable folder nothing is
+    recorded.
+    """
 
-    def set_verified(self, ids: Iterable[int]) -> None: ...
+    def __init__(self, folder: Path, question: str, *, again: bool = False) -> None:
+        """``question`` identifies the store and the objects; ``again`` discards the results of an earlier run."""
+        self._path = folder / f'{hashlib.sha256(question.encode()).hexdigest()[:32]}{SUFFIX}'
+        self._again = again
+        self._file: IO[bytes] | None = None
+        self._known: frozenset[bytes] = frozenset()
+
+    def __enter__(self) -> Self:
+        """Raises StoreError if another process asks the same question."""
+        try:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for path in self._path.parent.glob(f'*{SUFFIX}'):
+                if (path == self._path and self._again) or time.time() - path.stat().st_mtime > KEEP_S:
+                    path.unlink()
+            file = self._path.open('a+b', buffering=0)
+        except OSError as error:
+            log.warning('after an interruption all objects will be checked again: %s', error)
+            return self
+        if not lock(file, wait=False):
+            file.close()
+            raise StoreError('another process is verifying the same objects', remedy='wait until it has finished')
+        self._file = file
+        file.seek(0)
+        found = file.read()
+        whole = len(found) - len(found) % DIGEST_BYTES
+        file.truncate(whole)
+        self._known = frozenset(found[place : place + DIGEST_BYTES] for place in range(0, whole, DIGEST_BYTES))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def unverified(self, page: Sequence[ObjectInfo]) -> Sequence[ObjectInfo]:
+        """The objects that no earlier run found valid."""
+        return [one for one in page if _digest(one) not in self._known] if self._known else page
+
+    def add(self, valid: Sequence[ObjectInfo]) -> None:
+        """Record that these objects are valid."""
+        if self._file is not None:
+            try:
+                self._file.write(b''.join(map(_digest, valid)))
+            except OSError as error:
+                log.warning('after an interruption the objects from here on will be checked again: %s', error)
+                self._file.close()
+                self._file = None
+
+    def finish(self) -> None:
+        """Record that the audit is complete, so that the next one starts from the beginning."""
+        if self._file is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def _digest(one: ObjectInfo) -> bytes:
+    description = json.dumps((one.bucket, one.key, one.size, one.sha256))
+    return hashlib.blake2b(description.encode(), digest_size=DIGEST_BYTES).digest()
 
 
 @dataclass(slots=True)
@@ -36,6 +108,8 @@ class Audit:
 
     asked: int = 0
     sound: int = 0
+    earlier: int = 0
+    """Objects that an earlier run found valid."""
     counts: dict[str, int] = field(default_factory=dict)
     """Kind -> findings."""
     first: dict[str, list[Finding]] = field(default_factory=dict)
@@ -52,12 +126,13 @@ class Audit:
             listed.append(finding)
 
 
-def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads: int = THREADS, keys: int | None = KEYS,
-          tell: Callable[[], None] = lambda: None, pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
-    """Check every object of ``source``; ``deep`` also reads their content. The callback is called after each one.
+def audit(pages: Iterable[Sequence[ObjectInfo]], progress: AuditProgress, store: ObjectStore, *, deep: bool = False,  # noqa: PLR0913 - as the verbs
+          threads: int = THREADS, keys: int | None = KEYS, tell: Callable[[int], object] = lambda _: None,
+          pause: Callable[[float], object] = time.sleep) -> Audit:  # fmt: skip
+    """Check these objects; ``deep`` also reads their content. The callback receives how many more are done.
 
-    Of an object without a known SHA-256 only the size is compared. Intact objects are noted; findings are not, so an audit that
-    ended early checks those again.
+    Of an object without a known SHA-256 only the size is compared. Valid objects are recorded; findings are not, so an audit
+    that ended early checks those again. One that checked everything finishes ``progress``.
     """
     found = Audit(keys=keys)
 
@@ -66,8 +141,12 @@ def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads:
 
     pool = ThreadPoolExecutor(threads, 'verify')
     try:
-        for page in source.pages():
-            _audit_page(page, pool, check, source, store, found, tell)
+        for page in pages:
+            left = progress.unverified(page)
+            found.earlier += len(page) - len(left)
+            tell(len(page) - len(left))
+            _audit_page(left, pool.map(check, left), progress, store, found, tell)
+        progress.finish()
     except StoreError as error:
         found.away = error
     finally:
@@ -75,22 +154,21 @@ def audit(source: Delivered, store: ObjectStore, *, deep: bool = False, threads:
     return found
 
 
-def _audit_page(page: Sequence[tuple[int, ObjectInfo]], pool: ThreadPoolExecutor, check: Callable[[ObjectInfo], Finding | None],
-                source: Delivered, store: ObjectStore, found: Audit, tell: Callable[[], None]) -> None:  # fmt: skip
-    sound: list[int] = []
+def _audit_page(page: Sequence[ObjectInfo], answers: Iterable[Finding | None], progress: AuditProgress, store: ObjectStore,
+                found: Audit, tell: Callable[[int], object]) -> None:  # fmt: skip
+    valid: list[ObjectInfo] = []
     findings: list[Finding] = []
-    answers = pool.map(check, [expected for _, expected in page])
     try:
-        for (number, _), finding in zip(page, answers, strict=True):
+        for one, finding in zip(page, answers, strict=True):
             if finding is None:
-                sound.append(number)
+                valid.append(one)
             else:
                 findings.append(finding)
-            tell()
+            tell(1)
     finally:
-        source.set_verified(sound)
-        found.sound += len(sound)
-        found.asked += len(sound)
+        progress.add(valid)
+        found.sound += len(valid)
+        found.asked += len(valid)
     if findings:
         _confirm_store(store)
     found.asked += len(findings)

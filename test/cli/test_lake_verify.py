@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import pyarrow as pa
 import pytest
 from click.testing import CliRunner, Result
 from lake.making import NOON_NS, SENSORS, add, add_part, content, folder_store, row
@@ -19,9 +18,10 @@ from shadowhound_data_logger.cli.common import BadUsage
 from shadowhound_data_logger.cli.lake import lake
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.core.config import UploadSettings
-from shadowhound_data_logger.core.errors import LakeError, StoreUnavailable
+from shadowhound_data_logger.core.errors import StoreError, StoreUnavailable
 from shadowhound_data_logger.formats.rows import schema
 from shadowhound_data_logger.lake import verify
+from shadowhound_data_logger.shipping.audit import DIGEST_BYTES, AuditProgress
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.verify import check_object
 
@@ -151,7 +151,7 @@ def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch)
         patched.setattr('shadowhound_data_logger.shipping.audit.check_object', judge)
         assert as_json(home)['unreachable']
     (notes,) = (home / 'verify').iterdir()
-    assert notes.stat().st_size == 4 * verify.DIGEST_BYTES
+    assert notes.stat().st_size == 4 * DIGEST_BYTES
     with notes.open('ab') as torn:
         torn.write(b'half')
     assert as_json(home, '--sensor', 'camera')['asked'] == 5  # another question
@@ -164,13 +164,12 @@ def test_an_interrupted_run_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_one_question_is_asked_by_one_process(home: Path, tmp_path: Path) -> None:
     """The other is told so; a home that cannot be written is verified all the same; what was found long ago is forgotten."""
-    nothing = verify.Rows(pa.table({name: [] for name in ('bucket', 'key', 'bytes', 'sha256')}))
-    with verify.Unfinished(nothing, tmp_path / 'verify', 'x'):
-        with pytest.raises(LakeError, match='another process'), verify.Unfinished(nothing, tmp_path / 'verify', 'x'):
+    with AuditProgress(tmp_path / 'verify', 'x'):
+        with pytest.raises(StoreError, match='another process'), AuditProgress(tmp_path / 'verify', 'x'):
             pass
         (old,) = (tmp_path / 'verify').iterdir()
         os.utime(old, (0, 0))
-    with verify.Unfinished(nothing, tmp_path / 'verify', 'y'):
+    with AuditProgress(tmp_path / 'verify', 'y'):
         assert not old.exists()
     shutil.rmtree(home / 'verify', ignore_errors=True)
     (home / 'verify').write_text('')

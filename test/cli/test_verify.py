@@ -158,16 +158,6 @@ def test_bad_usage(
     assert words in capsys.readouterr().err
 
 
-def test_one_at_a_time(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A second one ends at once and says why; notes that are none are said, and --again does without them."""
-    with closing(sqlite3.connect(home / 'spool/verify.db', isolation_level=None)) as other:
-        other.execute('BEGIN EXCLUSIVE')
-        assert 'is another --verify running' in str(run('--verify').exception)
-    (home / 'spool/verify.db').write_bytes(b'garbage' * 1000)
-    assert '--again starts from the beginning' in str(run('--verify').exception)
-    assert as_json('--verify', '--again')['asked'] == 3
-
-
 def test_the_folder_of_a_rescued_disk(home: Path) -> None:
     """A spool that was copied is verified as the one it was."""
     shutil.copytree(home / 'spool', home / 'rescued')

@@ -27,7 +27,7 @@ from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.prune import dates_of_deletion, forgotten
 from shadowhound_data_logger.lake.reindex import reindex
-from shadowhound_data_logger.shipping.audit import audit
+from shadowhound_data_logger.shipping.audit import AuditProgress, audit
 from shadowhound_data_logger.stores import open_store
 
 NOW_NS = NOON_NS + 10 * DAY_NS
@@ -118,8 +118,8 @@ def _check(settings: StoreSettings) -> None:
     source, left_out = _source(settings), Findings()
     assert _answer(settings) == _stored(settings)
     rows = verify.rows(source, left_out)
-    with closing(open_store(settings, UploadSettings())) as store, verify.Unfinished(rows, settings.directory / 'v', '') as left:
-        found = audit(left, store)
+    with closing(open_store(settings, UploadSettings())) as store, AuditProgress(settings.directory / 'v', '') as progress:
+        found = audit(rows.pages(), progress, store)
     assert (found.counts, len(left_out)) == ({}, 0)
 
 

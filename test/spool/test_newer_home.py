@@ -38,7 +38,7 @@ def test_a_newer_home_is_left_alone(tmp_path: Path, killed: bool) -> None:
     before = contents(root)
     refusals = [
         lambda: new_spool(root).open(), lambda: ledger.read(root, 'thor'), lambda: retry(root),
-        lambda: Deliveries(root).open('x'),
+        lambda: Deliveries(root).open(),
     ]  # fmt: skip
     for opening in refusals:
         with pytest.raises(SpoolError, match=rf'version {SCHEMA_VERSION + 1}.*update shadowhound_data_logger'):

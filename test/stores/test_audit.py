@@ -14,7 +14,7 @@ from stores.memory import MemoryStore
 
 from shadowhound_data_logger.core.errors import AccessDenied, CredentialsRejected, StoreError, StoreUnavailable
 from shadowhound_data_logger.core.model import ObjectInfo, SpooledObject, State
-from shadowhound_data_logger.shipping.audit import KEYS, Audit, audit
+from shadowhound_data_logger.shipping.audit import KEYS, Audit, AuditProgress, audit
 from shadowhound_data_logger.spool import deliveries as deliveries_module
 from shadowhound_data_logger.spool.deliveries import Deliveries
 from shadowhound_data_logger.spool.spool import Spool
@@ -42,12 +42,9 @@ def deliver(spool: Spool, store: ObjectStore, bucket: str, *names: str) -> list[
 
 
 def verify(spool: Spool, store: Any, *, deep: bool = False, again: bool = False) -> Audit:
-    with closing(Deliveries(spool.root)) as deliveries:
-        deliveries.open(f'{deep}', again=again)
-        found = audit(deliveries, store, deep=deep, pause=lambda _: None)
-        if found.away is None:
-            deliveries.finish()
-    return found
+    with closing(Deliveries(spool.root)) as deliveries, AuditProgress(spool.root / 'verify', str(deep), again=again) as progress:
+        deliveries.open()
+        return audit(deliveries.pages(), progress, store, deep=deep, pause=lambda _: None)
 
 
 def remove(store: ObjectStore, item: SpooledObject) -> None:
@@ -84,7 +81,7 @@ def test_what_was_delivered_is_there(store: ObjectStore, spooled: Spool, bucket:
         found = verify(spooled, store, deep=deep)
         assert (found.asked, found.sound, found.counts, found.away) == (len(items), len(items), {}, None)
     assert pending.path.exists()
-    assert not list(spooled.root.glob('verify*'))
+    assert not list(spooled.root.glob('verify/*'))
 
 
 def test_the_catalogs_parts_are_not_asked_for(spooled: Spool) -> None:

@@ -10,7 +10,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import create_autospec
 
 import boto3
 import pytest
@@ -32,8 +31,7 @@ from shadowhound_data_logger.doctor.s3_put import single_requests
 from shadowhound_data_logger.lake import prune, pull
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.verify import Unfinished
-from shadowhound_data_logger.shipping.audit import audit
+from shadowhound_data_logger.shipping.audit import AuditProgress, audit
 from shadowhound_data_logger.stores import open_store
 from shadowhound_data_logger.stores.s3 import S3Store
 
@@ -358,17 +356,16 @@ def test_an_object_that_was_hidden_is_found_by_verify(server: Tower, as_user: Co
     for number, (key, body) in enumerate(bodies.items()):
         sha256 = hashlib.sha256(body).hexdigest()
         admin.put_object(Bucket='sensor-data', Key=key, Body=body, Metadata={'sha256': sha256}, **(own if number == 1 else {}))
-        expected.append((number, ObjectInfo('sensor-data', key, len(body), sha256)))
-    delivered = create_autospec(Unfinished, instance=True)
-    delivered.pages.return_value = [expected]
+        expected.append(ObjectInfo('sensor-data', key, len(body), sha256))
     with closing(open_store(server.store_settings('spark'), UploadSettings())) as store:
         store.open()
-        found = audit(delivered, store, pause=lambda _: pytest.fail('a wait'))
+        with AuditProgress(tmp_path / 'verify', '') as progress:
+            found = audit([expected], progress, store, pause=lambda _: pytest.fail('a wait'))
     assert found.away is None
     assert found.counts == {'unreadable': 1}, found
     (finding,) = found.first['unreadable']
     assert finding.key == 'thor/camera/sse-b.txt'
-    delivered.set_verified.assert_called_once_with([0, 2])
+    assert found.sound == 2
 
 
 def test_a_robot_that_is_over_its_quota_stores_nothing_more(server: Tower, as_user: Connect, monkeypatch: pytest.MonkeyPatch,
