@@ -125,11 +125,11 @@ def test_one_file_of_the_stores_knows_obstore() -> None:
 
 
 def test_only_the_tables_of_the_spools_index_send_sql_to_it() -> None:
-    """Other modules that send SQL have their own database: notes of an audit, what was fetched, a bag, the lake's tables."""
+    """Other modules that send SQL have their own database: what was fetched, a bag, the lake's tables."""
     tables = {path.relative_to(ROOT).as_posix() for path in ROOT.glob('spool/*_table.py')}
     index = {'spool/index.py', 'spool/schema.py', *tables}
     own = {
-        'spool/deliveries.py', 'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'lake/tables.py', 'bags/contents.py',
+        'lake/fetched.py', 'lake/search.py', 'lake/sink.py', 'lake/tables.py', 'bags/contents.py',
         'bags/sqlite_repair.py',
     }  # fmt: skip
     senders = {
