@@ -229,7 +229,7 @@ class Campaign:
             is_open = self._open() > 0
             self._wire.set(PASS)
             self._await(lambda name=name: self._is_over(name), 'what is gone is answered')
-            found = self._rows("SELECT gone FROM requests WHERE id = ? AND gone <> '{}'", name)
+            found = self._rows("SELECT unavailable FROM requests WHERE id = ? AND unavailable <> '{}'", name)
             self._kill_robot()
             self._start()
             if is_open and found:
@@ -306,7 +306,7 @@ class Campaign:
     def _served(self) -> int:
         """Requests that have their last answer, and got an object."""
         got = "SELECT * FROM requested WHERE request = requests.id AND outcome = 'delivered'"
-        query = f"SELECT count(*) FROM requests WHERE state <> 'active' AND told = state AND EXISTS ({got})"  # noqa: S608 - own text
+        query = f"SELECT count(*) FROM requests WHERE state <> 'active' AND answered_state = state AND EXISTS ({got})"  # noqa: S608 - own text
         return int(self._rows(query)[0][0])
 
     def _is_over(self, request: str) -> bool:

@@ -12,11 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 from shadowhound_data_logger.core import metadata_keys as meta
 from shadowhound_data_logger.core.clock import EARLIEST_SANE_NS, utc
 from shadowhound_data_logger.core.earth import is_place
+from shadowhound_data_logger.core.stamps import DAY_NS
 
 STRING, INT32, INT64, DOUBLE, TIME = 'string', 'int32', 'int64', 'double', 'time'
 """Kinds of columns. ``TIME`` is whole microseconds since 1970, UTC."""
@@ -152,7 +154,13 @@ def is_row(bucket: str, key: str) -> bool:
 
 def date_of(row: Row) -> str:
     """The folder of a row, ``YYYY-MM-DD``."""
-    return f'{utc(row["t_start_ns"]):%Y-%m-%d}' if row['t_start'] is not None else UNDATED
+    return _day(row['t_start_ns'] // DAY_NS) if row['t_start'] is not None else UNDATED
+
+
+@lru_cache(64)
+def _day(number: int) -> str:
+    """``YYYY-MM-DD`` of a day since 1970; every row of a file needs one, and most have the same."""
+    return f'{utc(number * DAY_NS):%Y-%m-%d}'
 
 
 def row_of(bucket: str, key: str, size: int, content_type: str, metadata: Mapping[str, str]) -> Row:
