@@ -5,6 +5,8 @@ An error has one form: the verb, what is wrong and where, and on the next line w
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sqlite3
 import sys
@@ -95,6 +97,7 @@ class _WithoutPandas:
 
 def main() -> None:
     """The console script."""
+    atexit.register(gc.freeze)  # the interpreter collects garbage at its end, which no process that ends needs
     sys.meta_path.insert(0, _WithoutPandas())
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a terminal that is not UTF-8, or text that is not Unicode

@@ -7,6 +7,8 @@ Exit codes: 0 stopped on request, 1 a failure, 2 invalid settings.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sys
 
@@ -16,6 +18,7 @@ from shadowhound_data_logger.node.intake.middleware import choose, requested_rmw
 
 def main(args: list[str] | None = None) -> int:
     """The console script; ``args`` are ROS arguments without the program's name."""
+    atexit.register(gc.freeze)  # the interpreter collects garbage at its end, which takes as long as all of a clean stop
     arguments = sys.argv[1:] if args is None else args
     try:
         middleware = choose(requested_rmw(arguments), os.environ)
