@@ -65,8 +65,10 @@ KILLED_S: Final = 1.5
 LATEST_NS: Final = SECOND
 """A message arrives so soon after it was sent, also where the machine stands still for a moment; the figures have the latest."""
 ARRIVED_NS: Final = SECOND // 2
-"""The tolerance of everything else on the clock of arrival, compared with the arrivals in the bags: within an object, arrivals are
-estimated from its first and last, and on a machine under load a message arrived 0.28 s late."""
+"""The tolerance of everything else on the clock of arrival, compared with the arrivals in the bags.
+
+Within an object, arrivals are estimated from its first and last, and on a machine under load a message arrived 0.28 s late.
+"""
 EXACT_NS: Final = SECOND // 1000
 """The tolerance of stamps where they are shown; in objects and bags they are exact."""
 OPEN_NS: Final = round((BATCH_S + 1.5) * SECOND)
