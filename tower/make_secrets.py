@@ -1,19 +1,18 @@
 #!/usr/bin/env python3
-"""Makes the credentials of a Tower, once, in files that their owner alone can read; it needs the standard library and openssl.
+"""Creates the credentials of a Tower, once, in files that only their owner can read; needs the standard library and openssl.
 
-    .env                  what compose.yaml and run.py read: passwords, the address to listen on
-    secrets/users.json    the users, their keys and passwords (the newest first): the one place where these stand
-    secrets/s3.json       the same as SeaweedFS reads it
-    secrets/security.toml, seaweedfs.*   what SeaweedFS's own servers know one another by: signing keys and a certificate
-    secrets/postgres.password, mlflow.pgpass, mlflow.password   what containers get as files: the database's password, the same as
-                          libpq reads it, and the password of MLflow's user `tower`
-    secrets/NAME.env      what a robot or Spark puts into its environment: copy it there, mode 600
-    secrets/NAME.credentials   its keys and its password alone, as S3 clients and MLflow's read them from a file: what is to be
-                          copied when they change
-    mlflow/users.json     digests of MLflow's passwords, which tell nobody anything: the server reads it, as another user
+.env                  read by compose.yaml and run.py: passwords, the address to listen on
+secrets/users.json    the users, their keys and passwords (the newest first): the only source of these
+secrets/s3.json       the same in SeaweedFS's format
+secrets/security.toml, seaweedfs.*   authentication between SeaweedFS's own servers: signing keys and a certificate
+secrets/postgres.password, mlflow.pgpass, mlflow.password   mounted into containers: the database's password, the same in libpq's
+                     format, and the password of MLflow's user `tower`
+secrets/NAME.env      the environment of a robot or Spark: copy it there, mode 600
+secrets/NAME.credentials   only its keys and password, as S3 clients and MLflow's read them from a file: copy it when they change
+mlflow/users.json     digests of MLflow's passwords, which are not secret: the server reads it, as another user
 
-What is there already stays: running it again adds what is missing. ``--rotate NAME`` gives a user a new key beside the old one,
-so that nothing stops; ``--retire NAME`` ends the old one once the new one is in use.
+Existing credentials stay: running it again adds what is missing. ``--rotate NAME`` gives a user a new key in addition to the old
+one, so that nothing stops; ``--retire NAME`` removes the old one once the new one is in use.
 """
 
 from __future__ import annotations
@@ -34,31 +33,31 @@ HERE = Path(__file__).resolve().parent
 READ_BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow', 'lake')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 MAILBOXES = 'sensor-data/_requests'
-"""What is asked of robots: a robot reads its own."""
+"""Requests to robots: each robot reads its own mailbox."""
 POLICIES = 'lerobot/policies'
-"""What every robot reads of the training's bucket: policies, and the signed metadata that say which of them may run."""
+"""Part of the training bucket that every robot reads: policies, and the signed metadata about which of them may run."""
 ADMIN = ('Admin', 'Read', 'Write', 'List', 'Tagging')
 NAME = re.compile(r'[a-z0-9][a-z0-9_-]{0,62}')
-"""A robot's name leads its keys, and is part of a pattern here: no wildcard may be in it."""
+"""A robot's name is the prefix of its keys, and part of patterns here: it must not contain wildcards."""
 OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
 NO_LOGIN = ('mlflow', 'prune')
-"""Users of S3 alone: MLflow's own server, and who deletes by `shadowhound-data lake prune`."""
+"""Users of S3 only: MLflow's own server, and the user of `shadowhound-data lake prune`."""
 SIGNING_KEYS = ('signing', 'signing.read', 'filer_signing', 'filer_signing.read')
-"""Of the volume servers, of the filer's IAM and of the gRPC port beside S3: without them SeaweedFS asks nobody who he is."""
+"""For the volume servers, the filer's IAM and the gRPC port next to S3: without them SeaweedFS does not authenticate clients."""
 CERTIFICATE, CERTIFICATE_KEY = 'seaweedfs.crt', 'seaweedfs.key'
 CERTIFICATE_DAYS = 36500
-"""It is for SeaweedFS's own servers alone, which trust this one certificate and no authority: new files replace it."""
+"""For SeaweedFS's own servers only, which trust this one certificate and no authority: new files replace it."""
 CA_FILE = '/etc/shadowhound/ca.pem'
-"""Where Thor and Spark keep the certificate of a private authority."""
+"""Path on Thor and Spark of the certificate of a private authority."""
 S3_PORT, MLFLOW_PORT = 9000, 5001
 
 
 class Refused(Exception):
-    """An argument cannot be followed; the text says why."""
+    """An invalid argument; the text has the reason."""
 
 
 def actions(user: str) -> list[str]:
-    """What a user may do, in SeaweedFS's words (https://github.com/seaweedfs/seaweedfs/wiki/Amazon-S3-API)."""
+    """A user's permissions, in SeaweedFS's terms (https://github.com/seaweedfs/seaweedfs/wiki/Amazon-S3-API)."""
     if user == 'tower':
         return list(ADMIN)
     if user == 'mlflow':
@@ -90,7 +89,7 @@ def new_key() -> dict[str, str]:
 
 
 def write(path: Path, text: str, mode: int = 0o600) -> None:
-    """Under its name only when it is whole, and by default never readable by others, not even for an instant."""
+    """Written atomically, and by default never readable by others, not even briefly."""
     part = path.with_name(f'{path.name}.part')
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), 'w', encoding='utf-8') as file:
@@ -123,7 +122,7 @@ def load_users(path: Path) -> dict[str, list[dict[str, str]]]:
 
 
 def seaweed(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
-    """The identities as ``weed s3 -config`` reads them."""
+    """The identities in the format of ``weed s3 -config``."""
     identities = [
         {'name': user, 'actions': actions(user),
          'credentials': [{name: key[name] for name in ('accessKey', 'secretKey')} for key in keys]}
@@ -133,7 +132,7 @@ def seaweed(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
 
 
 def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
-    """Who may log in to MLflow, as its server checks it (tower/shadowhound_tower/mlflow_access.py)."""
+    """MLflow's logins, as its server checks them (tower/shadowhound_tower/mlflow_access.py)."""
     digests = {
         user: [hashlib.sha256(key['password'].encode()).hexdigest() for key in keys]
         for user, keys in users.items() if user not in NO_LOGIN
@@ -142,7 +141,7 @@ def logins(users: Mapping[str, Sequence[Mapping[str, str]]]) -> str:
 
 
 def environment(user: str, key: Mapping[str, str], settings: Mapping[str, str]) -> str:
-    """What a machine needs to reach this Tower as this user, for a shell and for systemd's EnvironmentFile alike."""
+    """The variables with which a machine reaches this Tower as this user, for a shell and for systemd's EnvironmentFile."""
     scheme, offset = settings['TOWER_SCHEME'], int(settings['TOWER_OFFSET'])
     server = f'{scheme}://{settings["TOWER_HOST"]}'
     store = f'{server}:{S3_PORT + offset}'
@@ -160,21 +159,21 @@ def environment(user: str, key: Mapping[str, str], settings: Mapping[str, str]) 
 
 
 def credentials(user: str, key: Mapping[str, str]) -> str:
-    """A shared-credentials file, which a running program reads again, and MLflow's clients as well: its environment it cannot."""
+    """A shared-credentials file, which S3 and MLflow clients read again while they run; an environment cannot change."""
     keys = f'[default]\naws_access_key_id = {key["accessKey"]}\naws_secret_access_key = {key["secretKey"]}\n'
     login = f'[mlflow]\nmlflow_tracking_username = {user}\nmlflow_tracking_password = {key["password"]}\n'
     return keys + (login if user not in NO_LOGIN else '')
 
 
 def has_certificate(folder: Path) -> bool:
-    """Whether the servers speak TLS: docs/tower.md tells how to make the files."""
+    """Whether the servers use TLS: docs/tower.md describes how to create the files."""
     return (folder / 'tls' / 'tower.crt').is_file()
 
 
 def own_settings(
     folder: Path, host: str | None, offset: int | None, users: Mapping[str, Sequence[Mapping[str, str]]]
 ) -> dict[str, str]:
-    """What the servers themselves need; passwords that exist stay."""
+    """The settings of the servers themselves; existing passwords stay."""
     before = read_env(folder / '.env')
     tower, mlflow = users['tower'][0], users['mlflow'][0]
     return {
@@ -189,16 +188,16 @@ def own_settings(
 
 
 def make_certificate(folder: Path) -> None:
-    """A key and a certificate that vouches for itself. Raises Refused without openssl."""
+    """A key and a self-signed certificate. Raises Refused without openssl."""
     key, certificate = (folder / f'{name}.part' for name in (CERTIFICATE_KEY, CERTIFICATE))
     command = ['openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:P-256', '-nodes',
                '-days', str(CERTIFICATE_DAYS), '-subj', '/CN=tower', '-keyout', str(key), '-out', str(certificate)]  # fmt: skip
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, umask=0o077)
     except FileNotFoundError as error:
-        raise Refused('openssl is not installed, and makes the certificate of SeaweedFS: apt install openssl') from error
+        raise Refused('openssl is not installed, and is needed for the certificate of SeaweedFS: apt install openssl') from error
     except subprocess.CalledProcessError as error:
-        raise Refused(f'openssl makes no certificate: {error.stderr.strip()}') from error
+        raise Refused(f'openssl failed to create a certificate: {error.stderr.strip()}') from error
     for part in (key, certificate):
         part.replace(part.with_suffix(''))
 
@@ -222,7 +221,7 @@ def seaweed_environment() -> dict[str, str]:
 
 
 def write_for_servers(hidden: Path, settings: Mapping[str, str]) -> None:
-    """The secrets that servers read from files. Signing keys that exist stay."""
+    """The secrets that servers read from files. Existing signing keys stay."""
     if not (hidden / 'security.toml').is_file():
         write(hidden / 'security.toml', signing_keys())
     write(hidden / 'seaweedfs.env', lines(seaweed_environment()))
@@ -233,9 +232,9 @@ def write_for_servers(hidden: Path, settings: Mapping[str, str]) -> None:
 
 def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence[str] = (), retire: Sequence[str] = (), *,
          offset: int | None = None) -> list[str]:  # fmt: skip
-    """Write all files anew from what is there and what is asked for; returns the users. Raises Refused for a bad name.
+    """Write all files from the existing state and the arguments; returns the users. Raises Refused for an invalid name.
 
-    ``offset`` is what the servers add to their ports; None for what it was before.
+    ``offset`` is added to all ports of the servers; None keeps the previous one.
     """
     hidden = folder / 'secrets'
     hidden.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -243,16 +242,16 @@ def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence
     users = load_users(hidden / 'users.json')
     for name in robots:
         if not NAME.fullmatch(name):
-            raise Refused(f'{name!r} is no name for a robot: lower-case letters, digits, "-" and "_"')
+            raise Refused(f'{name!r} is not a valid name for a robot: lower-case letters, digits, "-" and "_"')
         if name in OWN_USERS:
-            raise Refused(f'{name!r} is no name for a robot: a user of the Tower itself is called so')
+            raise Refused(f'{name!r} is not a valid name for a robot: it is a user of the Tower')
     for name in dict.fromkeys((*OWN_USERS, *robots)):
         users.setdefault(name, [new_key()])
-    for key in (key for keys in users.values() for key in keys):  # of before MLflow had passwords
+    for key in (key for keys in users.values() for key in keys):  # keys from before MLflow had passwords
         key.setdefault('password', secrets.token_urlsafe(32))
     for name in (*rotate, *retire):
         if name not in users:
-            raise Refused(f'there is no user {name}; there are {", ".join(users)}')
+            raise Refused(f'there is no user {name}; known are {", ".join(users)}')
     for name in rotate:
         users[name].insert(0, new_key())
     for name in retire:
@@ -275,15 +274,15 @@ def make(folder: Path, host: str | None, robots: Sequence[str], rotate: Sequence
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description='Make the credentials of a Tower. What is there already stays.')
-    parser.add_argument('--folder', type=Path, default=HERE, help='where .env and secrets/ go (default: beside this script)')
-    parser.add_argument('--host', help='the address that Thor and Spark reach this Tower at; without one it listens on 127.0.0.1')
-    parser.add_argument('--offset', type=int, metavar='N', help='what the servers add to their ports (run.py --offset)')
+    parser = argparse.ArgumentParser(description='Create the credentials of a Tower. Existing ones stay.')
+    parser.add_argument('--folder', type=Path, default=HERE, help='folder of .env and secrets/ (default: that of this script)')
     parser.add_argument(
-        '--robot', action='append', default=[], metavar='NAME', help='a robot (default: thor); more than one allowed'
+        '--host', help='the address at which Thor and Spark reach this Tower; without one it listens on 127.0.0.1'
     )
-    parser.add_argument('--rotate', action='append', default=[], metavar='USER', help='a new key beside the old one')
-    parser.add_argument('--retire', action='append', default=[], metavar='USER', help='only the newest key stays')
+    parser.add_argument('--offset', type=int, metavar='N', help='added to all ports (run.py --offset)')
+    parser.add_argument('--robot', action='append', default=[], metavar='NAME', help='a robot (default: thor); may be repeated')
+    parser.add_argument('--rotate', action='append', default=[], metavar='USER', help='a new key in addition to the old one')
+    parser.add_argument('--retire', action='append', default=[], metavar='USER', help='keep only the newest key')
     options: Any = parser.parse_args(arguments)
     try:
         users = make(
@@ -292,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (Refused, OSError, ValueError) as error:
         print(f'make_secrets: {error}', file=sys.stderr)
         return 2
-    print(f'users {", ".join(users)}: {options.folder / "secrets"}/NAME.env is what each puts into its environment (mode 600)')
+    print(f'users {", ".join(users)}: {options.folder / "secrets"}/NAME.env is the environment of each (mode 600)')
     if options.rotate or options.retire:
         print('MLflow knows it; the S3 server reads it on SIGHUP: docker compose -f tower/compose.yaml kill -s HUP s3')
     return 0

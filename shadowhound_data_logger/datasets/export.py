@@ -1,7 +1,7 @@
-"""Exports missions to a dataset: choose missions, make their episodes in parallel, combine them, upload them.
+"""Exports missions to a dataset: selects missions, builds their episodes in parallel, combines and uploads them.
 
-Killed at any moment it goes on where it was: an episode that is made lies in ``DIR/.shadowhound/`` until the dataset has it,
-and what ``info.json`` does not count is made again, with the same bytes.
+If killed, a new run continues: finished episodes are in ``DIR/.shadowhound/`` until the dataset has them, and anything that
+``info.json`` does not count is rebuilt with the same bytes.
 """
 
 from __future__ import annotations
@@ -45,34 +45,34 @@ WORK: Final = '.shadowhound'
 """Working files in the dataset's folder that are not part of it."""
 DROPPING: Final = f'{WORK}/dropping.json'
 KNOWN: Final = 'exports.json'
-"""In SHADOWHOUND_HOME: the folders that were exported to, or fetched into, from this machine."""
+"""A file in SHADOWHOUND_HOME: the folders that this machine exported to, or downloaded into."""
 LOOK_S: Final = 5.0
-"""Between two checks for new objects."""
+"""Interval between checks for new objects."""
 PATIENCE_S: Final = 3600.0
-"""Waiting ends after this time without news about what is missing."""
+"""Waiting ends after this time without news about missing data."""
 TRAIN, VALIDATION = 'train', 'validation'
 
 
 @dataclass(slots=True)
 class Exported:
-    """What an export did, or with ``is_dry`` would try to do."""
+    """The result of an export, or of a dry run."""
 
     folder: Path
     added: list[Mapping[str, Any]] = field(default_factory=list)
     """``episode.json`` of each new episode."""
     present: list[str] = field(default_factory=list)
-    """Missions that were in the dataset already."""
+    """Missions that the dataset already had."""
     refused: dict[str, str] = field(default_factory=dict)
-    """Mission -> why."""
+    """Mission -> reason."""
     waiting: dict[str, str] = field(default_factory=dict)
     """Mission -> what is still unknown."""
     fps: int = 0
     action: str = ''
     digest: str = ''
     absent: list[str] = field(default_factory=list)
-    """What is missing in the folder of a task."""
+    """Missing files in the folder of a task."""
     streams: dict[str, Mapping[str, str]] = field(default_factory=dict)
-    """Mission -> stream -> where it comes from, of a dry run: those that were not refused before their messages were read."""
+    """Mission -> stream -> source, of a dry run: missions that were not rejected before their messages were read."""
 
 
 Say = Callable[[str], None]
@@ -83,11 +83,11 @@ def export(  # noqa: PLR0913 - the flags of the command
     cluster: Cluster | None = None, wait: bool = False, is_dry: bool = False, findings: Findings | None = None,
     say: Say = lambda _: None, sleep: Callable[[float], object] = time.sleep,
 ) -> Exported:  # fmt: skip
-    """Add the missions that the flags select to the dataset in this folder, which is created if missing.
+    """Add the selected missions to the dataset in this folder, which is created if missing.
 
-    Episodes are made here, one at a time unless ``workers`` says how many, or on a cluster, as many at a time as it has cores.
-    With ``wait`` it comes back once it is known of each mission what is missing, or nothing new has been heard for an hour.
-    Raises LakeError, SettingError, StoreError.
+    Episodes are built here, one at a time or ``workers`` at a time, or on a cluster, by default one per core. With ``wait`` it
+    returns
+    once the gaps of each mission are known, or after an hour without news. Raises LakeError, SettingError, StoreError.
     """
     findings = Findings() if findings is None else findings
     with writing(folder, is_dry=is_dry):
@@ -126,7 +126,7 @@ def export(  # noqa: PLR0913 - the flags of the command
             if task is not None:
                 write_recordings(task, plan, source.settings, folder / WORK / 'look')
 
-        _put_together(made, built, options, settings, result, recorded)
+        _assemble(made, built, options, settings, result, recorded)
         if task is not None and made.rows:
             result.absent = synchronize(task)
         return result
@@ -134,7 +134,7 @@ def export(  # noqa: PLR0913 - the flags of the command
 
 @contextmanager
 def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
-    """One process at a time. Raises LakeError while another one writes."""
+    """One process at a time. Raises LakeError if another one is writing."""
     if is_dry:
         yield
         return
@@ -146,7 +146,7 @@ def writing(folder: Path, *, is_dry: bool = False) -> Iterator[None]:
             yield
     except OSError as error:
         raise LakeError(f'{error.filename or folder} cannot be written: {error.strerror}',
-                        remedy='name a folder of yours, on a disk that has room') from error  # fmt: skip
+                        remedy='name a folder that you can write to, on a disk with free space') from error  # fmt: skip
 
 
 def resumed(folder: Path) -> Lerobot:
@@ -164,7 +164,7 @@ def resumed(folder: Path) -> Lerobot:
 
 
 def drop(folder: Path, mission_id: str) -> str:
-    """Remove a mission from a dataset and remember not to add it again; returns the new digest.
+    """Remove a mission from a dataset and record that it must not be added again; returns the new digest.
 
     Raises LakeError if it is not in the dataset.
     """
@@ -197,14 +197,14 @@ def _drop(made: Lerobot, mission_id: str) -> str:
 
 
 def _settled(made: Lerobot, options: ExportOptions) -> tuple[ExportOptions, int | None, str]:
-    """The first settings of a dataset apply to all of it. Raises LakeError for others."""
+    """The first settings of a dataset apply to all of it. Raises LakeError if the settings differ."""
     if made.settings is None:
         return options, options.fps, options.action_word
     now = {**options.as_json(), 'fps': options.fps or made.settings['fps'],
            'action': made.settings['action'] if options.action == AUTO else options.action_word}  # fmt: skip
     if other := [name for name in {**made.settings, **now} if now.get(name) != made.settings.get(name)]:
-        said = ', '.join(f'{name} {made.settings.get(name, "none")}' for name in other)
-        raise LakeError(f'{made.folder} was started with {said}', remedy='export to another folder, or with the same settings')
+        given = ', '.join(f'{name} {made.settings.get(name, "none")}' for name in other)
+        raise LakeError(f'{made.folder} was created with {given}', remedy='export to another folder, or with the same settings')
     return options, made.settings['fps'], made.settings['action']
 
 
@@ -215,7 +215,7 @@ def _new(made: Lerobot, missions: Sequence[ChosenMission]) -> list[ChosenMission
 
 
 def hashed(mission_id: str) -> str:
-    """How a dataset remembers a dropped mission."""
+    """The form in which a dataset remembers a dropped mission."""
     return hashlib.sha256(mission_id.encode()).hexdigest()
 
 
@@ -255,7 +255,7 @@ Built = list[tuple[EpisodePlan, dict[str, Any], Path]]
 
 def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store: StoreSettings, work: Path, *,  # noqa: PLR0913
            settings: Mapping[str, Any], workers: int | None, cluster: Cluster | None, say: Say) -> Built:  # fmt: skip
-    folders = [work / f'{hashed(each.mission.mission_id)[:16]}-{_key_of(each, settings, options)}' for each in plans]
+    folders = [work / f'{hashed(each.mission.mission_id)[:16]}-{_episode_key(each, settings, options)}' for each in plans]
     jobs = [(each, options, fps, store, folder) for each, folder in zip(plans, folders, strict=True)]
     if cluster is not None:
         return [(job[0], episode, job[-1]) for job, episode in zip(jobs, cluster.built(jobs, workers, say), strict=True)]
@@ -272,15 +272,15 @@ def _build(plans: Sequence[EpisodePlan], options: ExportOptions, fps: int, store
             try:
                 found.append((job[0], future.result(), job[-1]))
             except BrokenProcessPool as error:
-                raise LakeError(f'a process was killed while episodes were made; {mission} is not made, and nothing was added',
+                raise LakeError(f'a process was killed while building episodes; {mission} is not finished, and nothing was added',
                                 remedy='run it again, with fewer --workers if memory ran out: '
-                                       'episodes that were made need not be made again') from error  # fmt: skip
+                                       'finished episodes are kept') from error  # fmt: skip
             say(f'episode {number + 1} of {len(jobs)}: {mission}')
     return found
 
 
-def _key_of(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
-    """The result of an earlier run is reused if it was made in the same way from the same objects and gaps."""
+def _episode_key(plan: EpisodePlan, settings: Mapping[str, Any], options: ExportOptions) -> str:
+    """The key of an episode: an earlier result is reused if it has the same settings, objects and gaps."""
     inputs = [settings, options.validation_label, options.max_stale, options.allow_gaps, sorted(plan.topics.items()),
               plan.missing, _where(plan),
             [(name, sorted(track.key.to_pylist())) for name, track in sorted(_tracks_of(plan).items())],
@@ -296,10 +296,10 @@ def _tracks_of(plan: EpisodePlan) -> dict[str, Track]:
     return {**plan.tracks, **(plan.arm.tracks if plan.arm else {})}
 
 
-def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
+def _assemble(made: Lerobot, built: Built, options: ExportOptions, settings: Mapping[str, Any], result: Exported,
                   recorded: Callable[[EpisodePlan], None]) -> None:  # fmt: skip
     folder = made.folder
-    report: dict[str, Any] = {'settings': settings, 'episodes': _told_before(made), 'dropped': made.dropped}
+    report: dict[str, Any] = {'settings': settings, 'episodes': _earlier_reports(made), 'dropped': made.dropped}
     new: dict[str, Path] = {}
     for plan, episode, work in built:
         mission = plan.mission.mission_id
@@ -321,10 +321,10 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
     report |= {'refused': result.refused, 'waiting': result.waiting}
     if not made.rows:
         return
-    if new or not (folder / INFO).is_file() or report != _json_of(folder / REPORT):
+    if new or not (folder / INFO).is_file() or report != _read_json(folder / REPORT):
         if new:
             made.join_videos()
-            draw(made, _made_folder(folder / 'meta') / 'report.png')
+            draw(made, _create_folder(folder / 'meta') / 'report.png')
         made.commit(report, new)
     result.digest = made.digest
     for work in (folder / WORK).glob('*-*'):
@@ -333,26 +333,26 @@ def _put_together(made: Lerobot, built: Built, options: ExportOptions, settings:
 
 
 def split_of(mission_id: str, validation: float) -> str:
-    """Training or validation split of a mission: by its id alone, so that it does not change when others are added."""
+    """Training or validation split of a mission: from its id only, so that it does not change when others are added."""
     return VALIDATION if int(hashed(mission_id)[:8], 16) / 0x1_0000_0000 < validation else TRAIN
 
 
-def _told_before(made: Lerobot) -> list[dict[str, Any]]:
-    """Reports of the episodes in the dataset: a kill may have come between a report and ``info.json``."""
-    found = _json_of(made.folder / REPORT) if made.info else {}
+def _earlier_reports(made: Lerobot) -> list[dict[str, Any]]:
+    """Reports of the episodes in the dataset: a kill may have happened between a report and ``info.json``."""
+    found = _read_json(made.folder / REPORT) if made.info else {}
     return [each for each in found.get('episodes', []) if each['mission_id'] in made.mission_ids]
 
 
-def _json_of(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text(encoding='utf-8'))) if path.is_file() else {}
 
 
-def _made_folder(path: Path) -> Path:
+def _create_folder(path: Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     return path
 
 
-# -- which datasets there are ---------------------------------------------------------------------------------------------
+# -- known datasets -------------------------------------------------------------------------------------------------------
 
 
 def remember(home: Path, folder: Path) -> None:

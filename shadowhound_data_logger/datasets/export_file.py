@@ -1,4 +1,4 @@
-"""The file of ``export lerobot --config``: which topic and field becomes which feature, and how missions become episodes."""
+"""The file of ``export lerobot --config``: which topics and fields become which features, and how missions become episodes."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from shadowhound_data_logger.core.errors import LakeError
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.stamps import BY_STAMP
 from shadowhound_data_logger.core.untrusted import from_yaml
-from shadowhound_data_logger.datasets.clocks import pairs_of
+from shadowhound_data_logger.datasets.clocks import read_pairs
 from shadowhound_data_logger.datasets.features import AUTO, AV1, MAPPED, OWN_FILES, ExportOptions, StatePart
 
-REMEDY: Final = 'docs/datasets.md describes the file; examples/export_base.yaml and export_arm.yaml are two of them'
+REMEDY: Final = 'docs/datasets.md describes the file; see also examples/export_base.yaml and export_arm.yaml'
 _QUATERNION: Final = tuple('xyzw')
 
 
 @dataclass(frozen=True, slots=True)
 class TopicFields:
-    """Fields of the messages of a topic."""
+    """Fields of a topic's messages."""
 
     topic: str
     fields: tuple[str, ...]
-    """Paths in the message, such as ``twist.twist.linear.x``; a list is as many numbers as it has."""
+    """Paths in the message, such as ``twist.twist.linear.x``; a list contributes all its numbers."""
     names: tuple[str, ...] = ()
-    """One for each number; by default the joints' names in the message, otherwise the fields."""
+    """One per number; by default the joints' names in the message, otherwise the fields."""
     units: tuple[str, ...] = ()
-    """One for each number, or one for all."""
+    """One per number, or one for all."""
 
     def part(self, name: str) -> StatePart:
         """Raises ValueError."""
         if not self.topic.startswith('/') or not self.fields:
             raise ValueError(
-                f'{self.topic!r} with fields {list(self.fields)}: a topic begins with a slash, and fields are not empty'
+                f'{self.topic!r} with fields {list(self.fields)}: a topic starts with a slash, and fields are not empty'
             )
         return StatePart(name, self.topic, self.fields, self.names, self.units or ('',), tuple(_turns(self.fields)))
 
 
 @dataclass(frozen=True, slots=True)
 class ExportFile:
-    """What the file says, a field for each of its keys; docs/datasets.md has the table."""
+    """The content of the file, one field per key; docs/datasets.md has the table."""
 
     images: Mapping[str, str] = field(default_factory=lambda: {'front': 'camera'})
     state: tuple[Any, ...] = ('pose',)
@@ -73,7 +73,7 @@ class ExportFile:
             check_name(self.arm, 'arm')
         if self.fps != AUTO and (not isinstance(self.fps, int) or isinstance(self.fps, bool)):
             raise ValueError(f'fps is not auto or a whole number, but {self.fps!r}')
-        pairs = pairs_of(folder / self.arm_clock) if self.arm_clock else ()
+        pairs = read_pairs(folder / self.arm_clock) if self.arm_clock else ()
         return ExportOptions(
             fps=None if self.fps == AUTO else self.fps, images=self.images,
             state=tuple(each if isinstance(each, str) else _part(each, 'state') for each in self.state),
@@ -86,7 +86,7 @@ class ExportFile:
 
 
 def read(path: Path) -> ExportFile:
-    """The file. Raises LakeError with its name."""
+    """Read the file. Raises LakeError with its name."""
     try:
         given = from_yaml(path.read_text(encoding='utf-8'))
         given = {} if given is None else given
@@ -110,12 +110,12 @@ def _check_keys(given: Any, kind: type[ExportFile | TopicFields], where: str) ->
         if name not in known:
             near = get_close_matches(str(name), known, 1)
             raise ValueError(
-                f'there is no key {name!r}{where}: ' + (f'is it {near[0]}?' if near else f'there are {", ".join(known)}')
+                f'there is no key {name!r}{where}: ' + (f'is it {near[0]}?' if near else f'known keys are {", ".join(known)}')
             )
 
 
 def _turns(paths: tuple[str, ...]) -> Iterable[slice]:
-    """Where ``....x`` to ``....w`` of one orientation follow each other."""
+    """Find consecutive ``....x`` to ``....w`` of one orientation."""
     for first in range(len(paths) - 3):
         prefixes, axes = zip(*(path.rpartition('.')[::2] for path in paths[first : first + 4]), strict=True)
         if axes == _QUATERNION and len(set(prefixes)) == 1:

@@ -1,4 +1,4 @@
-"""The features of a dataset: the numbers of state and action, from which sensor, with names and units."""
+"""The features of a dataset: the numbers of state and action, with their sensors, names and units."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ class StatePart:
 
     name: str
     sensor: str
-    """Or a topic, which begins with a slash."""
+    """Or a topic, which starts with a slash."""
     fields: tuple[str, ...]
     """Paths in a message; empty: the lake's defaults for the type."""
     names: tuple[str, ...]
-    """Names of the numbers; empty if the message has them (joints)."""
+    """Names of the numbers; empty if the message contains them (joints)."""
     units: tuple[str, ...]
     turns: tuple[slice, ...] = ()
-    """Quaternions x y z w among them."""
+    """Slices with quaternions x y z w."""
     is_derived: bool = False
     """Derived from two poses of odometry instead of read from a message."""
 
     def as_json(self) -> dict[str, Any]:
-        """How a file names it."""
+        """The part as written in a file."""
         return {'topic': self.sensor, 'fields': list(self.fields), 'names': list(self.names), 'units': list(self.units)}
 
 
@@ -51,18 +51,18 @@ STATE_PARTS: Final[Mapping[str, StatePart]] = {
         StatePart('battery', 'lowstate', ('bms_state.soc',), ('battery_pct',), ('%',)),
     )
 }  # fmt: skip
-"""By the word that ``state`` takes."""
+"""By the keyword in ``state``."""
 COMMAND: Final = StatePart(
     'cmd_vel', 'cmd_vel', ('linear.x', 'linear.y', 'angular.z'), ('x.vel', 'y.vel', 'theta.vel'), ('m/s', 'm/s', 'rad/s')
 )
 DERIVED: Final = StatePart('odometry', 'odom', _POSE, COMMAND.names, COMMAND.units, is_derived=True)
 ACTIONS: Final[Mapping[str, StatePart]] = {part.name: part for part in (COMMAND, DERIVED)}
 AUTO: Final = 'auto'
-"""In place of one of ``ACTIONS``: the commands if the first mission of a dataset has them, otherwise what odometry measured."""
+"""Instead of one of ``ACTIONS``: the commands if the first mission of a dataset has them, otherwise measured odometry."""
 MAPPED: Final = 'fields'
 """The action of a dataset that takes it from fields of a topic."""
 ARM_JOINTS, ARM_COMMANDS, ARM_CLOCK = 'arm_joints', 'arm_commands', 'arm_clock'
-"""The names of an arm's sensors here, regardless of their names in the recording: they are found by topic."""
+"""Names of an arm's sensors in datasets, whatever their names in the recording: they are found by topic."""
 ARM_TOPICS: Final = {ARM_JOINTS: 'joint_states', ARM_COMMANDS: 'joint_commands', ARM_CLOCK: 'clock'}
 """Below the arm's namespace: sensor_msgs/JointState twice, sensor_msgs/TimeReference."""
 JOINT_STATE: Final = 'sensor_msgs/msg/JointState'
@@ -81,26 +81,26 @@ OWN_FILES, SHARED = 'episode', 'shared'
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """How missions become episodes; the same for a whole dataset."""
+    """How missions become episodes; the same for a complete dataset."""
 
     fps: int | None = None
     """None: the rate of the slowest camera."""
     state: tuple[str | StatePart, ...] = ('pose',)
-    """Of ``STATE_PARTS``, or fields of a topic."""
+    """From ``STATE_PARTS``, or fields of a topic."""
     action: str | StatePart = AUTO
-    """Of ``ACTIONS``, or fields of a topic."""
+    """From ``ACTIONS``, or fields of a topic."""
     images: Mapping[str, str] = field(default_factory=lambda: {'front': 'camera'})
     """Name of a feature -> sensor or topic with its images."""
     codec: str = AV1
     is_lossless: bool = False
     layout: str = OWN_FILES
-    """``episode``: separate video files for each episode; ``shared``: those of all episodes in one file for each camera."""
+    """``episode``: separate video files for each episode; ``shared``: one file per camera for all episodes."""
     resample: Mapping[str, str] = field(default_factory=dict)
     """Sensor or topic -> ``hold`` or ``linear``; default: hold."""
     max_age_s: Mapping[str, float] = field(default_factory=dict)
     """Sensor or topic -> seconds; default: ``ticks.LATE`` periods of the stream or of the ticks."""
     by: str = BY_STAMP
-    """Which of the two times of messages places them at the ticks."""
+    """Which of a message's two times is used for the ticks."""
     max_gap_s: float = 5.0
     max_stale: float = 0.05
     allow_gaps: bool = False
@@ -161,7 +161,7 @@ class ExportOptions:
         return self.action if isinstance(self.action, str) else MAPPED
 
     def actions(self, word: str) -> list[StatePart]:
-        """Where the action can come from, best first; ``word`` as in ``action_word``."""
+        """Possible sources of the action, best first; ``word`` as in ``action_word``."""
         if not isinstance(self.action, str):
             return [self.action]
         return [COMMAND, DERIVED] if word == AUTO else [ACTIONS[word]]

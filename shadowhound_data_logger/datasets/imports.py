@@ -1,8 +1,8 @@
-"""Imports recordings of an arm by other programs into the store, as sources like our own: hashed, and in the catalog.
+"""Imports an arm's recordings by other programs into the store, with hashes and catalog rows like our own.
 
-LeRobotDataset v2.1 and v3.0 (https://github.com/huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx) and HDF5 as ACT and
-ALOHA write it (https://github.com/tonyzhaozh/aloha, record_episodes.py). Joints and commands become objects of the arm, each
-with the identity of its episode in its key and metadata; pictures stay where they are.
+LeRobotDataset v2.1 and v3.0 (https://github.com/huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx) and HDF5 as written by
+ACT and ALOHA (https://github.com/tonyzhaozh/aloha, record_episodes.py). Joints and commands become objects of the arm, with the
+episode's identity in key and metadata; images are not imported.
 
 The identity is the SHA-256 of the imported part of an episode (``identity_of``), not of a file: LeRobot v3 has many episodes in
 one file, and rewrites it when the dataset grows.
@@ -47,12 +47,12 @@ if TYPE_CHECKING:
 AS_RECORDED: Final = 'lerobot/joints'
 """Positions in the unit of the recording: LeRobot does not record it."""
 GRID_S: Final = 1e-4
-"""The difference that lerobot allows between a time and its frame's (``tolerance_s``)."""
+"""lerobot's tolerance between a time and its frame's time (``tolerance_s``)."""
 DIGITS: Final = 16
 """Digits of an identity in a key."""
 MS: Final = 1_000_000
 PART: Final = 3000
-"""Samples of an object."""
+"""Samples per object."""
 COLUMNS: Final = ('episode', 'begin_ns')
 
 
@@ -69,7 +69,7 @@ class Demonstration:
     number: int
     """Its number in the dataset."""
     identity: str
-    """``identity_of`` what was recorded."""
+    """``identity_of`` the recording."""
 
     @property
     def begin_ns(self) -> int:
@@ -87,25 +87,26 @@ class Imported:
     episodes: int = 0
     """New ones."""
     unchanged: int = 0
-    """Episodes that were there already."""
+    """Episodes that were imported before."""
     samples: int = 0
-    """Of the new episodes."""
+    """In the new episodes."""
     objects: int = 0
     """New ones."""
     present: int = 0
-    """Objects that were there already."""
+    """Objects that were in the store already."""
     refused: dict[str, str] = field(default_factory=dict)
-    """Episode -> why."""
+    """Episode -> reason."""
     absent: list[str] = field(default_factory=list)
     """Episodes of this arm that were imported before and are not in this dataset; they stay in the store."""
 
 
 def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: NDArray[Any], commands: NDArray[Any] | None,
                 unit: str) -> str:  # fmt: skip
-    """SHA-256 in hex of an episode as it was recorded: joints, unit, the time of each sample since the first, all numbers.
+    """SHA-256 in hex of an episode as recorded: joints, unit, the time of each sample since the first, all numbers.
 
-    The numbers are hashed as float64, little endian, row by row, before units are converted. So it does not depend on the file
-    that they are in, on the number of the episode, or on the width of a column that holds the same values.
+    The numbers are hashed as float64, little endian, row by row, before units are converted. So it does not depend on the file,
+    on the
+    episode's number, or on the width of a column with the same values.
     """
     header = {'names': list(names), 'unit': unit, 'samples': len(positions), 'has_commands': commands is not None}
     whole = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
@@ -116,8 +117,8 @@ def identity_of(stamps_ns: NDArray[np.int64], names: Sequence[str], positions: N
     return whole.hexdigest()
 
 
-def times_of(path: Path) -> dict[int, int]:
-    """Episode -> when it began by the arm's clock, of a CSV file with ``episode,begin_ns``. Raises SettingError."""
+def read_times(path: Path) -> dict[int, int]:
+    """Episode -> its start by the arm's clock, from a CSV file with ``episode,begin_ns``. Raises SettingError."""
     try:
         found = {int(row['episode']): int(row['begin_ns']) for row in csv_rows(path.read_bytes())}
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
@@ -127,10 +128,10 @@ def times_of(path: Path) -> dict[int, int]:
     return found
 
 
-def of_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> Iterator[Demonstration]:
+def read_lerobot(folder: Path, times: Mapping[int, int], *, is_degrees: bool) -> Iterator[Demonstration]:
     """The episodes of a LeRobotDataset v2.1 or v3.0 with known start times.
 
-    Those are ``times``, otherwise the column ``shadowhound.stamp_ns``. Raises LakeError.
+    Start times are from ``times``, otherwise from the column ``shadowhound.stamp_ns``. Raises LakeError.
     """
     info = _info(folder)
     features = info['features']
@@ -172,7 +173,7 @@ def _info(folder: Path) -> dict[str, Any]:
         version = str(info['codebase_version'])
         state = info['features']['observation.state']
         if version not in {'v2.1', 'v3.0'} or len(state['shape']) != 1 or not float(info['fps']) > 0:
-            raise LakeError(f'{folder} is a dataset of version {version} with {info["fps"]} frames a second',
+            raise LakeError(f'{folder} is a dataset of version {version} with {info["fps"]} frames per second',
                             remedy='v2.1 and v3.0 can be imported')  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise LakeError(f'{folder} is not a LeRobotDataset: {error}', remedy=f'it has {INFO} with observation.state') from error
@@ -192,7 +193,7 @@ def _joint(name: str) -> str:
 
 
 def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int, int], fps: float) -> NDArray[np.int64]:
-    """LeRobot counts frames at an even rate, and its times are rounded to float32: where they agree, the frames are exact."""
+    """LeRobot counts frames at a constant rate and rounds times to float32: if they agree, the frame numbers are exact."""
     if number not in times:
         if 'shadowhound.stamp_ns' in columns:
             return columns['shadowhound.stamp_ns'][:, 0].astype(np.int64)
@@ -207,7 +208,7 @@ def _stamps(number: int, columns: Mapping[str, NDArray[Any]], times: Mapping[int
     return times[number] + np.rint(seconds * SECOND).astype(np.int64)
 
 
-def of_hdf5(
+def read_hdf5(
     paths: Sequence[Path], times: Mapping[int, int], *, fps: float, joints: Sequence[str] = ()
 ) -> Iterator[Demonstration]:
     """The n-th file is episode n: ``observations/qpos`` and ``action``, (samples, joints). Raises LakeError."""
@@ -224,7 +225,7 @@ def of_hdf5(
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise LakeError(f'{path} is not a demonstration in the layout of ACT and ALOHA: {error}') from error
         if positions.ndim != 2 or not len(positions) or (commands is not None and commands.shape != positions.shape):
-            raise LakeError(f'{path}: observations/qpos and action are not of one shape, (samples, joints)')
+            raise LakeError(f'{path}: observations/qpos and action must have the same shape, (samples, joints)')
         width = positions.shape[1]
         names = tuple(joints) or tuple(f'joint_{n}' for n in range(width))
         if len(names) != width:
@@ -235,9 +236,9 @@ def of_hdf5(
 
 
 def import_episodes(demonstrations: Iterable[Demonstration], arm: str, store: ObjectStore) -> Imported:
-    """Store the new episodes as recordings of the arm, with rows in the catalog; nothing in the store is changed.
+    """Store the new episodes as recordings of the arm, with rows in the catalog; existing objects are not changed.
 
-    An episode is refused if the store has another recording of its time, or its recording with another time. Raises LakeError,
+    An episode is rejected if the store has another recording of its time, or its recording with another time. Raises LakeError,
     StoreError.
     """
     every, found, stored = list(demonstrations), Imported(), _StoredEpisodes(store, arm)
@@ -272,15 +273,15 @@ class _StoredEpisodes:
         self._store, self._arm = store, arm
         self._keys: set[str] = set()
         self._pieces: list[tuple[int, str, str]] = []
-        """(begin in ms, identity, key) of the objects with joints, in this order."""
+        """(start in ms, identity, key) of the objects with joints, sorted."""
         self._begins: dict[str, set[int]] = {}
-        """Identity -> the begins, in ms, of the episodes that have it."""
+        """Identity -> the starts, in ms, of the episodes with it."""
         for sensor in (ARM_JOINTS, ARM_COMMANDS):
             named = ARM_TOPICS[sensor]
             name = rf'(\d{{8}}/\d{{6}}_\d{{3}})_{named}_([0-9a-f]{{{DIGITS}}})_(\d+)\.json'
             pattern = re.compile(rf'{re.escape(arm)}/{named}/{name}', re.ASCII)
             for info in store.list(schema.BUCKET, f'{arm}/{named}/'):
-                if (match := pattern.fullmatch(info.key)) is None or (begin_ms := _ms_of(match[1])) is None:
+                if (match := pattern.fullmatch(info.key)) is None or (begin_ms := _parse_ms(match[1])) is None:
                     continue  # recorded by the arm's own machine
                 self._keys.add(info.key)
                 if sensor == ARM_JOINTS:
@@ -296,32 +297,34 @@ class _StoredEpisodes:
                 self._add(stamp // MS, each.identity[:DIGITS], self._key(each, ARM_JOINTS, number), number)
 
     def conflict(self, each: Demonstration, wanted: Mapping[int, str]) -> str:
-        """Why it cannot be stored, or empty. ``wanted`` are start time, in ms, and identity of all imported episodes."""
+        """Why it cannot be stored, or empty. ``wanted`` has start time, in ms, and identity of all imported episodes."""
         if self.has(each):
             return ''
         mine = each.identity[:DIGITS]
         for begin in sorted(self._begins.get(mine, ())):
             if wanted.get(begin) != mine:
-                return f'its recording was imported with the begin {iso(begin * MS)}: it has another number or time now'
+                return f'its recording was imported with the start time {iso(begin * MS)}: it has another number or time now'
         if (other := self._overlapping(each)) is None:
             return ''
         begin, identity = other
         if begin == each.begin_ns // MS:
-            return f'it changed: the recording with this begin was imported as {identity}, and is {mine} now'
-        return f'the recording that was imported with the begin {iso(begin * MS)} is of the same time'
+            return f'it changed: the recording with this start time was imported as {identity}, and is {mine} now'
+        return f'the recording that was imported with the start time {iso(begin * MS)} overlaps it'
 
     def others(self, wanted: Mapping[int, str]) -> list[str]:
-        """The episodes with other begins than these."""
+        """The episodes with other start times."""
         every = sorted((begin, identity) for identity, begins in self._begins.items() for begin in begins)
         return [f'{iso(begin * MS)} {identity}' for begin, identity in every if begin not in wanted]
 
     def put(self, each: Demonstration, sensor: str, number: int, values: NDArray[np.float64], found: Imported) -> schema.Row:
-        """Store the samples from ``number`` times ``PART`` on, if they are not there; the row. Raises LakeError, StoreError."""
+        """Store the samples from ``number`` times ``PART`` on, if they are missing; returns the row. Raises LakeError,
+        StoreError.
+        """
         key = self._key(each, sensor, number)
         held = self._store.head(schema.BUCKET, key) if key in self._keys else None
         if held is not None:
             if held.metadata.get(meta.IMPORTED_FROM) != each.identity:
-                raise LakeError(f'{schema.BUCKET}/{key} is not of {each.name}', remedy='import it as another --arm')
+                raise LakeError(f'{schema.BUCKET}/{key} does not belong to {each.name}', remedy='import it as another --arm')
             found.present += 1
             return schema.row_of(schema.BUCKET, key, held.size, 'application/json', held.metadata)
         some = slice(number * PART, (number + 1) * PART)
@@ -348,7 +351,7 @@ class _StoredEpisodes:
             try:
                 is_new = self._store.put(item) is Put.CREATED
             except ForeignObject as error:
-                raise LakeError(f'{schema.BUCKET}/{key} is there, and is another recording of that time',
+                raise LakeError(f'{schema.BUCKET}/{key} exists, and is another recording of that time',
                                 remedy='import it as another --arm, or with other --times') from error  # fmt: skip
         found.objects += is_new
         found.present += not is_new
@@ -365,7 +368,7 @@ class _StoredEpisodes:
             self._begins.setdefault(identity, set()).add(begin_ms)
 
     def _overlapping(self, each: Demonstration) -> tuple[int, str] | None:
-        """Begin in ms and identity of an object of the same time."""
+        """Start in ms and identity of an object of the same time."""
         place = bisect_left(self._pieces, (each.begin_ns // MS,))
         if place < len(self._pieces) and self._pieces[place][0] <= int(each.stamps_ns[-1]) // MS:
             return self._pieces[place][:2]
@@ -379,8 +382,8 @@ class _StoredEpisodes:
         return None
 
 
-def _ms_of(text: str) -> int | None:
-    """``YYYYMMDD/HHMMSS_mmm`` of a key as ms since 1970; None if it is not a time."""
+def _parse_ms(text: str) -> int | None:
+    """``YYYYMMDD/HHMMSS_mmm`` in a key as ms since 1970; None if it is not a time."""
     seconds, _, ms = text.rpartition('_')
     try:
         return int(datetime.strptime(f'{seconds}+0000', '%Y%m%d/%H%M%S%z').timestamp()) * 1000 + int(ms)

@@ -1,10 +1,10 @@
-"""A dataset in LeRobot's format v3.0, as lerobot 0.6.1 reads it, in a folder: complete while it has ``meta/info.json``.
+"""A dataset in LeRobot's format v3.0, as read by lerobot 0.6.1, in a folder: complete if it has ``meta/info.json``.
 
-https://github.com/huggingface/lerobot, src/lerobot/datasets: utils.py has the paths, dataset_metadata.py and io_utils.py what is
-read. Each episode has a data file, a video for each camera and an episodes file of its own, which are never written again, except
-that with the layout ``shared`` there is one video for each camera (docs/decisions/0022). What speaks of all of them is written
-anew, ``info.json`` last. Ours are the columns ``shadowhound/...`` of the episodes and the files ``meta/shadowhound_*``, which
-lerobot keeps and does not look at.
+https://github.com/huggingface/lerobot, src/lerobot/datasets: utils.py has the paths, dataset_metadata.py and io_utils.py the
+readers. Each episode has a data file, a video per camera and an episodes file, which are never rewritten, except that with the
+layout ``shared`` there is one video per camera (docs/decisions/0022). Files about all episodes are rewritten, ``info.json`` last.
+The columns ``shadowhound/...`` of the episodes and the files ``meta/shadowhound_*`` are additions, which lerobot keeps and
+ignores.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ if TYPE_CHECKING:
 
 VERSION: Final = 'v3.0'
 ANY_SIZE_MB: Final = 1_000_000
-"""So that lerobot's own writer, too, puts what it adds into the one file."""
+"""Makes lerobot's own writer put everything it adds into the one file, too."""
 CHUNK: Final = 1000
-"""Files in a folder."""
+"""Files per folder."""
 DATA: Final = 'data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
 VIDEO: Final = 'videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4'
 EPISODES: Final = 'meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'
@@ -64,7 +64,7 @@ STATS, TASKS = 'meta/stats.json', 'meta/tasks.parquet'
 SOURCE_TABLE, GAP_TABLE = DIGEST_FILES[1:]
 REPORT, FILES, DIGESTS = 'meta/shadowhound_report.json', 'meta/shadowhound_files.json', 'meta/shadowhound_digests.json'
 OURS: Final = 'shadowhound/'
-"""The prefix of our own columns in ``meta/episodes``."""
+"""The prefix of our columns in ``meta/episodes``."""
 QUANTILES: Final = {'q01': 0.01, 'q10': 0.10, 'q50': 0.50, 'q90': 0.90, 'q99': 0.99}
 _COUNTERS: Final = {
     'timestamp': 'float32',
@@ -88,12 +88,12 @@ class Lerobot:
         self.settings: dict[str, Any] | None = report.get('settings') if self.info else None
         """The settings of its episodes."""
         self.dropped: list[str] = report.get('dropped', [])
-        """SHA-256 of the ids of missions that must not come back."""
+        """SHA-256 of the ids of missions that must not be added again."""
         self.rows: list[EpisodeRow] = list(self._rows()) if self.info else []
         self._joined: dict[Path, list[Clip]] = {}
         """Shared video -> the clips that it must consist of."""
         self._is_changed = False
-        """Whether earlier episodes were."""
+        """Whether earlier episodes changed."""
 
     @property
     def mission_ids(self) -> list[str]:
@@ -104,7 +104,7 @@ class Lerobot:
         return digest_of(self.folder)
 
     def path(self, pattern: str, row: Mapping[str, Any], what: str, **names: str) -> Path:
-        """Of a file of an episode; ``what`` is ``data``, ``meta/episodes`` or ``videos/KEY``."""
+        """Path of a file of an episode; ``what`` is ``data``, ``meta/episodes`` or ``videos/KEY``."""
         place = {each: row[f'{what}/{each}'] for each in ('chunk_index', 'file_index')}
         return self.folder / pattern.format(**place, **names)
 
@@ -114,29 +114,29 @@ class Lerobot:
         return int(self.info['fps'])
 
     def clip(self, row: EpisodeRow, key: str) -> Clip:
-        """The frames of an episode in the video that they are in."""
+        """The frames of an episode in their video."""
         path = self.path(VIDEO, row, f'videos/{key}', video_key=key)
         return Clip(path, round(row[f'videos/{key}/from_timestamp'] * self.fps), row['length'])
 
     def video_keys(self) -> list[str]:
         return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] == 'video']
 
-    def picture_keys(self) -> list[str]:
+    def image_keys(self) -> list[str]:
         return [key for key, feature in (self.info or {}).get('features', {}).items() if feature['dtype'] in {'video', 'image'}]
 
     def numbers(self, row: EpisodeRow, key: str) -> NDArray[Any]:
         """(frames, numbers) of a feature of an episode."""
         return matrix(pq.read_table(self.path(DATA, row, 'data'), columns=[key])[key])
 
-    def pictures(self, row: EpisodeRow, key: str) -> Iterator[NDArray[np.uint8]]:
+    def images(self, row: EpisodeRow, key: str) -> Iterator[NDArray[np.uint8]]:
         """(height, width, 3) RGB of each frame of an episode. Raises LakeError."""
         if key in self.video_keys():
             yield from frames_of(self.clip(row, key), self.fps)
         else:
             yield from (decode.image(body) for body in self.bodies(row, key))
 
-    def pictures_at(self, row: EpisodeRow, key: str, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        """Those of these frames, counted from 0 within the episode, in rising order. Raises LakeError."""
+    def images_at(self, row: EpisodeRow, key: str, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        """The frames with these numbers, counted from 0 in the episode, in ascending order. Raises LakeError."""
         if key in self.video_keys():
             clip = self.clip(row, key)
             yield from frames_at(clip.path, self.fps, [clip.first + number for number in numbers])
@@ -152,7 +152,7 @@ class Lerobot:
         assert self.info is not None
         for place, path in enumerate(sorted((self.folder / 'meta/episodes').glob('*/*.parquet'))):
             if place >= self.info['total_episodes']:
-                return  # of a run that was killed before it said so
+                return  # from a run that was killed before it updated info.json
             yield pq.read_table(path).to_pylist()[0]
 
     # -- adding ----------------------------------------------------------------------------------------------------
@@ -160,13 +160,13 @@ class Lerobot:
     def add(self, episode: Mapping[str, Any], made: Path, options: ExportOptions, split: str) -> None:
         """Append one episode from the folder ``made``. It becomes part of the dataset with ``commit``.
 
-        Raises LakeError if it does not fit the earlier episodes.
+        Raises LakeError if it does not match the earlier episodes.
         """
         features = features_of(episode, options)
         if self.info is None:
             self.info = _empty_info(episode, features, options)
         if (other := different(self.info['features'], features)) or self.info['fps'] != episode['fps']:
-            raise LakeError(f'its {other or "frames a second"} differ from those of the episodes before it')
+            raise LakeError(f'its {other or "frames per second"} differ from those of the episodes before it')
         number = int(self.rows[-1]['data/file_index'] + CHUNK * self.rows[-1]['data/chunk_index'] + 1) if self.rows else 0
         begin = int(self.rows[-1]['dataset_to_index']) if self.rows else 0
         place = {'chunk_index': number // CHUNK, 'file_index': number % CHUNK}
@@ -185,7 +185,7 @@ class Lerobot:
         values = _write_data(made / ROWS, target, row, self._tasks().index(episode['task']), features)
         stats = {key: vector_stats(column) for key, column in values.items()}
         for name, histogram in episode['histograms'].items():
-            stats[f'observation.{name}'] = picture_stats(np.array(histogram), episode['frames'])
+            stats[f'observation.{name}'] = image_stats(np.array(histogram), episode['frames'])
             row[f'{OURS}histogram/observation.{name}'] = np.array(histogram).ravel().tolist()
             if not options.is_lossless:
                 video = self.path(VIDEO, row, f'videos/observation.{name}', video_key=f'observation.{name}')
@@ -196,27 +196,27 @@ class Lerobot:
                     _take(made / f'{name}.mp4', video)
         row |= {f'stats/{key}/{name}': value for key, each in stats.items() for name, value in each.items()}
         row |= {f'meta/episodes/{name}': value for name, value in place.items()}
-        row |= _ours(episode, split)
+        row |= _shadowhound_columns(episode, split)
         row |= {f'{OURS}labels': json.dumps(episode['labels'])} if options.labels else {}
         self._write_row(row)
 
     def _write_row(self, row: EpisodeRow) -> None:
-        arrays = {name: pa.array([value], _type_of(name, value)) for name, value in row.items()}
+        arrays = {name: pa.array([value], _arrow_type(name, value)) for name, value in row.items()}
         _write(self.path(EPISODES, row, 'meta/episodes'), pa.table(arrays))
 
     def _tasks(self) -> list[str]:
-        """In the order in which they first appear."""
+        """In order of first appearance."""
         return list(dict.fromkeys(task for row in self.rows for task in row['tasks']))
 
     def join_videos(self) -> None:
-        """Write the shared videos of the episodes that were added; those before them stay in their place. Raises LakeError."""
+        """Write the shared videos of the added episodes; earlier ones keep their position. Raises LakeError."""
         for path, clips in self._joined.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path, is_synced=True) as file:
                 join(clips, self.fps, file)
         self._joined.clear()
 
-    # -- what speaks of all ----------------------------------------------------------------------------------------
+    # -- files about all episodes ----------------------------------------------------------------------------------
 
     def commit(self, report: Mapping[str, Any], made: Mapping[str, Path]) -> str:
         """Write the files about all episodes, ``info.json`` last; returns the digest. ``made``: folders of new episodes."""
@@ -245,7 +245,7 @@ class Lerobot:
         return digest
 
     def _stats(self) -> dict[str, Any]:
-        """Of all frames together, not of what is known of each episode; of none where all were dropped."""
+        """Statistics over all frames, not combined per episode; empty if all were dropped."""
         assert self.info is not None
         if not self.rows:
             return {}
@@ -256,13 +256,13 @@ class Lerobot:
             for key in numeric:
                 columns[key].append(matrix(table[key]))
         stats = {key: vector_stats(np.concatenate(found)) for key, found in columns.items()}
-        for key in self.picture_keys():
+        for key in self.image_keys():
             histogram = sum(np.array(row[f'{OURS}histogram/{key}'], np.int64).reshape(3, 256) for row in self.rows)
-            stats[key] = picture_stats(np.asarray(histogram), sum(row['length'] for row in self.rows))
+            stats[key] = image_stats(np.asarray(histogram), sum(row['length'] for row in self.rows))
         return stats
 
     def _write_parts(self, path: Path, name: str, made: Mapping[str, Path], schema: pa.Schema) -> None:
-        """One row group of each episode, in their order: of new ones from their folders, of others from the file before."""
+        """One row group per episode, in order: new ones from their folders, others from the previous file."""
         before: dict[str, pa.Table] = {}
         if path.is_file():
             file = pq.ParquetFile(path)
@@ -276,7 +276,7 @@ class Lerobot:
                     writer.write_table(table.select(schema.names).cast(schema), row_group_size=max(len(table), 1))
 
     def _note_digest(self, digest: str) -> None:
-        """Which missions a digest stands for: a dataset grows, and a model was trained on what it was then."""
+        """Record the missions of this digest: a dataset grows, and a model was trained on an earlier state."""
         history = _json(self.folder / DIGESTS) or {'digests': []}
         if not history['digests'] or history['digests'][-1]['digest'] != digest:
             history['digests'].append({'digest': digest, 'missions': self.mission_ids})
@@ -298,13 +298,13 @@ class Lerobot:
         _put_json(self.folder / FILES, {'files': dict(sorted(found.items()))})
 
     def paths(self) -> Iterator[Path]:
-        """The files that belong to it, but for ``info.json`` and the list of them."""
-        yield from dict.fromkeys(path for row in self.rows for path in self._files_of(row))
+        """The files that belong to it, except ``info.json`` and this list."""
+        yield from dict.fromkeys(path for row in self.rows for path in self._episode_files(row))
         optional = ('meta/report.png', LABEL_TABLE)
         yield from (self.folder / name for name in (STATS, TASKS, SOURCE_TABLE, GAP_TABLE, REPORT, DIGESTS))
         yield from (self.folder / name for name in optional if (self.folder / name).is_file())
 
-    # -- taking away -----------------------------------------------------------------------------------------------
+    # -- removing --------------------------------------------------------------------------------------------------
 
     def drop(self, mission_id: str) -> None:
         """Delete an episode and renumber the later ones. ``commit`` must be called afterwards."""
@@ -332,11 +332,11 @@ class Lerobot:
             row.update((name, value) for key in shared for name, value in _times(key, begin, count, self.fps).items())
             for name in wanted:
                 row |= {f'stats/{name}/{each}': value for each, value in vector_stats(matrix(new[name])).items()}
-            if row != known:  # also where a kill came between its rows and this
+            if row != known:  # also if a kill happened between its rows and this
                 self._write_row(row)
             begin += count
-        used = {path for row in self.rows for path in self._files_of(row)}
-        for path in (path for row in gone for path in self._files_of(row) if path not in used):
+        used = {path for row in self.rows for path in self._episode_files(row)}
+        for path in (path for row in gone for path in self._episode_files(row) if path not in used):
             path.unlink(missing_ok=True)
         kept = (_json(self.folder / DIGESTS) or {'digests': []})['digests']
         _put_json(self.folder / DIGESTS, {'digests': [
@@ -347,7 +347,7 @@ class Lerobot:
         if self.settings is None or self.settings['layout'] != SHARED:
             return []
         lengths = [row['length'] for row in self.rows]
-        begins = np.cumsum([0, *lengths[:-1]]).tolist() if lengths else []  # not of the rows: some may be numbered again already
+        begins = np.cumsum([0, *lengths[:-1]]).tolist() if lengths else []  # not from the rows: some may be renumbered already
         for key in self.video_keys():
             for path in {self.path(VIDEO, row, f'videos/{key}', video_key=key) for row in self.rows}:
                 kept = [Clip(path, begin, row['length']) for row, begin in zip(self.rows, begins, strict=True)
@@ -357,8 +357,8 @@ class Lerobot:
                         join(kept, self.fps, file)
         return self.video_keys()
 
-    def _files_of(self, row: EpisodeRow) -> Iterator[Path]:
-        """What says that they are there, last."""
+    def _episode_files(self, row: EpisodeRow) -> Iterator[Path]:
+        """The files of an episode; the one that records its existence is last."""
         yield self.path(DATA, row, 'data')
         for key in self.video_keys():
             yield self.path(VIDEO, row, f'videos/{key}', video_key=key)
@@ -387,7 +387,7 @@ def features_of(episode: Mapping[str, Any], options: ExportOptions) -> dict[str,
         origins += [f'{part.sensor}, derived' if part.is_derived else part.sensor] * len(names)
     features['observation.state'] = _vector(state, units=units, source=origins)
     features['action'] = _action_feature(streams, options)
-    features['shadowhound.stale'] = _vector(list(streams), about='1 where the newest message is older than it may be')
+    features['shadowhound.stale'] = _vector(list(streams), about='1 if the newest message is older than allowed')
     features['shadowhound.age_s'] = _vector(list(streams), about='seconds since the newest message')
     features['shadowhound.cause'] = {'dtype': 'string', 'shape': [1], 'names': None}
     features |= {LABEL_FEATURE: {'dtype': 'string', 'shape': [1], 'names': None}} if options.labels else {}
@@ -397,7 +397,7 @@ def features_of(episode: Mapping[str, Any], options: ExportOptions) -> dict[str,
 
 
 def _action_feature(streams: Mapping[str, Any], options: ExportOptions) -> dict[str, Any]:
-    """The arm's numbers first; ``derived`` where one of them was not commanded."""
+    """The arm's numbers first; ``derived`` if one of them was not commanded."""
     base = streams['action']['sensor'] == COMMAND.sensor
     names, units = list(COMMAND.names), list(COMMAND.units)
     sources, is_derived = [COMMAND.sensor if base else f'{DERIVED.sensor}, derived'], not base
@@ -448,7 +448,7 @@ def _empty_info(episode: Mapping[str, Any], features: Mapping[str, Any], options
     }  # fmt: skip
 
 
-def _ours(episode: Mapping[str, Any], split: str) -> EpisodeRow:
+def _shadowhound_columns(episode: Mapping[str, Any], split: str) -> EpisodeRow:
     named = ('mission_id', 'run_id', 'robot', 'mission_type', 'first_tick_ns', 'last_tick_ns', 'begins_late_s')
     row: EpisodeRow = {f'{OURS}{name}': episode[name] for name in named}
     row[f'{OURS}split'] = split
@@ -461,12 +461,12 @@ def _ours(episode: Mapping[str, Any], split: str) -> EpisodeRow:
     return row
 
 
-def _type_of(name: str, value: Any) -> pa.DataType:
+def _arrow_type(name: str, value: Any) -> pa.DataType:
     """As lerobot's writer has them: 64 bits, and lists of any depth."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, list):
-        inner = _type_of(name, value[0]) if value else pa.string()
+        inner = _arrow_type(name, value[0]) if value else pa.string()
         return pa.list_(inner)
     return {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}[type(value)]
 
@@ -485,7 +485,7 @@ def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features
             table = table.append_column('episode_index', pa.array([row['episode_index']] * count, pa.int64()))
             table = table.append_column('index', pa.array(range(first, first + count), pa.int64()))
             table = table.append_column('task_index', pa.array([task] * count, pa.int64())).select(order)
-            table = table.replace_schema_metadata(_kinds_of(features))
+            table = table.replace_schema_metadata(_column_types(features))
             writer = writer or pq.ParquetWriter(out, table.schema, compression='snappy')
             writer.write_table(table)
             begin += count
@@ -497,16 +497,16 @@ def _write_data(source: Path, target: Path, row: EpisodeRow, task: int, features
     return {key: np.concatenate(parts) for key, parts in found.items()}
 
 
-def _kinds_of(features: Mapping[str, Any]) -> dict[str, str] | None:
-    """What the ``datasets`` library takes columns for that it streams: without it, pictures are bytes to it."""
-    pictures = {key: {'_type': 'Image'} for key, feature in features.items() if feature['dtype'] == 'image'}
-    return {'huggingface': json.dumps({'info': {'features': pictures}})} if pictures else None
+def _column_types(features: Mapping[str, Any]) -> dict[str, str] | None:
+    """Column types for the ``datasets`` library when it streams: otherwise images are plain bytes."""
+    images = {key: {'_type': 'Image'} for key, feature in features.items() if feature['dtype'] == 'image'}
+    return {'huggingface': json.dumps({'info': {'features': images}})} if images else None
 
 
 def matrix(column: pa.ChunkedArray) -> NDArray[Any]:
-    """(rows, numbers) of a column of numbers or of lists of one length."""
+    """(rows, numbers) of a column of numbers or of lists of equal length."""
     flat = column.combine_chunks()
-    if isinstance(flat, pa.ChunkedArray):  # pyarrow keeps an empty one so
+    if isinstance(flat, pa.ChunkedArray):  # pyarrow's form of an empty column
         flat = flat.chunk(0) if flat.num_chunks else pa.array([], column.type)
     count = len(flat)
     values = flat.flatten() if pa.types.is_nested(flat.type) else flat
@@ -514,7 +514,7 @@ def matrix(column: pa.ChunkedArray) -> NDArray[Any]:
 
 
 def vector_stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Of (frames, numbers), over the frames; ``count`` is how many these are."""
+    """Statistics of (frames, numbers) over the frames; ``count`` is the number of frames."""
     found = {'min': values.min(axis=0), 'max': values.max(axis=0), 'mean': values.mean(axis=0, dtype=np.float64),
              'std': values.std(axis=0, dtype=np.float64)}  # fmt: skip
     made = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
@@ -526,8 +526,8 @@ def vector_stats(values: NDArray[Any]) -> dict[str, Any]:
     }
 
 
-def picture_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
-    """Of every pixel of every frame, by colour, 0 to 1; each in the shape (3, 1, 1). ``histogram`` is (3, 256)."""
+def image_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
+    """Statistics over every pixel of every frame, by color, 0 to 1; each has shape (3, 1, 1). ``histogram`` is (3, 256)."""
     levels, total = np.arange(256) / 255, histogram.sum(axis=1)
     mean = (histogram * levels).sum(axis=1) / total
     spread = np.sqrt((histogram * (levels - mean[:, None]) ** 2).sum(axis=1) / total)
@@ -535,12 +535,12 @@ def picture_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
     there = histogram > 0
 
     def quantile(share: float) -> list[float]:
-        """The lowest value that so many pixels do not exceed."""
-        return [float(levels[int(np.searchsorted(upto[colour], share * total[colour]))]) for colour in range(3)]
+        """The smallest value that at least this share of the pixels does not exceed."""
+        return [float(levels[int(np.searchsorted(upto[color], share * total[color]))]) for color in range(3)]
 
     found = {
-        'min': [float(levels[there[colour].argmax()]) for colour in range(3)],
-        'max': [float(levels[255 - there[colour][::-1].argmax()]) for colour in range(3)],
+        'min': [float(levels[there[color].argmax()]) for color in range(3)],
+        'max': [float(levels[255 - there[color][::-1].argmax()]) for color in range(3)],
         'mean': mean.tolist(), 'std': spread.tolist(),
     }  # fmt: skip
     statistics = {**found, **{name: quantile(share) for name, share in QUANTILES.items()}}
@@ -549,7 +549,7 @@ def picture_stats(histogram: NDArray[np.int64], frames: int) -> dict[str, Any]:
 
 
 def _task_table(tasks: Sequence[str]) -> pa.Table:
-    """As pandas writes a frame whose index is the task: without what says so, lerobot looks tasks up by number."""
+    """The tasks as pandas writes a frame indexed by task: without its metadata, lerobot looks tasks up by number."""
     about = {
         'index_columns': ['task'],
         'column_indexes': [{'name': None, 'field_name': None, 'pandas_type': 'unicode', 'numpy_type': 'object',

@@ -1,8 +1,8 @@
-"""The folder of a task of mobile manipulation: what the robot and the arm recorded, and both in one training set.
+"""The folder of a mobile manipulation task: the recordings of robot and arm, and both in one training set.
 
 ``TASK/go2/MISSION/`` has ``odometry.mcap``, ``camera_front.mp4`` and ``joint_states.csv``, ``TASK/soarm/MISSION/`` the arm's
 ``joint_states.csv`` and ``joint_commands.csv``, all messages at their own rates; ``TASK/synchronized/`` has ``lerobot/`` (the
-training set), ``timestamps.csv`` (which messages make each frame) and, where one was logged, ``detections.json``.
+training set), ``timestamps.csv`` (the messages of each frame) and, if any were logged, ``detections.json``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 FRAMES: Final = 'odom', 'base_link'
 """Of the Go2's driver."""
 MAX_DETECTIONS: Final = 64 << 20
-"""Bytes of an object with detections."""
+"""Maximum size of an object with detections."""
 
 
 def task_of(folder: Path) -> Path | None:
@@ -58,7 +58,7 @@ def task_of(folder: Path) -> Path | None:
 
 
 def write_recordings(task: Path, plan: EpisodePlan, settings: StoreSettings, work: Path) -> None:
-    """What robot and arm recorded in a mission, into their folders. Raises StoreError, LakeError, BagDamaged, OSError."""
+    """Write the recordings of robot and arm in a mission. Raises StoreError, LakeError, BagDamaged, OSError."""
     place, store = Place(settings), open_store(settings, UploadSettings())
     name, begin = plan.mission.mission_id, plan.mission.begin_ns
     try:
@@ -118,7 +118,7 @@ def forget(task: Path, mission_id: str) -> None:
 
 
 def _folder(task: Path, part: str, mission_id: str) -> Path:
-    """Of a mission. Raises LakeError for an id (from a store) that would lead out of the task's folder."""
+    """The folder of a mission. Raises LakeError for an id (from a store) that would be outside of the task's folder."""
     if not is_name(mission_id):
         raise LakeError(f'the mission {printable(mission_id)!r} has a name that is invalid for a folder')
     return task / part / mission_id
@@ -131,7 +131,7 @@ def _fresh(folder: Path) -> Path:
 
 
 def _write_odometry(path: Path, series: Series) -> None:
-    """Poses and velocities as they were published; the catalog's objects contain no covariances."""
+    """Poses and velocities as published; the catalog's objects contain no covariances."""
     types = get_typestore(Stores.ROS2_HUMBLE)
     definition, hashed = types.generate_msgdef(ODOMETRY, ros_version=2)
     channel = Channel(series.recording.topic, ODOMETRY, 'ros2msg', definition, hashed, '')
@@ -160,7 +160,7 @@ def _write_joints(path: Path, series: Series, clock: ClockOffset | None) -> None
 
 
 def _detections(plan: EpisodePlan, place: Place) -> Iterator[dict[str, Any]]:
-    """The messages of the mission, as they were stored."""
+    """The messages of the mission, as stored."""
     for track in plan.detections:
         for number in track.within(plan.mission.begin_ns, plan.mission.end_ns):
             wanted = track.object(int(number))
@@ -175,7 +175,7 @@ def _detections(plan: EpisodePlan, place: Place) -> Iterator[dict[str, Any]]:
 
 
 def _write_timestamps(made: Lerobot, file: io.TextIOWrapper) -> None:
-    """One row per frame: its tick, and for each stream the newest message in it, by the clock of the stream."""
+    """One row per frame: its tick, and for each stream its newest message, by the clock of the stream."""
     table = csv.writer(file)
     sources = pq.read_table(made.folder / SOURCE_TABLE, columns=[EPISODE, 'frame', 'stream', 'stamp_ns'])
     streams: Sequence[str] = made.info['features']['shadowhound.stale']['names'] if made.info else []

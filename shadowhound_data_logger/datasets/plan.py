@@ -1,4 +1,4 @@
-"""Which missions are selected, what the store has of each, and whether it is known what is missing."""
+"""Which missions are selected, what the store has of each, and whether their gaps are known."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from shadowhound_data_logger.datasets.features import (
     ExportOptions,
     StatePart,
 )
-from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, bags_of, manifests_of
+from shadowhound_data_logger.datasets.series import Interval, RecordedSensor, Recordings, read_manifests, select_bags
 from shadowhound_data_logger.datasets.ticks import whole_fps
 from shadowhound_data_logger.formats.rows.schema import Row
 from shadowhound_data_logger.lake import labels, query
@@ -45,15 +45,16 @@ from shadowhound_data_logger.lake.track import NEEDED, RECEIVED, Track
 from shadowhound_data_logger.stores.base import ObjectStore
 
 BEFORE_NS: Final = 10 * SECOND
-"""So long before its start what a mission's first tick may still hold was published."""
+"""Messages published up to this long before a mission's start may be held at its first tick."""
 LONGEST_BATCH_NS: Final = 3600 * SECOND
-"""An object that began so long before may reach into a mission (sensor.batch_s)."""
+"""An object that starts this long before a mission may extend into it (sensor.batch_s)."""
 RECORDED: Final = ('odom', 'joints')
 """Sensors with messages that are exported unchanged, in addition to the frames (mobile.py)."""
 DETECTIONS: Final = frozenset({'vision_msgs/msg/Detection2DArray', 'vision_msgs/msg/Detection3DArray'})
 END_SLACK_NS: Final = 2 * SECOND
-"""A topic's last message comes so much before the end of a mission that the robot is switched off with; a slow topic's two
-periods."""
+"""A topic's last message may be this long before the end of a mission if the robot is switched off; for a slow topic, two
+periods.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +69,12 @@ class ChosenMission:
     """The mission's command; otherwise its type."""
     begin_ns: int
     end_ns: int
-    """0 while the mission is active, or its end has not reached the store."""
+    """0 while the mission is active, or until its end has reached the store."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPlan:
-    """One column group of a dataset in one mission: its name, its source, and what is known of its gaps."""
+    """One column group of a dataset in one mission: its name, its source, and its known gaps."""
 
     name: str
     part: StatePart | None
@@ -82,18 +83,18 @@ class StreamPlan:
     known: Known
     downsampled: tuple[tuple[int, int], ...]
     complete_ns: int
-    """Up to here the robot has reported what is missing; 0 if it has reported nothing."""
+    """The robot has reported its gaps up to here; 0 if it has reported none."""
     is_final: bool = False
-    """Whether it will report no more: it counts only received messages, or the topic ended and the node was restarted."""
+    """Whether it will report no more: it only counts received messages, or the topic ended and the node was restarted."""
 
     def is_known(self, end_ns: int) -> bool:
-        """Whether it is known what is missing up to that time."""
+        """Whether the gaps are known up to that time."""
         period_ns = round(SECOND / self.recording.rate_hz) if self.recording.rate_hz else 0
         return self.complete_ns + max(END_SLACK_NS, 2 * period_ns) >= end_ns
 
     def known_until(self, end_ns: int) -> str:
-        """Up to when the robot has reported what is missing, as part of a sentence."""
-        return f'up to {(end_ns - self.complete_ns) / SECOND:.1f} s before its end' if self.complete_ns else 'nothing'
+        """Up to when the robot has reported gaps, as part of a sentence."""
+        return f'up to {(end_ns - self.complete_ns) / SECOND:.1f} s before its end' if self.complete_ns else 'for no part of it'
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ class ArmPlan:
 
 @dataclass(frozen=True, slots=True)
 class EpisodePlan:
-    """A mission, and everything needed to make an episode of it. Can be sent to another process."""
+    """A mission, and everything needed to build an episode from it. It can be sent to another process."""
 
     mission: ChosenMission
     streams: tuple[StreamPlan, ...]
@@ -124,12 +125,12 @@ class EpisodePlan:
     topics: Mapping[str, str]
     bags: tuple[Manifest, ...]
     gaps: pa.Table
-    """The statements of the gap journal that were used."""
+    """The rows of the gap journal that were used."""
     missing: tuple[str, ...] = ()
     """Requested sensors without data."""
     arm: ArmPlan | None = None
     detections: tuple[Track, ...] = ()
-    """Of topics with detections of objects."""
+    """Topics with detections of objects."""
     labels: tuple[Label, ...] = ()
     """The labels of its time, if requested."""
 
@@ -139,22 +140,22 @@ class EpisodePlan:
 
     @property
     def waits_for(self) -> str:
-        """Why it is unknown so far what is missing; empty if it is known."""
+        """Why its gaps are not known yet; empty if they are."""
         if not self.mission.end_ns:
-            return 'it goes on, or its summary has not arrived'
+            return 'it is active, or its summary has not arrived'
         end = self.mission.end_ns
         for stream in self.streams:
             if not stream.is_final and not stream.is_known(end):
-                return f'of {stream.recording.topic} the robot has said {stream.known_until(end)} what is missing'
+                return f'the gaps of {stream.recording.topic} are reported {stream.known_until(end)} so far'
         return ''
 
     @property
     def never_complete(self) -> str:
-        """Why it will never be known what is missing; empty if it is known, or will be."""
+        """Why its gaps will never be known; empty if they are known, or will be."""
         end = self.mission.end_ns
         for stream in self.streams:
             if stream.is_final and not stream.is_known(end):
-                return f'of {stream.recording.topic} the robot can say {stream.known_until(end)} what is missing'
+                return f'the gaps of {stream.recording.topic} are reported {stream.known_until(end)}'
         return ''
 
     @property
@@ -164,7 +165,7 @@ class EpisodePlan:
 
 
 def chosen(source: Bucket, flags: Mapping[str, Any], findings: Findings) -> list[ChosenMission]:
-    """In the order of their begin. Raises LakeError, SettingError, StoreError."""
+    """Sorted by start time. Raises LakeError, SettingError, StoreError."""
     rows = query.missions(source, findings=findings, **flags).to_pylist()
     return sorted(map(_mission, rows), key=lambda each: (each.begin_ns, each.mission_id))
 
@@ -183,7 +184,7 @@ def _ns(stamp: Any) -> int:
 
 def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission], options: ExportOptions, action: str,
             work: Path, findings: Findings) -> Iterator[EpisodePlan]:  # fmt: skip
-    """Each with what is there of it. ``action`` is ``cmd_vel`` or ``odometry``, or ``auto`` for what the first of them has.
+    """A plan of each mission from what the store has. ``action`` is ``cmd_vel``, ``odometry``, or ``auto`` for the first one's.
 
     Raises LakeError, StoreError.
     """
@@ -193,7 +194,7 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
             source, robot=robot, since_ns=min(mission.begin_ns for mission in ours) - BEFORE_NS, findings=findings, by=options.by
         )
         labelled = labels.read(source, robot, findings=findings) if options.labels or options.validation_label else []
-        recorded = manifests_of(store, robot)
+        recorded = read_manifests(store, robot)
         for mission in ours:
             made = _planned(source, store, mission, options, action=action, stated=stated, recorded=recorded, work=work,
                             findings=findings)  # fmt: skip
@@ -204,14 +205,14 @@ def planned(source: Bucket, store: ObjectStore, missions: Sequence[ChosenMission
 def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
     """Why it cannot become an episode, as far as is known before its messages are read; otherwise empty.
 
-    With ``fps`` 0, the rate of the frames is not settled yet.
+    ``fps`` 0: the rate of the frames is not chosen yet.
     """
     if plan.missing:
-        return f'the store has nothing of {", ".join(sorted(set(plan.missing)))} in it'
+        return f'the store has no data of {", ".join(sorted(set(plan.missing)))} in it'
     if plan.arm is not None and plan.arm.clock is None:
         return plan.arm.why
     if plan.never_complete and not options.allow_gaps:
-        return f'{plan.never_complete}, and no more will come: --allow-gaps takes it'
+        return f'{plan.never_complete}, and no more reports will arrive: --allow-gaps accepts it'
     if not fps:
         return ''
     if plan.arm is not None and plan.arm.clock is not None and plan.arm.clock.uncertainty_ns > SECOND // fps // 2:
@@ -220,7 +221,7 @@ def refusal(plan: EpisodePlan, options: ExportOptions, fps: int) -> str:
     cameras = [each.recording for each in plan.streams if each.part is None]
     slow = min(cameras, key=lambda each: each.rate_hz, default=None)
     if slow is not None and fps > whole_fps(slow.rate_hz):
-        return f'{slow.topic} has {slow.rate_hz:.3g} Hz in the {slow.sink}, less than {fps} frames a second'
+        return f'{slow.topic} has {slow.rate_hz:.3g} Hz in the {slow.sink}, less than {fps} frames per second'
     return ''
 
 
@@ -244,7 +245,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
     used = f'{among("sensor", sorted({*sensors, *RECORDED} - named))} OR {among("type", sorted(DETECTIONS))}'
     used += f' OR {among("topic", sorted(named))}' if named else ''
     span: dict[str, Any] = {'since': utc(since - LONGEST_BATCH_NS), 'until': utc(until + 1000)}
-    if options.by == BY_RECEIVED:  # stamps can be anywhere then, and so the dates of rows
+    if options.by == BY_RECEIVED:  # stamps can be anywhere then, and so can the dates of rows
         arrival = 'coalesce(received_start_ns, t_start_ns)'
         used, span = f'({used}) AND {arrival} >= {since - LONGEST_BATCH_NS} AND {arrival} <= {until} AND t_start IS NOT NULL', {}
     found = query.objects(
@@ -259,7 +260,7 @@ def _planned(source: Bucket, store: ObjectStore, mission: ChosenMission, options
         topics[topic] = topic
     if options.by == BY_RECEIVED:
         tracks = {sensor: track.by_arrival() for sensor, track in tracks.items()}
-    bags = tuple(bags_of(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
+    bags = tuple(select_bags(recorded, mission.mission_id, mission.run_id, Interval(mission.begin_ns, until)))
     place = Place(source.settings)
     with Recordings(place, store, tracks, topics, (since, until), bags, work, early_ns=BEFORE_NS, by=options.by) as recordings:
         best = {sensor: recordings.best(sensor) for sensor in set(sensors)}
@@ -307,11 +308,11 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
             until=utc(end + 1000),
         ).to_pylist()  # fmt: skip
         rows_of = {sensor: [row for row in found if row['topic'] == topics[sensor]] for sensor in sensors}
-        return {sensor: _track_of(some, begin, end) for sensor, some in rows_of.items() if some}
+        return {sensor: _best_track(some, begin, end) for sensor, some in rows_of.items() if some}
 
     place, wide = Place(source.settings), (since - NEAR_NS, until + NEAR_NS)
     pairs = [np.array(options.clock_pairs, np.int64).reshape(-1, 2)]
-    near = bags_of(recorded, mission.mission_id, mission.run_id, Interval(*wide))
+    near = select_bags(recorded, mission.mission_id, mission.run_id, Interval(*wide))
     with Recordings(place, store, tracks(*wide, ARM_CLOCK), topics, wide, near, work) as recordings:
         if (events := recordings.best(ARM_CLOCK)) is not None:
             series = recordings.series(events, ('time_ref.sec', 'time_ref.nanosec'))
@@ -334,7 +335,7 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     parts.append((ARM_ACTION, ARM_COMMAND, commands) if commands else (ARM_ACTION, ARM_STATE, joints))
     for name, part, recording in parts:
         track = arm.tracks.get(recording.sensor)
-        if recording.sink == OBJECTS and track is not None and track.robot != mission.robot:  # what was imported is complete
+        if recording.sink == OBJECTS and track is not None and track.robot != mission.robot:  # an import is complete
             known = of_rows(track.robot, OBJECTS, recording.topic, begin, end + SECOND, ())
             streams.append(StreamPlan(name, part, recording, known, (), mission.end_ns))
         else:
@@ -344,8 +345,8 @@ def _arm_streams(source: Bucket, store: ObjectStore, mission: ChosenMission, opt
     return arm, streams
 
 
-def _track_of(rows: Sequence[Row], begin_ns: int, end_ns: int) -> Track:
-    """Of one machine, the one that has most in this time: an arm may be recorded by its own and by the robot."""
+def _best_track(rows: Sequence[Row], begin_ns: int, end_ns: int) -> Track:
+    """Of one machine, the one with the most in this time: an arm may be recorded by its own computer and by the robot."""
     best = _most_frequent([row['robot'] for row in _within(rows, begin_ns, end_ns)] or [row['robot'] for row in rows])
     return Track.of(pa.Table.from_pylist([row for row in rows if row['robot'] == best], schema=narrow((*NEEDED, *RECEIVED))))
 
@@ -361,7 +362,7 @@ def _most_frequent(values: Sequence[Any]) -> Any:
 
 def _stream(name: str, part: StatePart | None, recording: RecordedSensor, mission: ChosenMission, stated: pa.Table,
             last_ns: int) -> StreamPlan:  # fmt: skip
-    """``last_ns`` is the stamp of the last of its messages that is in the store."""
+    """``last_ns`` is the stamp of its last message in the store."""
     rows = stated.filter(pc.equal(stated['sink'], recording.sink)).to_pylist()
     mine = [row for row in rows if row['topic'] == recording.topic]
     begin, end = mission.begin_ns - BEFORE_NS, mission.end_ns + SECOND
@@ -376,14 +377,14 @@ def _stream(name: str, part: StatePart | None, recording: RecordedSensor, missio
 
 
 def _about(stated: pa.Table, topics: pa.Array, since: int, until: int) -> pa.Table:
-    """The statements about these topics and this time, and those without a time, in one order."""
+    """The gap rows about these topics and this time, and those without a time, in a fixed order."""
     reaches = pc.and_(pc.less_equal(stated['from_ns'], until), pc.greater_equal(stated['to_ns'], since))
     kept = stated.filter(pc.and_(pc.is_in(stated['topic'], value_set=topics), pc.fill_null(reaches, fill_value=True)))
     return kept.sort_by([(name, 'ascending') for name in ('topic', 'sink', 'what', 'id')]).combine_chunks()
 
 
 def _tracks(rows: Sequence[Row], mission: ChosenMission) -> tuple[dict[str, Track], dict[str, str]]:
-    """By sensor, of the topic and type that most objects of the mission are of: a sensor may have changed its topic."""
+    """By sensor, of the topic and type of most of the mission's objects: a sensor may have changed its topic."""
     tracks, topics = {}, {}
     for sensor in sorted({row['sensor'] for row in rows}):
         ours = [row for row in rows if row['sensor'] == sensor]

@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 WIDTH: Final = 1200
 HEIGHT: Final = 150
-"""Of an episode."""
+"""Per episode."""
 GAP: Final = 8
 FRAMES: Final = 5
 MOST: Final = 60
-"""Episodes, evenly chosen."""
+"""Maximum number of episodes, evenly spaced."""
 PALE, RED, GREEN = '#9aa7b3', '#d62828', '#4c9f70'
 
 
 def draw(made: Lerobot, target: Path) -> None:
-    """Write the picture of a dataset that has at least one episode. Raises LakeError, OSError."""
+    """Draw a dataset that has at least one episode. Raises LakeError, OSError."""
     rows = evenly_spaced(made.rows, MOST)
     sheet = Image.new('RGB', (WIDTH, len(rows) * (HEIGHT + GAP) + GAP), 'white')
     for place, row in enumerate(rows):
@@ -44,8 +44,8 @@ def _episode(made: Lerobot, row: EpisodeRow, sheet: Image.Image, top: int) -> No
     pen.text((GAP, top), title[:150].encode('latin-1', 'replace').decode('latin-1'), fill=INK)
     wanted = sorted({round(share * (row['length'] - 1)) for share in np.linspace(0, 1, FRAMES)})
     left, height = GAP, HEIGHT - 50
-    for key in made.picture_keys()[:1]:
-        for pixels in made.pictures_at(row, key, wanted):
+    for key in made.image_keys()[:1]:
+        for pixels in made.images_at(row, key, wanted):
             picture = Image.fromarray(pixels)
             picture = picture.resize((max(1, min(170, round(picture.width * height / picture.height))), height))
             sheet.paste(picture, (left, top + 16))
@@ -70,7 +70,7 @@ def _path(pen: ImageDraw.ImageDraw, path: NDArray[Any], stale: NDArray[np.bool_]
 
 
 def _bars(pen: ImageDraw.ImageDraw, stale: NDArray[Any], seconds: float, top: int) -> None:
-    """A line of time for each stream, stale ticks in red."""
+    """A timeline of each stream, stale ticks in red."""
     count, streams = stale.shape
     width, each = WIDTH - 2 * GAP, max(2, 22 // streams)
     for stream in range(streams):

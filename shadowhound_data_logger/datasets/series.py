@@ -1,7 +1,7 @@
 """What one mission recorded, sensor by sensor: all messages of a time, from objects or bags, whichever have more.
 
-A series is in memory but for its pictures: those of objects are read again when they are needed, those of a bag are kept in a
-file of the work folder meanwhile.
+A series is in memory except for its images: those in objects are read again when needed, those in a bag are kept in a file of the
+work folder.
 """
 
 from __future__ import annotations
@@ -49,23 +49,23 @@ if TYPE_CHECKING:
 KEEP_BYTES: Final = 16 << 20
 THREADS: Final = 8
 MIN_SPAN_NS: Final = 2 * SECOND
-"""Of a slice from which a rate is computed."""
+"""Minimum span of a slice from which a rate is computed."""
 AS_MUCH: Final = 0.5
-"""A recording competes with the one that covers most of a mission if it covers so much of what that one does."""
+"""A recording is a candidate if it covers at least this share of what the best one covers."""
 NEARLY_ALL: Final = 0.9
-"""An event's bag is an excerpt, unless it has so much of a mission."""
+"""An event's bag is an excerpt, unless it has this share of a mission."""
 MIN_ADDED_NS: Final = SECOND
-"""Another mission's bag, or one of none, is read for more than this: our recorder needs that long to notice a mission."""
+"""Another mission's bag, or one of no mission, must add more than this: our recorder needs that long to notice a mission."""
 HOLE: Final = 10
-"""So many periods without an object are not covered."""
+"""This many periods without an object count as a gap."""
 AHEAD: Final = 16
-"""Pictures that are fetched before they are needed."""
+"""Images that are fetched ahead."""
 _MESSAGE_TITLE: Final = re.compile(r'^MSG: ([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)\s*$', re.ASCII)
 _ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 
 
 class Interval(NamedTuple):
-    """A time, both ends included, ns."""
+    """A time span, both ends included, ns."""
 
     first_ns: int
     last_ns: int
@@ -75,11 +75,11 @@ class Interval(NamedTuple):
         return max(0, self.last_ns - self.first_ns)
 
     def within(self, other: Interval) -> Interval:
-        """What both have; its end is before its begin where that is nothing."""
+        """The intersection; its end is before its start if empty."""
         return Interval(max(self.first_ns, other.first_ns), min(self.last_ns, other.last_ns))
 
     def without(self, others: Sequence[Interval]) -> list[Interval]:
-        """What none of the others has."""
+        """The parts that are in none of the others."""
         left = [self]
         for other in others:
             before = [Interval(one.first_ns, min(one.last_ns, other.first_ns - 1)) for one in left]
@@ -90,12 +90,12 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _SlicePart:
-    """A slice of a bag, and of which times it is read."""
+    """A slice of a bag, and the times it is read for."""
 
     bag: Manifest
     slice: SliceEntry
     messages: int
-    """Of one topic, in all of it."""
+    """Of one topic, in the complete slice."""
     whole: Interval
     times: tuple[Interval, ...]
 
@@ -104,7 +104,7 @@ class _SlicePart:
         return sum(time.within(counted).length for time in self.times)
 
     def share(self, counted: Interval) -> float:
-        """Which share of its messages is read in a time, if they are evenly spread."""
+        """The share of its messages that is read for a time, if they are evenly spread."""
         if self.whole.length:
             return self.covered(counted) / self.whole.length
         return float(any(counted.first_ns <= time.first_ns <= counted.last_ns for time in self.times))
@@ -117,7 +117,7 @@ class SourceFile:
     bucket: str
     key: str
     sha256: str
-    """Empty where nobody knows it."""
+    """Empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,11 +128,11 @@ class RecordedSensor:
     topic: str
     type: str
     sink: str
-    """``objects`` or ``bags``, as the gap journal names them."""
+    """``objects`` or ``bags``, as in the gap journal."""
     messages: int
-    """In the time that counts. Estimated where only a part of an object or slice is of that time."""
+    """In the time that counts. Estimated if an object or slice is only partly in that time."""
     rate_hz: float
-    """Of what was recorded, without its gaps; 0 where it is not known."""
+    """Of the recorded parts, without gaps; 0 if unknown."""
     covered: float
     """Share of the time that counts in which it was recorded, 0 to 1."""
 
@@ -147,47 +147,47 @@ class Series:
     values: NDArray[np.float64]
     """(messages, numbers); of pictures (messages, 0)."""
     file: NDArray[np.int64]
-    """Of each message, its place in ``files``."""
+    """For each message, its index in ``files``."""
     files: Sequence[SourceFile]
     received: NDArray[np.int64]
-    """When each arrived, by the clock of the machine that recorded it; 0 where that is unknown."""
+    """Arrival of each, by the clock of the recording machine; 0 if unknown."""
     names: tuple[str, ...] = ()
-    """Of joints, by the first message."""
+    """Of joints, from the first message."""
     previous: NDArray[np.int64] | None = None
-    """Of values that are derived from two messages, (messages, 4): of the earlier one time, stamp, arrival and file."""
-    picture: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
-    """Content and extension (``jpg``, ``png``) of a message of a camera."""
+    """For values that are derived from two messages, (messages, 4): time, stamp, arrival and file of the earlier one."""
+    image: Callable[[int], tuple[bytes, str]] = field(default=lambda _: (b'', ''))
+    """Content and extension (``jpg``, ``png``) of a camera's message."""
     own_stamps: NDArray[np.int64] | None = None
-    """The stamps of the messages, where ``stamps`` has other times: the robot's instead of another machine's, or arrivals."""
+    """The stamps of the messages, if ``stamps`` has other times: the robot's instead of another machine's, or arrivals."""
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def only(self, chosen: NDArray[Any]) -> Series:
-        """These messages of numbers."""
+        """A selection of the messages."""
         own = None if self.own_stamps is None else self.own_stamps[chosen]
         return replace(self, stamps=self.stamps[chosen], values=self.values[chosen], file=self.file[chosen],
                        received=self.received[chosen], own_stamps=own)  # fmt: skip
 
     @property
     def period_ns(self) -> int:
-        """Between two messages, as a rule."""
+        """The usual time between two messages."""
         return int(np.median(np.diff(self.stamps))) if len(self.stamps) > 1 else 0
 
 
 class Recordings:
-    """Finds and reads what was recorded of one mission.
+    """Finds and reads the recordings of one mission.
 
-    Enter once; ``series`` any number of times, while it is entered; one thread.
+    Enter once; call ``series`` any number of times while entered; one thread.
     """
 
     def __init__(self, place: Place, store: ObjectStore, tracks: Mapping[str, Track], topics: Mapping[str, str],  # noqa: PLR0913
                  span_ns: tuple[int, int], bags: Sequence[Manifest], work: Path, *, early_ns: int = 0,
                  by: str = BY_STAMP) -> None:  # fmt: skip
-        """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time that is read, both ends included.
+        """``tracks`` and ``topics`` are by sensor; ``span_ns`` is the time to read, both ends included.
 
-        What was recorded in the first ``early_ns`` of it does not count when one recording is chosen over another. ``bags``
-        are in the order of preference (``bags_of``). ``by`` is which of their two times messages have; the tracks have the same.
+        Messages in the first ``early_ns`` of it do not count when recordings are compared. ``bags`` are in order of preference
+        (``select_bags``). ``by`` is the time that messages are placed by; the tracks use the same.
         """
         self._place = place
         self._store = store
@@ -208,9 +208,9 @@ class Recordings:
         self._stack.close()
 
     def best(self, sensor: str) -> RecordedSensor | None:
-        """The one with most messages in the time that counts, of those that cover at least half as much of it as the fullest one.
+        """The recording with the most messages in the time that counts, among those that cover at least half as much as the best.
 
-        None where none has a message in that time.
+        None if there is no message in that time.
         """
         found = [each for each in (self._in_objects(sensor), *self._in_bags(sensor)) if each is not None and each.messages]
         enough = AS_MUCH * max((each.covered for each in found), default=0.0)
@@ -218,11 +218,11 @@ class Recordings:
 
     def series(self, recording: RecordedSensor, fields: Sequence[str] = ()) -> Series:
         """All messages of the time. Raises StoreError, LakeError, BagDamaged."""
-        is_picture = recording.type in {COMPRESSED_IMAGE, IMAGE}
+        is_image = recording.type in {COMPRESSED_IMAGE, IMAGE}
         if recording.sink == OBJECTS:
             track = self._within(recording.sensor)
-            return self._pictures(recording, track) if is_picture else self._numbers(recording, track, fields)
-        return self._from_bag(recording, fields, is_picture=is_picture)
+            return self._read_images(recording, track) if is_image else self._numbers(recording, track, fields)
+        return self._from_bag(recording, fields, is_image=is_image)
 
     # -- objects ---------------------------------------------------------------------------------------------------
 
@@ -249,7 +249,7 @@ class Recordings:
         return RecordedSensor(sensor, self._topics.get(sensor, ''), track.kind, OBJECTS, messages, rate, covered)
 
     def _extent(self, track: Track) -> tuple[int, float]:
-        """How many messages of these objects are in the time that counts, and the share of it from each to the one after it."""
+        """How many messages of these objects are in the time that counts, and the share of it between consecutive objects."""
         first, last = self._counted
         begin, end = track.start_ns.clip(first, last), track.end_ns.clip(first, last)
         parts = np.where(track.end_ns > track.start_ns, (end - begin) / np.maximum(track.end_ns - track.start_ns, 1), 1.0)
@@ -283,8 +283,8 @@ class Recordings:
         received = np.concatenate([np.empty(0, np.int64), *arrived])
         return self._ordered(recording, stamps, values, file, [_file(each) for each in objects], received, names)
 
-    def _pictures(self, recording: RecordedSensor, track: Track) -> Series:
-        """The content of an object is read for its stamps only where it is an archive."""
+    def _read_images(self, recording: RecordedSensor, track: Track) -> Series:
+        """The content of an object is only read for stamps if it is an archive."""
         prefetch = self._stack.enter_context(Prefetch(self._place.read, KEEP_BYTES, THREADS))
         stamps: list[int] = []
         arrived: list[int] = []
@@ -303,7 +303,7 @@ class Recordings:
         times_of = self._times(np.array(stamps, np.int64), np.array(arrived, np.int64))
         order = np.argsort(times_of, kind='stable')
 
-        def picture(message: int) -> tuple[bytes, str]:
+        def image(message: int) -> tuple[bytes, str]:
             coming = {where[int(order[place])][0] for place in range(message, min(message + AHEAD, len(order)))}
             prefetch.ahead([objects[number] for number in sorted(coming)])
             number, member = where[int(order[message])]
@@ -317,10 +317,10 @@ class Recordings:
             recording, np.array(stamps, np.int64), np.empty((len(stamps), 0)), file, [_file(each) for each in objects],
             np.array(arrived, np.int64),
         )  # fmt: skip
-        return _with_pictures(made, picture, order, times_of, self._span)
+        return _with_images(made, image, order, times_of, self._span)
 
     def _times(self, stamps: NDArray[np.int64], received: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those that place messages: their stamps, or their arrivals as far as these are known."""
+        """The times that place messages: stamps, or arrivals where known."""
         return np.where(received > 0, received, stamps) if self._by == BY_RECEIVED else stamps
 
     def _ordered(self, recording: RecordedSensor, stamps: NDArray[np.int64], values: NDArray[np.float64], file: NDArray[np.int64],
@@ -336,17 +336,17 @@ class Recordings:
     def _in_bags(self, sensor: str) -> Iterator[RecordedSensor]:
         topics = {(topic.topic, topic.type): None for bag in self._bags for topic in bag.topics}
         for topic, kind in topics:
-            if self._is_of(sensor, topic, kind):
+            if self._has_fields(sensor, topic, kind):
                 parts = self._parts(topic)
                 counts = [each.messages * each.share(self._counted) for each in parts]
-                # A slice's span is that of all its topics: of a short one it says little about one of them.
+                # A slice's span is that of all its topics: a short one says little about one of them.
                 rates = [(each.bag, each.messages / each.whole.length * 1e9) for each in parts
                          if each.share(self._counted) and each.whole.length >= MIN_SPAN_NS]  # fmt: skip
                 rate = max((rate for bag, rate in rates if bag is rates[0][0]), default=0.0)
                 covered = sum(each.covered(self._counted) for each in parts) / max(self._counted.length, 1)
                 yield RecordedSensor(sensor, topic, kind, BAGS, round(sum(counts)), rate, min(1.0, covered))
 
-    def _is_of(self, sensor: str, topic: str, kind: str) -> bool:
+    def _has_fields(self, sensor: str, topic: str, kind: str) -> bool:
         known = self._topics.get(sensor)
         if known is not None:
             return topic == known
@@ -355,14 +355,15 @@ class Recordings:
         return any(kind == wanted and (topic == f'/{name}' or topic.endswith(f'/{name}')) for name, wanted in names)
 
     def _parts(self, topic: str) -> list[_SlicePart]:
-        """The slices with messages of a topic, and of which time each is read: two bags of one time have each message twice.
+        """The slices with messages of a topic, and the times each is read for: two bags of one time contain each message twice.
 
-        Of a later bag, what the bags before it leave open is taken: all of it if the bag is of the same mission as the first one,
-        else if it is more than a second of the time that counts.
+        A later bag adds what the earlier ones lack: all of that if the bag is of the same mission as the first one, otherwise
+        only if it is
+        more than a second of the time that counts.
         """
         found: list[_SlicePart] = []
         for bag in self._bags:
-            step = _offset_of(bag)
+            step = _clock_offset(bag)
             covered = [time for each in found for time in each.times]
             mine = []
             for each in bag.slices:
@@ -371,12 +372,12 @@ class Recordings:
                     mine.append(_SlicePart(bag, each, each.recorded[topic], whole, tuple(whole.without(covered))))
             added = sum(each.covered(self._counted) for each in mine)
             first = found[0].bag.mission if found else bag.mission
-            is_first = not found or (first is not None and _is_of_mission(bag, first.mission_id, first.run_id))
+            is_first = not found or (first is not None and _belongs_to_mission(bag, first.mission_id, first.run_id))
             if added > MIN_ADDED_NS or (is_first and any(each.share(self._counted) for each in mine)):
                 found += [each for each in mine if each.times]
         return found
 
-    def _from_bag(self, recording: RecordedSensor, fields: Sequence[str], *, is_picture: bool) -> Series:
+    def _from_bag(self, recording: RecordedSensor, fields: Sequence[str], *, is_image: bool) -> Series:
         stamps: list[int] = []
         rows: list[NDArray[np.float64]] = []
         where: list[tuple[int, int, str]] = []
@@ -384,17 +385,17 @@ class Recordings:
         arrived: list[int] = []
         files: list[SourceFile] = []
         names: tuple[str, ...] = ()
-        bodies = self._stack.enter_context(tempfile.TemporaryFile(dir=self._work)) if is_picture else None  # noqa: SIM115
+        bodies = self._stack.enter_context(tempfile.TemporaryFile(dir=self._work)) if is_image else None  # noqa: SIM115
         for part in self._parts(recording.topic):
             files.append(SourceFile(naming.BUCKET, part.slice.key, part.slice.sha256))
-            step = _offset_of(part.bag)
+            step = _clock_offset(part.bag)
             for message, types in self._messages(part.slice, recording.topic):
                 if not any(first <= message.log_ns + step <= last for first, last in part.times):
                     continue
                 stamp = _stamp(message, types) + step
                 try:
                     if bodies is not None:
-                        content, extension = _picture(message, types)
+                        content, extension = _read_image(message, types)
                         where.append((bodies.tell(), len(content), extension))
                         bodies.write(content)
                     else:
@@ -414,12 +415,12 @@ class Recordings:
         times = self._times(stamped, np.array(arrived, np.int64))
         order = np.argsort(times, kind='stable')
 
-        def picture(message: int) -> tuple[bytes, str]:
+        def image(message: int) -> tuple[bytes, str]:
             start, size, extension = where[int(order[message])]
             bodies.seek(start)
             return bodies.read(size), extension
 
-        return _with_pictures(made, picture, order, times, self._span)
+        return _with_images(made, image, order, times, self._span)
 
     def _messages(self, each: SliceEntry, topic: str) -> Iterator[tuple[RecordedMessage, MessageTypes]]:
         source = StoredFile(self._store, naming.BUCKET, each.key, each.bytes)
@@ -428,15 +429,15 @@ class Recordings:
         for message in McapFile(source).messages(wanted):
             if message.channel not in known:
                 folder = self._stack.enter_context(tempfile.TemporaryDirectory(dir=self._work))
-                known[message.channel] = _types_of(message.channel, Path(folder))
+                known[message.channel] = _message_types(message.channel, Path(folder))
             yield message, known[message.channel]
 
 
-def manifests_of(store: ObjectStore, robot: str) -> list[Manifest]:
-    """Of all bags of a robot whose times are known, with the slices that the store has.
+def read_manifests(store: ObjectStore, robot: str) -> list[Manifest]:
+    """Manifests of all bags of a robot with known times, with the slices that the store has.
 
-    The robot may keep other slices until they are requested. A bag without a manifest (of another recorder, or still growing) is
-    not among them. Raises StoreError.
+    The robot may keep other slices until requested. A bag without a manifest (of another recorder, or still growing) is skipped.
+    Raises StoreError.
     """
     found = []
     for bag in find_bags(store, robot):
@@ -453,15 +454,16 @@ def manifests_of(store: ObjectStore, robot: str) -> list[Manifest]:
     return found
 
 
-def bags_of(manifests: Iterable[Manifest], mission_id: str, run_id: str, counted: Interval) -> list[Manifest]:
-    """The bags that have messages of a mission's time, the preferred ones first.
+def select_bags(manifests: Iterable[Manifest], mission_id: str, run_id: str, counted: Interval) -> list[Manifest]:
+    """The bags with messages of a mission's time, the preferred ones first.
 
-    The mission's own bags are first, then those of no mission, then those of other missions, last those of events, if they have
-    nearly all of it; of each kind, the one with most of the mission first.
+    Order: the mission's own bags, those of no mission, those of other missions, those of events if they have nearly all of it;
+    within
+    each, the one with most of the mission first.
     """
     found = []
     for manifest in manifests:
-        step = _offset_of(manifest)
+        step = _clock_offset(manifest)
         times = [Interval(each.t_start_ns + step, each.t_end_ns + step) for each in manifest.slices]
         covered = sum(each.within(counted).length for each in times)
         is_excerpt = manifest.event is not None and covered < NEARLY_ALL * counted.length
@@ -476,10 +478,10 @@ def _rank(bag: Manifest, mission_id: str, run_id: str) -> int:
         return 3
     if bag.mission is None:
         return 1
-    return 0 if _is_of_mission(bag, mission_id, run_id) else 2
+    return 0 if _belongs_to_mission(bag, mission_id, run_id) else 2
 
 
-def _is_of_mission(bag: Manifest, mission_id: str | None, run_id: str | None) -> bool:
+def _belongs_to_mission(bag: Manifest, mission_id: str | None, run_id: str | None) -> bool:
     """By the mission's id; by its run's while a bag has no other."""
     if bag.mission is None:
         return False
@@ -492,7 +494,7 @@ def _file(wanted: Object) -> SourceFile:
 
 
 def _arrivals(track: Track, number: int, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """When the messages of an object arrived, in their stored order; zeros if that is unknown."""
+    """Arrivals of the messages of an object, in stored order; zeros if unknown."""
     first, last = (0, 0) if track.received_ns is None else map(int, track.received_ns[number])
     if not first:
         return np.zeros(len(times), np.int64)
@@ -503,20 +505,20 @@ def _unpacked(prefetch: Prefetch, wanted: Object) -> list[decode.ArchiveMember]:
     return decode.members(prefetch.get(wanted), decode.extension_of(wanted.key))
 
 
-def _with_pictures(made: Series, picture: Callable[[int], tuple[bytes, str]], order: NDArray[np.intp], times: NDArray[np.int64],
+def _with_images(made: Series, image: Callable[[int], tuple[bytes, str]], order: NDArray[np.intp], times: NDArray[np.int64],
                    span: tuple[int, int]) -> Series:  # fmt: skip
-    """``picture`` counts all messages in their order; the series may begin later."""
+    """``image`` counts all messages in their order; the series may start later."""
     before = int((times[order] < span[0]).sum())
-    made.picture = lambda message: picture(before + message)
+    made.image = lambda message: image(before + message)
     return made
 
 
-def _offset_of(bag: Manifest) -> int:
+def _clock_offset(bag: Manifest) -> int:
     return 0 if bag.clock is None else bag.clock.offset_ns or 0
 
 
-def _types_of(channel: Channel, folder: Path) -> MessageTypes:
-    """What the bag itself says of its messages: a machine that trains has no ROS."""
+def _message_types(channel: Channel, folder: Path) -> MessageTypes:
+    """The definitions in the bag: a machine that trains has no ROS."""
     text, named = channel.definition, re.fullmatch(r'([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)', channel.type, re.ASCII)
     if channel.encoding == 'ros2msg' and named is not None:
         first, *others = text.split(f'{SEPARATOR}\n')
@@ -533,13 +535,13 @@ def _types_of(channel: Channel, folder: Path) -> MessageTypes:
 
 
 def _stamp(message: RecordedMessage, types: MessageTypes) -> int:
-    """That of its header where it is set, else when it was published."""
+    """The stamp of its header if set, otherwise the time of publication."""
     stamp = header_stamp_ns(message.cdr) if types.has_header(message.channel.type) else 0
     return stamp if stamp >= EARLIEST_SANE_NS else message.publish_ns or message.log_ns
 
 
-def _picture(message: RecordedMessage, types: MessageTypes) -> tuple[bytes, str]:
-    """A compressed picture as it was published, a raw one as PNG."""
+def _read_image(message: RecordedMessage, types: MessageTypes) -> tuple[bytes, str]:
+    """A compressed image as published, a raw one as PNG."""
     sample = Sample(message.log_ns, message.cdr)
     batch = Batch('camera', message.channel.topic, message.channel.type, (sample,), len(message.cdr))
     made = encode_png(Job(batch, SensorSettings(name='camera', format='png'), 'robot', types), sample)
@@ -558,26 +560,26 @@ def _values(message: Any, kind: str, fields: Sequence[str]) -> NDArray[np.float6
     return np.concatenate(found) if found else np.empty(0)
 
 
-def pictures_of(
-    store: ObjectStore, asked: Collection[tuple[str, str, int, str]], topic: str, work: Path
+def read_images(
+    store: ObjectStore, requested: Collection[tuple[str, str, int, str]], topic: str, work: Path
 ) -> dict[tuple[str, int], bytes]:
-    """(key, stamp) -> the picture, of (bucket, key, stamp, sha256); those that are not there are left out.
+    """(key, stamp) -> the image, for (bucket, key, stamp, sha256); missing ones are skipped.
 
-    Raises StoreError; LakeError for an object that is not what it was.
+    Raises StoreError; LakeError for an object that changed.
     """
     found: dict[tuple[str, int], bytes] = {}
     with ExitStack() as stack:
-        for bucket, key, sha256 in sorted({(bucket, key, sha256) for bucket, key, _, sha256 in asked}):
-            stamps = {stamp for _, other, stamp, _ in asked if other == key}
+        for bucket, key, sha256 in sorted({(bucket, key, sha256) for bucket, key, _, sha256 in requested}):
+            stamps = {stamp for _, other, stamp, _ in requested if other == key}
             held = store.head(bucket, key)
             if held is None:
                 continue
             if key.endswith('.mcap'):
-                found |= _pictures_in_slice(store, held, stamps, topic, stack, work)
+                found |= _images_in_slice(store, held, stamps, topic, stack, work)
                 continue
             body = store.get(bucket, key)
             if sha256 and hashlib.sha256(body).hexdigest() != sha256:
-                raise LakeError(f'the source {bucket}/{key} is not what it was')
+                raise LakeError(f'the source {bucket}/{key} has changed')
             extension = decode.extension_of(key)
             if extension in decode.ARCHIVES:
                 offset = int(held.metadata.get(meta.CLOCK_OFFSET_NS, 0))
@@ -588,7 +590,7 @@ def pictures_of(
     return found
 
 
-def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[int], topic: str, stack: ExitStack,
+def _images_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[int], topic: str, stack: ExitStack,
                        work: Path) -> dict[tuple[str, int], bytes]:  # fmt: skip
     found: dict[tuple[str, int], bytes] = {}
     known: dict[Channel, MessageTypes] = {}
@@ -597,8 +599,8 @@ def _pictures_in_slice(store: ObjectStore, held: ObjectInfo, stamps: Collection[
     for message in McapFile(StoredFile(store, held.bucket, held.key, held.size)).messages(wanted):
         if message.channel not in known:
             folder = stack.enter_context(tempfile.TemporaryDirectory(dir=work))
-            known[message.channel] = _types_of(message.channel, Path(folder))
+            known[message.channel] = _message_types(message.channel, Path(folder))
         stamp = _stamp(message, known[message.channel]) + offset
         if stamp in stamps:
-            found[held.key, stamp] = _picture(message, known[message.channel])[0]
+            found[held.key, stamp] = _read_image(message, known[message.channel])[0]
     return found

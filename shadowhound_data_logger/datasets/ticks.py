@@ -1,6 +1,6 @@
 """The known values at each tick: the latest message at or before it, never a later one, and its age.
 
-Times are ns since 1970 (int64). Nothing here looks at a message whose stamp is after the tick.
+Times are ns since 1970 (int64). A message with a stamp after the tick is never used.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SLACK: Final = 1.02
-"""A rate counts as the next whole one from so much below it: 29.97 Hz are 30."""
+"""A rate this close below a whole number counts as that number: 29.97 Hz are 30."""
 LATE: Final = 1.5
-"""By default, a message is stale after so many periods."""
+"""By default, a message is stale after this many periods."""
 PHASE: Final = 95
-"""Percent of the pictures that arrive before their tick: ticks begin so much after the first picture."""
+"""Percent of the images that arrive before their tick: ticks start this long after the first image."""
 NOT_SAMPLED, NOT_PUBLISHED, UNKNOWN = 'not_sampled', 'not_published', 'unknown'
 """Causes in addition to those of the gap journal: skipped on purpose; not published; unknown."""
 
@@ -33,13 +33,13 @@ def whole_fps(rate_hz: float) -> int:
 
 
 def ticks_of(first_ns: int, last_ns: int, fps: int) -> NDArray[np.int64]:
-    """All ticks from the first until the last, both included: the n-th is n/fps seconds after the first, to the ns."""
+    """All ticks from the first to the last, both included: the n-th is n/fps seconds after the first, to the ns."""
     count = int((last_ns - first_ns) * fps // SECOND) + 1 if last_ns >= first_ns else 0
     return first_ns + np.arange(count, dtype=np.int64) * SECOND // fps
 
 
 def phase_of(stamps: NDArray[np.int64], first_ns: int, fps: int) -> int:
-    """How long after ``first_ns`` the ticks begin, so that pictures with their usual jitter are there, ns."""
+    """How long after ``first_ns`` the ticks start, so that images with their usual jitter have arrived, ns."""
     period = SECOND // fps
     away = (stamps - first_ns) % period
     away = np.where(away > period // 2, away - period, away)
@@ -47,7 +47,7 @@ def phase_of(stamps: NDArray[np.int64], first_ns: int, fps: int) -> int:
 
 
 def latest(stamps: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The number of the last message at or before each tick; -1 if there is none. Of equal stamps, the last one."""
+    """The index of the last message at or before each tick; -1 if there is none. Of equal stamps, the last one."""
     return np.searchsorted(stamps, ticks, 'right').astype(np.int64) - 1
 
 
@@ -58,7 +58,7 @@ class Sampled:
     message: NDArray[np.int64]
     """The newest at or before the tick; never -1."""
     other: NDArray[np.int64]
-    """The message after ``message - 1`` or before it that a value was interpolated with; -1 where it was held."""
+    """The second message that a value was interpolated with, after ``message - 1`` or before it; -1 if it was held."""
     age_s: NDArray[np.float32]
     """Of the newest message."""
     stale: NDArray[np.bool_]
@@ -73,11 +73,13 @@ def sample(stamps: NDArray[np.int64], ticks: NDArray[np.int64], max_age_ns: int)
 
 def interpolated(stamps: NDArray[np.int64], values: NDArray[np.float64], ticks: NDArray[np.int64], max_gap_ns: int,
                  turns: Sequence[slice] = ()) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
-    """(values, the earlier of the two messages) on a straight line between the last two messages, one period before the tick.
+    """(values, the earlier of the two messages): linear between the last two messages, evaluated one period before the tick.
 
-    Both have been there by then: so it is as causal as holding, and one period late. ``turns`` are quaternions among the
-    columns (x y z w), which turn at an even rate (slerp). Where two messages are farther apart than ``max_gap_ns``, or there
-    are no two, the newest one is held (-1).
+    Both have arrived by then: it is as causal as holding, and one period late. ``turns`` are quaternions among the columns (x y z
+    w),
+    which are interpolated by slerp. If two messages are more than ``max_gap_ns`` apart, or there are no two, the newest one is
+    held
+    (-1).
     """
     newest = latest(stamps, ticks)
     found, earlier = values[newest].copy(), np.full(len(ticks), -1, np.int64)
@@ -101,7 +103,7 @@ def interpolated(stamps: NDArray[np.int64], values: NDArray[np.float64], ticks: 
 
 
 def _slerp(one: NDArray[np.float64], other: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """https://en.wikipedia.org/wiki/Slerp, the shorter way; of quaternions that are nearly the same, the straight line."""
+    """https://en.wikipedia.org/wiki/Slerp, the shorter way; linear for nearly equal quaternions."""
     dot = (one * other).sum(axis=1, keepdims=True)
     other, dot = np.where(dot < 0, -other, other), np.abs(dot).clip(0, 1)
     angle = np.arccos(dot)
@@ -117,9 +119,9 @@ def _slerp(one: NDArray[np.float64], other: NDArray[np.float64], share: NDArray[
 def motion(
     stamps: NDArray[np.int64], poses: NDArray[np.float64], max_gap_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(later message, (n, 3) ahead m/s, left m/s, turning rad/s) between each two messages, as the robot saw it.
+    """(later message, (n, 3) forward m/s, left m/s, yaw rate rad/s) between consecutive messages, in the robot's frame.
 
-    ``poses`` is (n, 7): x y z and the quaternion x y z w. Pairs that are farther apart than ``max_gap_ns`` give none.
+    ``poses`` is (n, 7): x y z and the quaternion x y z w. Pairs more than ``max_gap_ns`` apart are skipped.
     """
     seconds = np.diff(stamps) / SECOND
     yaw = np.arctan2(2 * (poses[:, 6] * poses[:, 5] + poses[:, 3] * poses[:, 4]), 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2))
@@ -134,7 +136,7 @@ def motion(
 def cause_of(known: Known, thinned: Sequence[tuple[int, int]], message_ns: int, tick_ns: int) -> str:
     """Why there is no newer message at a tick: the cause of the gap around it, otherwise of one since the newest message.
 
-    ``thinned`` are times in which messages were left out on purpose.
+    ``thinned`` are times in which messages were dropped on purpose.
     """
     since = known.between(max(known.begin_ns, min(message_ns + 1, tick_ns)), min(known.end_ns, tick_ns + 1)).stretches
     for stretch in reversed(since):

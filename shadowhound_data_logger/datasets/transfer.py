@@ -43,7 +43,7 @@ class DatasetPlace:
 
     @classmethod
     def of(cls, url: str) -> DatasetPlace:
-        """Raises SettingError for what is not ``s3://BUCKET/FOLDER``."""
+        """Raises SettingError for a URL other than ``s3://BUCKET/FOLDER``."""
         named = _URL.fullmatch(url)
         if named is None:
             raise SettingError('--to', url, f'a folder, or {SCHEME}{BUCKET}/{FOLDER}go2/NAME')
@@ -65,13 +65,13 @@ class Transferred:
 def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[[str], None] = lambda _: None) -> Transferred:
     """Upload the folder. During the upload the place has no ``info.json``, so that it is recognized as incomplete.
 
-    First it has the digests, so that ``catch_up`` knows whose upload was cut off.
+    The digests are uploaded first, so that ``catch_up`` can find out whose upload was interrupted.
 
     Raises StoreError, LakeError for a folder that is not a dataset.
     """
     made = Lerobot(folder)
     if made.info is None:
-        raise LakeError(f'{folder} is not a dataset: it has no {INFO}', remedy='shadowhound-data export lerobot makes one')
+        raise LakeError(f'{folder} is not a dataset: it has no {INFO}', remedy='shadowhound-data export lerobot creates one')
     paths = sorted(made.paths())
     local = {path.relative_to(folder).as_posix(): path for path in paths}
     last = {name: folder / name for name in (FILES, INFO)}
@@ -107,7 +107,7 @@ def upload(folder: Path, place: DatasetPlace, store: ObjectStore, say: Callable[
 def fetch_dataset(
     place: DatasetPlace, folder: Path, store: ObjectStore, say: Callable[[str], None] = lambda _: None
 ) -> Transferred:
-    """Download the dataset, ``info.json`` last; files that the place does not have any more are removed.
+    """Download the dataset, ``info.json`` last; files that the place no longer has are removed.
 
     Raises StoreError, LakeError if there is no dataset.
     """

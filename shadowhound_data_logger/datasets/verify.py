@@ -1,6 +1,6 @@
 """Verifies a dataset: its files are complete, its sources are unchanged in the store, its images match their sources.
 
-And the other way round: which datasets, and which models, saw an object.
+Also finds the datasets and models that used an object.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.untrusted import from_json, is_path
 from shadowhound_data_logger.datasets.episodes import EPISODE, SOURCES
 from shadowhound_data_logger.datasets.lerobot import DIGESTS, FILES, OURS, SOURCE_TABLE, EpisodeRow, Lerobot
-from shadowhound_data_logger.datasets.series import pictures_of
+from shadowhound_data_logger.datasets.series import read_images
 from shadowhound_data_logger.datasets.transfer import DatasetPlace
 from shadowhound_data_logger.datasets.video import ssim
 from shadowhound_data_logger.lake import decode
@@ -37,7 +37,7 @@ THREADS: Final = 16
 FRAMES: Final = 5
 """Frames of each camera in each episode, by default."""
 ALIKE: Final = 0.8
-"""Least similarity (SSIM) of a frame of a video to its source; AV1 at crf 30 keeps more than 0.9 of what cameras see."""
+"""Minimum similarity (SSIM) of a video frame to its source; AV1 at crf 30 keeps more than 0.9 for camera images."""
 MAX_TABLE_BYTES: Final = 1 << 30
 
 
@@ -58,7 +58,7 @@ def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_
            say: Callable[[str], None] = lambda _: None) -> VerifyResult:  # fmt: skip
     """``frames`` is how many of each camera and episode are compared, None for all; ``is_read`` reads every source again.
 
-    ``forgotten`` is asked where sources are gone: (bucket, key) -> the date on which `lake prune` deleted it.
+    ``forgotten`` is called for missing sources: (bucket, key) -> the date on which `lake prune` deleted it.
 
     Raises LakeError for a dataset of another program, StoreError.
     """
@@ -77,7 +77,7 @@ def verify(folder: Path, store: ObjectStore, *, frames: int | None = FRAMES, is_
     for row in made.rows:
         say(f'episode {row["episode_index"] + 1} of {len(made.rows)}')
         mine = table.filter(pc.equal(table[EPISODE], row[f'{OURS}mission_id']))
-        for key in made.picture_keys():
+        for key in made.image_keys():
             try:
                 _frames(made, row, key, mine, store, frames, found)
             except (LakeError, ObjectRefused) as error:
@@ -96,7 +96,7 @@ def _files(made: Lerobot, found: VerifyResult) -> None:
         elif name not in listed:
             found.wrong.append(f'{name} is not in {FILES}')
         elif fingerprint(path) != (listed[name]['bytes'], listed[name]['sha256']):
-            found.wrong.append(f'{name} is not what was written')
+            found.wrong.append(f'{name} differs from what was written')
         found.files += 1
 
 
@@ -114,14 +114,14 @@ def _sources(table: pa.Table, store: ObjectStore, found: VerifyResult, forgotten
             gone.append((row['bucket'], row['key']))
             return ''
         is_changed = finding.kind in {CHECKSUM, FOREIGN}
-        return f'the source {name} is not what it was' if is_changed else f'the source {name}: {finding.detail}'
+        return f'the source {name} has changed' if is_changed else f'the source {name}: {finding.detail}'
 
     with ThreadPoolExecutor(THREADS, 'export-verify') as pool:
-        found.wrong += [said for said in pool.map(wrong, rows) if said]
+        found.wrong += [given for given in pool.map(wrong, rows) if given]
     dates = forgotten() if gone else {}
     for bucket, key in sorted(gone):
-        said = f'was deleted on {dates[bucket, key]} (lake prune)' if (bucket, key) in dates else 'is gone'
-        found.wrong.append(f'the source {bucket}/{key} {said}')
+        given = f'was deleted on {dates[bucket, key]} (lake prune)' if (bucket, key) in dates else 'is gone'
+        found.wrong.append(f'the source {bucket}/{key} {given}')
     found.sources = len(rows)
 
 
@@ -135,36 +135,36 @@ def _frames(made: Lerobot, row: EpisodeRow, key: str, sources: pa.Table, store: 
         found.wrong.append(f'episode {row["episode_index"]}: frames of {key} have no source')
         return
     with TemporaryDirectory() as work:
-        asked = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in by_frame.values()}
-        pictures = pictures_of(store, asked, row[f'{OURS}{stream}/topic'], Path(work))
+        requested = {(each['bucket'], each['key'], each['stamp_ns'], each['sha256']) for each in by_frame.values()}
+        images = read_images(store, requested, row[f'{OURS}{stream}/topic'], Path(work))
     count = 0
-    shown: Iterator[Any] = made.pictures(row, key) if key in made.video_keys() else made.bodies(row, key)
+    shown: Iterator[Any] = made.images(row, key) if key in made.video_keys() else made.bodies(row, key)
     for number, content in enumerate(shown):
         count += 1
         if number not in by_frame:
             continue
-        body = pictures.get((by_frame[number]['key'], by_frame[number]['stamp_ns']))
+        body = images.get((by_frame[number]['key'], by_frame[number]['stamp_ns']))
         if body is None:
             found.wrong.append(
-                f'episode {row["episode_index"]}, frame {number}: its source {by_frame[number]["key"]} has no such picture'
+                f'episode {row["episode_index"]}, frame {number}: its source {by_frame[number]["key"]} has no such image'
             )
             continue
         found.frames += 1
         if isinstance(content, bytes):
             if content != body:
-                found.wrong.append(f'episode {row["episode_index"]}, frame {number} of {key} is not its source, byte for byte')
+                found.wrong.append(f'episode {row["episode_index"]}, frame {number} of {key} differs from its source')
             continue
         alike = ssim(content, decode.image(body))
         found.least_ssim = min(found.least_ssim, alike)
         if alike < ALIKE:
             found.wrong.append(
-                f'episode {row["episode_index"]}, frame {number} of {key} is not like its source (SSIM {alike:.2f})'
+                f'episode {row["episode_index"]}, frame {number} of {key} does not look like its source (SSIM {alike:.2f})'
             )
     if count != length:
         found.wrong.append(f'episode {row["episode_index"]}: {key} has {count} frames, the episode {length}')
 
 
-# -- which datasets saw an object ---------------------------------------------------------------------------------------------
+# -- which datasets used an object --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

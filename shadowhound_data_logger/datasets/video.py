@@ -1,7 +1,7 @@
-"""Encodes images to an mp4 and decodes them, with PyAV: LeRobot's own settings, and the same bytes on every machine.
+"""Encodes images to mp4 and decodes them, with PyAV: LeRobot's settings, and the same bytes on every machine.
 
-SVT-AV1 writes the same for any number of threads; x264 does not, so it has one. A frame's time is its number divided by the
-frames a second, exactly: the stream's time base is that or a fraction of it.
+SVT-AV1 output does not depend on the number of threads; x264's does, so it has one. A frame's time is exactly its number divided
+by the frames per second: the stream's time base is that or a fraction of it.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ CODECS: Final = {
 """lerobot 0.6.1, configs/video.py: a key frame every second frame, so that a random one is decoded quickly."""
 _NAMES: Final = {AV1: 'av1', H264: 'h264'}
 BLOCK: Final = 8
-"""Pixels of a side of what is compared at a time."""
+"""Block size of the comparison, pixels."""
 
 
 class VideoWriter:
-    """Frames of one size, one after the other. Enter once; a file that an error leaves behind is incomplete."""
+    """Writes frames of one size. Enter once; a file that an error leaves behind is incomplete."""
 
     def __init__(self, path: Path, fps: int, size: tuple[int, int], codec: str) -> None:
         """``size`` is (height, width), both even. Raises LakeError otherwise."""
         if size[0] % 2 or size[1] % 2:
             raise LakeError(
-                f'pictures of {size[1]} x {size[0]} cannot be {PIXELS} video',
+                f'images of {size[1]} x {size[0]} cannot be {PIXELS} video',
                 remedy='export them with lossless: true in the file of --config',
             )
         self._path, self._fps, self._size = path, fps, size
@@ -80,10 +80,9 @@ class VideoWriter:
 
 @contextmanager
 def _same_scheduling() -> Iterator[None]:
-    """Threads that become or are made real-time ones meanwhile get the scheduling that the caller had.
+    """Threads started within it keep the caller's scheduling.
 
-    SVT-AV1, run by root, gives its threads and its caller SCHED_FIFO at 99 (seen with PyAV 18.1): everything else on the machine
-    would wait for them.
+    SVT-AV1, run as root, gives its threads and its caller SCHED_FIFO at 99 (seen with PyAV 18.1): all other programs would wait.
     """
     if sys.platform != 'linux':
         yield
@@ -98,7 +97,7 @@ def _same_scheduling() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Some frames of a video that we wrote: of an episode, the first of them is a key frame."""
+    """A range of frames in one of our videos: of an episode, whose first frame is a key frame."""
 
     path: Path
     first: int
@@ -106,7 +105,7 @@ class Clip:
 
 
 def frames_of(clip: Clip, fps: int) -> Iterator[NDArray[np.uint8]]:
-    """The RGB pixels of each of its frames. Raises LakeError for what is not a video."""
+    """The RGB pixels of each frame. Raises LakeError for an unreadable video."""
     try:
         with av.open(str(clip.path)) as file:
             stream = file.streams.video[0]
@@ -116,20 +115,20 @@ def frames_of(clip: Clip, fps: int) -> Iterator[NDArray[np.uint8]]:
             found = (frame for frame in file.decode(stream) if frame.pts >= first)
             yield from (frame.to_ndarray(format='rgb24') for frame in islice(found, clip.frames))
     except (av.error.FFmpegError, IndexError, OSError) as error:
-        raise LakeError(f'{clip.path} is not a video that can be read: {error}') from error
+        raise LakeError(f'{clip.path} is not a readable video: {error}') from error
 
 
 def count_frames(path: Path) -> int:
-    """By the index of the file. Raises LakeError for what is not a video."""
+    """From the file's index. Raises LakeError for an unreadable video."""
     try:
         with av.open(str(path)) as file:
             return int(file.streams.video[0].frames)
     except (av.error.FFmpegError, IndexError, OSError) as error:
-        raise LakeError(f'{path} is not a video that can be read: {error}') from error
+        raise LakeError(f'{path} is not a readable video: {error}') from error
 
 
 def join(clips: Sequence[Clip], fps: int, target: IO[bytes]) -> None:
-    """The frames of all clips one after the other, as they were encoded; the same clips give the same bytes. Raises LakeError."""
+    """Concatenate all clips without re-encoding; the same clips give the same bytes. Raises LakeError."""
     stream, extradata, count = None, None, 0
     try:
         with av.open(target, 'w', format='mp4', options={'write_btrt': '0'}) as out:  # a bit rate that depends on the sources
@@ -170,7 +169,7 @@ def _packets(file: Any, clip: Clip, fps: int) -> Iterator[Any]:
 
 
 def frames_at(path: Path, fps: int, numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-    """Pixels RGB of these frames, counted from 0; none but those and what they are made from is decoded. Raises LakeError."""
+    """RGB pixels of these frames, counted from 0; decodes only those and their reference frames. Raises LakeError."""
     try:
         with av.open(str(path)) as file:
             stream = file.streams.video[0]
@@ -193,9 +192,9 @@ def feature_info(codec: str, fps: int, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def ssim(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
-    """The mean structural similarity of two pictures' luminance in blocks of 8 x 8, 1 for equal ones.
+    """The mean structural similarity of two images' luminance in blocks of 8 x 8, 1 for equal ones.
 
-    Wang, Bovik, Sheikh, Simoncelli: Image quality assessment, IEEE TIP 13 (2004), with even weights.
+    Wang, Bovik, Sheikh, Simoncelli: Image quality assessment, IEEE TIP 13 (2004), with uniform weights.
     """
     first, second = (_blocks(each) for each in (one, other))
     means = first.mean(axis=-1), second.mean(axis=-1)
@@ -208,7 +207,7 @@ def ssim(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
 
 def _blocks(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    grey = pixels.astype(np.float64) @ np.array([0.299, 0.587, 0.114])
-    height, width = (side - side % BLOCK for side in grey.shape)
-    cut = grey[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    gray = pixels.astype(np.float64) @ np.array([0.299, 0.587, 0.114])
+    height, width = (side - side % BLOCK for side in gray.shape)
+    cut = gray[:height, :width].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK)
     return np.asarray(cut.transpose(0, 2, 1, 3).reshape(height // BLOCK, width // BLOCK, BLOCK * BLOCK))

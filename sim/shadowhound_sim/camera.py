@@ -1,7 +1,8 @@
-"""The front camera: draws what it sees of the building from the robot's pose, 640 by 480 pixels, a few ms a frame.
+"""The front camera: renders the building from the robot's pose, 640 by 480 pixels, a few ms per frame.
 
-An ideal pinhole. Each column of the picture is one ray in the plane; floor and ceiling are looked up by perspective, walls
-and furniture are vertical spans of a column. Every pixel becomes one index into the atlas (see ``surfaces``).
+An ideal pinhole. Each image column is one ray in the plane; floor and ceiling are looked up by perspective, walls and furniture
+are
+vertical spans of a column. Every pixel becomes one index into the atlas (see ``surfaces``).
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ HEIGHT: Final = 480
 FOCAL: Final = 432.2
 """Focal length in pixels: the Go2's own at this width (864.4 at 1280, front_camera_720.yaml of go2_ros2_sdk)."""
 MOUNT: Final = (0.30, 0.07)
-"""How far ahead of and above the middle of the body the camera sits, m."""
+"""Position of the camera ahead of and above the center of the body, m."""
 NEAREST: Final = 0.05
 FADE: Final = 1.4
-"""Levels of shade a meter of distance costs."""
+"""Shade levels per meter of distance."""
 _STRIP: Final = 48
-"""Rows worked on at a time: few enough that intermediate results stay in the cache."""
+"""Rows processed at a time: few enough that intermediate results stay in the cache."""
 _BAR: Final = 24
 """Rows of the caption at the lower edge."""
 
 
 class _View(NamedTuple):
-    """What the camera knows of one frame: itself, its rays, what they cross."""
+    """The state of one frame: pose, rays, and their hits."""
 
     x: float
     y: float
@@ -57,7 +58,7 @@ class _View(NamedTuple):
 
 
 class Camera:
-    """Frames of one world; holds the atlas and scratch memory, so one thread at a time may draw."""
+    """Renders frames of one world; holds the atlas and scratch memory, so only one thread at a time may draw."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -70,7 +71,7 @@ class Camera:
 
     def draw(self, t: float, caption: str, out: NDArray[np.uint8]) -> None:
         """Draws the frame at ``t`` with its caption into ``out``, (HEIGHT, WIDTH, 3) in BGR and contiguous."""
-        view = self._look(self.world.pose(t))
+        view = self._view(self.world.pose(t))
         index = self._index
         self._floor_and_ceiling(view, index)
         self._walls(view, index)
@@ -81,7 +82,7 @@ class Camera:
         np.right_shift(bar, 2, out=bar)
         glyphs.write(out, caption, 8, HEIGHT - _BAR + (_BAR - glyphs.HEIGHT) // 2, (225, 240, 245))
 
-    def _look(self, pose: BodyPose) -> _View:
+    def _view(self, pose: BodyPose) -> _View:
         cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
         x, y = pose.x + MOUNT[0] * cos, pose.y + MOUNT[0] * sin
         dx = (cos + sin * self._across).astype(np.float32)
@@ -93,7 +94,7 @@ class Camera:
         return _View(x, y, pose.z + MOUNT[1], horizon, dx, dy, hits, wall)
 
     def _floor_and_ceiling(self, view: _View, index: NDArray[np.int32]) -> None:
-        """Paints floor and ceiling as far as the farthest wall; what lies beyond nearer walls is painted over."""
+        """Paints floor and ceiling up to the farthest wall; areas behind nearer walls are painted over."""
         farthest = float(view.wall.max())
         ceiling = math.ceil(view.horizon - FOCAL * (CEILING - view.z) / farthest) + 1
         floor = math.floor(view.horizon + FOCAL * view.z / farthest) - 1
@@ -103,7 +104,7 @@ class Camera:
             self._plane(view, index, (row, min(row + _STRIP, HEIGHT)), (view.z, self.atlas.floor))
 
     def _plane(self, view: _View, index: NDArray[np.int32], rows: tuple[int, int], plane: tuple[float, int]) -> None:
-        """Some rows of a level plane, given how far it is below the camera and where its picture begins."""
+        """Some rows of a level plane, given its distance below the camera and the start of its texture."""
         below, base = plane
         depth = np.float32(FOCAL * below) / (self._rows[slice(*rows)] - np.float32(view.horizon))
         np.copyto(depth, np.inf, where=depth <= 0)
@@ -141,7 +142,7 @@ class Camera:
         return start
 
     def _boxes(self, view: _View, index: NDArray[np.int32]) -> None:
-        """Paints furniture, lintels and door frames, the farthest first; undersides and tops count by their far edge."""
+        """Paints furniture, lintels and door frames, the farthest first; undersides and tops are sorted by their far edge."""
         seen = self._partial[(view.hits.near[self._partial] < view.wall).any(axis=1)]
         work: list[tuple[float, int, bool]] = []
         bounds = self.world.plan.bounds
@@ -198,7 +199,7 @@ class Camera:
         heights: tuple[float, float],
         texture: tuple[float, int],
     ) -> None:
-        """Vertical spans from ``heights[0]`` to ``heights[1]`` (m) at a depth in each of some columns."""
+        """Vertical spans from ``heights[0]`` to ``heights[1]`` (m) at a depth in some columns."""
         columns, depth, start = spans
         scale, stride = texture
         pixel = np.float32(FOCAL) / depth
@@ -237,13 +238,13 @@ def _put(part: NDArray[np.int32], columns: NDArray[np.intp], mask: NDArray[np.bo
 
 
 def _level(depth: NDArray[np.float32], more: NDArray[np.int64] | int = 0) -> NDArray[np.int32]:
-    """The level of shade at a depth."""
+    """The shade level at a depth."""
     levels: NDArray[np.int32] = np.minimum((depth * FADE).clip(0, LEVELS).astype(np.int32) + more, LEVELS - 1)
     return levels
 
 
 def _room_grid() -> NDArray[np.uint8]:
-    """Which of ROOMS each 10 cm of the building belongs to; row 0 is south."""
+    """The index into ROOMS of each 10 cm of the building; row 0 is south."""
     grid = np.zeros((80, 120), np.uint8)
     for number, room in enumerate(ROOMS):
         grid[round(room.y0 * 10) : round(room.y1 * 10), round(room.x0 * 10) : round(room.x1 * 10)] = number

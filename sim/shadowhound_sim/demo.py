@@ -1,7 +1,7 @@
-"""``make demo``: a simulated Go2, the real node and a Tower of its own for a minute, and proof that nothing got lost.
+"""``make demo``: a simulated Go2, the real node and a private Tower for a minute, and a check that nothing was lost.
 
-Exit codes: 0 all is accounted for and identical in the S3 server, 1 it is not, or something failed or was logged as an error by
-the node, 2 bad usage.
+Exit codes: 0 everything is accounted for and identical in the S3 server, 1 it is not, or something failed or the node logged an
+error, 2 usage error.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from shadowhound_sim import demo_audit, demo_mission, demo_processes, demo_repor
 from shadowhound_sim.so_arm import NAMESPACE
 
 MARKER: Final = '.shadowhound-demo'
-"""In a folder that the demo made and may replace."""
+"""Marks a folder that the demo created and may replace."""
 MIN_S: Final = 5.0
 AT_THE_DOCK_S: Final = 3.0
-"""The robot publishes for so long after its mission: so it is known what is missing up to the end (docs/datasets.md)."""
+"""The robot keeps publishing for this long after its mission, so that gaps are known up to its end (docs/datasets.md)."""
 NO_PROXY: Final = ('NO_PROXY', 'no_proxy')
 
 
@@ -47,10 +47,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     options = _parser().parse_args(arguments)
     if not (options.duration >= MIN_S and 0 <= options.outage <= options.duration / 2):
-        print(f'demo: --duration is {MIN_S:g} s at least, --outage half of it at most', file=sys.stderr)
+        print(f'demo: --duration is {MIN_S:g} s or more, --outage at most half of it', file=sys.stderr)
         return 2
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # which nohup has asked for
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # ignored, as nohup requests
             signal.signal(number, signal.default_int_handler)
     console = Console(highlight=False)
     try:
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 folder, options.duration, options.outage, console, mlflow=options.mlflow, keeps=options.keep, arm=options.arm
             )
     except KeyboardInterrupt:
-        console.print('\ndemo: stopped. What there is lies in the folder still.')
+        console.print('\ndemo: stopped. The data so far is in the folder.')
         return 130
     except FolderRefused as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -71,13 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, mlflow: bool = True,
         keeps: bool = False, arm: bool = False) -> int:  # fmt: skip
-    """Everything, from an empty folder to the verdict; with ``keeps`` the page and the Tower stay until Ctrl-C."""
-    console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower to log to.')
-    console.print(f'All of it on this machine, in {folder}/\n')
+    """Run everything, from an empty folder to the verdict; with ``keeps`` the page and the Tower stay until Ctrl-C."""
+    console.print(f'[bold]A Go2 on patrol for {duration_s:g} s, its data logger, and a Tower.')
+    console.print(f'Everything runs on this machine, in {folder}/\n')
     if importlib.util.find_spec('go2_interfaces') is None:
         console.print('[yellow]go2_interfaces is not installed[/] (make setup builds it where there is a g++):')
-        console.print('/imu, /go2_states and /lowstate are left out.\n')
-    console.print('Starting the Tower, an S3 server and MLflow (some ten seconds) ...')
+        console.print('/imu, /go2_states and /lowstate are skipped.\n')
+    console.print('Starting the Tower, an S3 server and MLflow (about ten seconds) ...')
     for name in NO_PROXY:
         os.environ[name] = ','.join(filter(None, (os.environ.get(name), '127.0.0.1')))
     with ExitStack() as stack:
@@ -97,16 +97,16 @@ def run(folder: Path, duration_s: float, outage_s: float, console: Console, *, m
         from shadowhound_sim import demo_pictures  # noqa: PLC0415 - matplotlib takes a second to load
 
         drawn += demo_pictures.live_page(address, folder / 'live.jpg')
-        code = _tell(folder, audit, record, run_id, drawn, console, address if keeps else '')
+        code = _report(folder, audit, record, run_id, drawn, console, address if keeps else '')
         if keeps:
             with suppress(KeyboardInterrupt):
                 page.wait()
     return code
 
 
-def _tell(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, run_id: str, drawn: list[Path],
+def _report(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, run_id: str, drawn: list[Path],
           console: Console, page: str) -> int:  # fmt: skip
-    """The result, and the exit code that says it."""
+    """Print the result; returns the exit code."""
     (folder / 'ledger.json').write_text(json.dumps(audit.ledger, indent=2), encoding='utf-8')
     demo_report.show_result(audit, record, console)
     if run_id and (summary := demo_mission.summary(audit.bodies, run_id)) is not None:
@@ -121,7 +121,9 @@ def _tell(folder: Path, audit: demo_audit.DemoAudit, record: demo_run.Record, ru
 def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, console: Console, *,  # noqa: PLR0913 - as asked for
             with_mission: bool, with_arm: bool, stack: ExitStack
             ) -> tuple[demo_run.Record, str, demo_processes.Child, str]:  # fmt: skip
-    """The minute itself, its mission's run if it is one, and the live page, which the stack ends; the others have ended."""
+    """The minute itself, the id of its mission's run if any, and the live page, which the stack stops; other processes have
+    exited.
+    """
     environ = demo_processes.environment(folder / 'home', tower.environment(), demo_processes.free_domain())
     console.print(f'Starting the node and the robot (ROS_DOMAIN_ID={environ["ROS_DOMAIN_ID"]}, this machine only) ...')
     with (
@@ -132,7 +134,7 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         stack.enter_context(page)
         console.print(f'Watch it live, while it walks: {address}')
         if outage_s:
-            console.print(f'In the middle the S3 server goes away for {outage_s:g} s.\n')
+            console.print(f'In the middle the S3 server is unreachable for {outage_s:g} s.\n')
         with ExitStack() as agents:
             if with_arm:
                 module = 'shadowhound_sim.so_arm'
@@ -151,16 +153,16 @@ def _patrol(folder: Path, tower: Tower, duration_s: float, outage_s: float, cons
         began = time.monotonic()
         node.stop(demo_processes.STOP_S)
         node.check()
-        console.print(f'The robot has stopped. Asked to end (SIGINT), the node did so in {time.monotonic() - began:.1f} s.')
+        console.print(f'The robot has stopped. On SIGINT the node exited in {time.monotonic() - began:.1f} s.')
     return replace(record, errors=tuple(node.errors())), run_id, page, address
 
 
 @contextmanager
 def fresh_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder that is ours alone; what an earlier demo left in it is gone. Raises FolderRefused."""
+    """An empty folder for this demo; the data of an earlier demo is deleted. Raises FolderRefused."""
     marker = folder / MARKER
     if folder.exists() and not marker.is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FolderRefused(f'{folder} is there and no demo made it', remedy='name another one with --folder')
+        raise FolderRefused(f'{folder} exists and was not created by a demo', remedy='name another one with --folder')
     folder.mkdir(parents=True, exist_ok=True)
     with flock(marker, wait=False) as is_mine:
         if not is_mine:
@@ -179,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--outage', type=float, default=10.0, metavar='S', help='seconds without the S3 server (default 10; 0: none)'
     )
-    parser.add_argument('--folder', type=Path, default=Path('demo'), help='where all of it lies (default demo)')
+    parser.add_argument('--folder', type=Path, default=Path('demo'), help='folder of the demo (default demo)')
     parser.add_argument('--keep', action='store_true', help='keep the live page and the Tower afterwards, until Ctrl-C')
     parser.add_argument('--arm', action='store_true', help='with a simulated SO-ARM100, its clock 37 ms ahead (docs/datasets.md)')
     parser.add_argument('--no-mlflow', dest='mlflow', action='store_false', help='the S3 server only, which starts sooner')

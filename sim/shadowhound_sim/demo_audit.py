@@ -1,7 +1,7 @@
-"""The demo's own audit: reads every object back from the S3 server, and compares all figures with one another.
+"""The demo's independent audit: reads every object back from the S3 server, and compares all counts.
 
-It trusts nobody's sums: messages come from the simulated robot's own account, content from the server, hashes and numbers of
-publishers from the spool's index, and samples are counted in the objects themselves.
+It does not trust totals: messages come from the simulated robot's own count, content from the server, hashes and sequence numbers
+from the spool's index, and samples are counted in the objects.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class SensorTotals:
     delivered: int = 0
     bytes: int = 0
     latest: str = ''
-    """Key of the latest; of the catalog its folder, for its keys are long."""
+    """Key of the latest; for the catalog its folder, because its keys are long."""
 
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """What became of the messages of one topic; None is a figure that nobody knows."""
+    """The fate of a topic's messages; None means unknown."""
 
     published: int
-    """By the robot's own account."""
+    """Counted by the robot."""
     before_match: int | None
     """Published before the node had found the publisher."""
     account: ledger.TopicFigures | None
@@ -51,7 +51,7 @@ class Messages:
 
     @property
     def unaccounted(self) -> int:
-        """Messages after the match that the ledger does not know: published after the last one that arrived."""
+        """Messages after the match that are not in the ledger: published after the last one that arrived."""
         if self.account is None or self.before_match is None:
             return 0
         return self.published - self.before_match - (self.account['published'] or 0)
@@ -59,7 +59,7 @@ class Messages:
 
 @dataclass(frozen=True, slots=True)
 class DemoAudit:
-    """What the audit of a demo found."""
+    """The result of a demo's audit."""
 
     ledger: Ledger
     messages: Mapping[str, Messages]
@@ -69,15 +69,15 @@ class DemoAudit:
     samples: int
     """Messages counted in them."""
     bodies: Mapping[str, bytes]
-    """What was read, by key; no two buckets have the same."""
+    """Content by key; keys are unique across buckets."""
     rows: int
-    """Of the catalog, as it lies in the server."""
+    """Rows of the catalog in the server."""
     problems: tuple[str, ...]
-    """One sentence for each thing that is not as it should be."""
+    """One sentence for each problem."""
 
 
 def audit(spool: Path, robot: str, published: Mapping[str, int], store: ObjectStore) -> DemoAudit:
-    """Raises StoreError when the server cannot be read, SpoolError for the spool."""
+    """Raises StoreError if the server cannot be read, SpoolError for the spool."""
     found = ledger.read(spool, robot)
     index = Index(spool / 'index.db', read_only=True)
     index.open()
@@ -118,7 +118,7 @@ def _totals(rows: list[Any]) -> dict[str, SensorTotals]:
 
 
 def _count(rows: list[Any], bodies: Mapping[str, bytes]) -> Counter[str]:
-    """Messages by topic, as they are in the objects that were read back."""
+    """Messages by topic, counted in the objects that were read back."""
     samples: Counter[str] = Counter()
     for row in rows:
         topic = json.loads(row['metadata']).get('topic')
@@ -133,7 +133,7 @@ def _unread(delivered: Mapping[str, str], bodies: Mapping[str, bytes]) -> list[s
     found += [f'{key} is in the bucket, but not known as delivered' for key in bodies.keys() - delivered.keys()]
     for key in delivered.keys() & bodies.keys():
         if hashlib.sha256(bodies[key]).hexdigest() != delivered[key]:
-            found.append(f'{key} is not what was spooled')
+            found.append(f'{key} differs from the spooled object')
     return sorted(found)
 
 
@@ -172,7 +172,7 @@ def _undelivered(found: Ledger) -> list[str]:
 
 def _uncounted(found: Ledger, samples: Mapping[str, int]) -> list[str]:
     return [
-        f'{topic}: {row["stored_in"]["delivered"]:,} messages are delivered, but {samples.get(topic, 0):,} lie in the bucket'
+        f'{topic}: {row["stored_in"]["delivered"]:,} messages are delivered, but {samples.get(topic, 0):,} are in the bucket'
         for topic, row in found['topics'].items()
         if row['stored_in']['delivered'] != samples.get(topic, 0)
     ]

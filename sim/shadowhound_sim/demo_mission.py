@@ -1,6 +1,6 @@
 """The demo's patrol as a mission: the agent that logs it, in a separate process, and the result.
 
-The agent states no distance, so that what the node measured stands (docs/missions.md). Run as a program, this is the agent.
+The agent reports no distance, so that the node's measurement is used (docs/missions.md). Run as a program, this is the agent.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from shadowhound_sim.demo_processes import READY_S, STOP_S, Child, DemoFailed
 
 COMMAND: Final = 'go through all six rooms and come back to the dock'
 SEND_S: Final = 120.0
-"""For the run to have everything: its pictures take some seconds, and longer on a busy machine."""
-PICTURE: Final = 'trajectory.png'
+"""Time for the run to receive everything: its images take some seconds, longer on a busy machine."""
+PLOT: Final = 'trajectory.png'
 
 
 def start(folder: Path, environ: Mapping[str, str]) -> Child:
-    """The agent, once its mission has begun. Raises DemoFailed when it does not."""
+    """The agent, once its mission has started. Raises DemoFailed if it does not start."""
     agent = Child(__name__, (), environ, folder / 'agent.log')
     end_s = time.monotonic() + READY_S
     while not any(missions(folder / 'home')):
         if not agent.is_running or time.monotonic() > end_s:
             agent.stop(0.0)
-            raise agent.failed('did not begin a mission')
+            raise agent.failed('did not start a mission')
         time.sleep(0.1)
     return agent
 
 
 def end(agent: Child, console: Console) -> str:
-    """End the mission; the id of its run. What has not arrived by then is printed. Raises DemoFailed without a run."""
+    """End the mission; returns the id of its run and prints what has not arrived by then. Raises DemoFailed without a run."""
     agent.stop(SEND_S + STOP_S)
     agent.check()
     found = json.loads(agent.output.splitlines()[-1])
@@ -58,29 +58,29 @@ def end(agent: Child, console: Console) -> str:
 
 
 def pictures(tracking: Mapping[str, str], run_id: str, path: Path, console: Console) -> list[Path]:
-    """The way over the floor plan, an artifact of the run, as a file; without it the reason is printed."""
+    """The path on the floor plan, an artifact of the run, as a file; if it is missing the reason is printed."""
     try:
-        return [picture(tracking, run_id, path)]
+        return [plot(tracking, run_id, path)]
     except DemoFailed as error:
         console.print(f'[yellow]{error}[/]')
         return []
 
 
-def picture(tracking: Mapping[str, str], run_id: str, path: Path) -> Path:
-    """The path over the floor plan, an artifact of the run, as a file. ``tracking`` are MLflow's variables. Raises DemoFailed."""
-    url = f'{tracking["MLFLOW_TRACKING_URI"]}/get-artifact?{urlencode({"path": PICTURE, "run_uuid": run_id})}'
+def plot(tracking: Mapping[str, str], run_id: str, path: Path) -> Path:
+    """The path on the floor plan, an artifact of the run, as a file. ``tracking`` are MLflow's variables. Raises DemoFailed."""
+    url = f'{tracking["MLFLOW_TRACKING_URI"]}/get-artifact?{urlencode({"path": PLOT, "run_uuid": run_id})}'
     login = f'{tracking["MLFLOW_TRACKING_USERNAME"]}:{tracking["MLFLOW_TRACKING_PASSWORD"]}'
     headers = {'Authorization': 'Basic ' + b64encode(login.encode()).decode()}
     try:
         with urlopen(Request(url, headers=headers), timeout=READY_S) as answer:  # noqa: S310 - our own server on 127.0.0.1
             path.write_bytes(answer.read())
     except (URLError, TimeoutError) as error:
-        raise DemoFailed(f'the run {run_id} gives no {PICTURE}: {error}') from error
+        raise DemoFailed(f'the run {run_id} has no {PLOT}: {error}') from error
     return path
 
 
 def summary(bodies: Mapping[str, bytes], run_id: str) -> dict[str, Any] | None:
-    """The mission's summary.json, of what was read from the S3 server; None where it is not there yet."""
+    """The mission's summary.json as read from the S3 server; None if it has not arrived."""
     for key, body in bodies.items():
         if key.endswith(f'/missions/{run_id}/summary.json'):
             found: dict[str, Any] = json.loads(body)
@@ -89,7 +89,7 @@ def summary(bodies: Mapping[str, bytes], run_id: str) -> dict[str, Any] | None:
 
 
 def main() -> int:
-    """Log a mission until SIGINT; prints what became of it."""
+    """Log a mission until SIGINT; prints its result."""
     stop = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: stop.set())
     with closing(MissionDataLogger()) as logger:

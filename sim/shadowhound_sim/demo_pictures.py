@@ -1,4 +1,4 @@
-"""The demo's pictures, made of nothing but the objects that were read back from the S3 server and the readings of the run."""
+"""The demo's plots, made only from objects that were read back from the S3 server, and from the readings of the run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shadowhound_sim.floor_plan import FloorPlan
 log = logging.getLogger(__name__)
 
 CELL_M: Final = 0.03
-"""Of the map that the point clouds are drawn into."""
+"""Cell size of the map that is drawn from the point clouds."""
 FLOOR_M: Final = 0.08
 LINTEL_M: Final = 1.9
 """Heights in between are walls and furniture, as seen from above."""
@@ -37,23 +37,23 @@ THUMB: Final = (240, 180)
 GAP: Final = 8
 PAGE_MS: Final = 90_000
 SETTLE_MS: Final = 3000
-"""The page has shown what it was asked for by then; the picture is for people."""
+"""Time for the page to render; the screenshot is only for people."""
 CAPTION: Final = 18
 
 
 def draw(folder: Path, bodies: Mapping[str, bytes], record: Record) -> list[Path]:
-    """Write the PNG files into the folder; the paths of those for which there was data."""
+    """Write the PNG files into the folder; returns the paths of those with data."""
     with mpl.rc_context(STYLE):
         made = [
-            contact_sheet(_of_sensor(bodies, 'camera'), folder / 'frames.png'),
-            patrol(_of_sensor(bodies, 'lidar'), _of_sensor(bodies, 'odom'), record, folder / 'patrol.png'),
+            contact_sheet(_objects_of_sensor(bodies, 'camera'), folder / 'frames.png'),
+            patrol(_objects_of_sensor(bodies, 'lidar'), _objects_of_sensor(bodies, 'odom'), record, folder / 'patrol.png'),
             delivery(record, folder / 'delivery.png'),
         ]
     return [path for path in made if path is not None]
 
 
 def live_page(address: str, path: Path) -> list[Path]:
-    """The live page with the middle of the patrol, as a Chromium of this machine shows it; nothing where there is none."""
+    """The live page at the middle of the patrol, rendered by this machine's Chromium; empty if there is none."""
     chromium = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
     if chromium is None or find_spec('playwright') is None:
         return []
@@ -85,13 +85,13 @@ def live_page(address: str, path: Path) -> list[Path]:
             page.screenshot(path=path, type='jpeg', quality=82, timeout=PAGE_MS)
             browser.close()
     except Error as error:
-        log.warning('there is no picture of the live page: %s', error)
+        log.warning('there is no screenshot of the live page: %s', error)
         return []
     return [path]
 
 
 def contact_sheet(frames: Mapping[str, bytes], path: Path) -> Path | None:
-    """Camera frames in the order of time, evenly chosen, each with the name it has in the bucket."""
+    """Evenly spaced camera frames in order of time, each with its name in the bucket."""
     columns, rows = SHEET
     keys = sorted(frames)
     chosen = [keys[round(place)] for place in np.linspace(0, len(keys) - 1, min(columns * rows, len(keys)))] if keys else []
@@ -110,7 +110,7 @@ def contact_sheet(frames: Mapping[str, bytes], path: Path) -> Path | None:
 
 
 def patrol(clouds: Mapping[str, bytes], poses: Mapping[str, bytes], record: Record, path: Path) -> Path | None:
-    """The building as the point clouds show it from above, and the way through it; in amber while the Tower was away."""
+    """The building from the point clouds, seen from above, and the path through it; in amber while the Tower was unreachable."""
     if not clouds or not poses:
         return None
     plan = FloorPlan.build()
@@ -132,7 +132,7 @@ def patrol(clouds: Mapping[str, bytes], poses: Mapping[str, bytes], record: Reco
     axes.plot(*xy.T, color=BLUE, lw=2, marker='o', ms=4, label=f'odometry, {len(xy)} poses')
     if record.outage is not None:
         away = [record.outage[0] <= t <= record.outage[1] for t in times - times[0]]
-        axes.plot(*xy[away].T, color=AMBER, lw=3, marker='o', ms=5, label='recorded while the S3 server was away')
+        axes.plot(*xy[away].T, color=AMBER, lw=3, marker='o', ms=5, label='recorded while the S3 server was unreachable')
     axes.plot(*xy[0], marker='o', ms=11, mfc='white', mec=BLUE, mew=2, ls='', label='start')
     axes.set(xlabel='x [m], frame odom', ylabel='y [m]', aspect='equal')
     axes.set_title(f'The patrol, from {len(clouds)} point clouds and {len(xy)} poses in the bucket')
@@ -152,20 +152,20 @@ def delivery(record: Record, path: Path) -> Path:
     if record.outage is not None:
         for axes in (above, below):
             axes.axvspan(*record.outage, color=AMBER, alpha=0.16, lw=0)
-        above.text(sum(record.outage) / 2, 0.97, 'S3 server away', transform=above.get_xaxis_transform(), ha='center', va='top',
+        above.text(sum(record.outage) / 2, 0.97, 'S3 server down', transform=above.get_xaxis_transform(), ha='center', va='top',
                    color=AMBER, fontweight='bold')  # fmt: skip
     above.plot(t, spooled, color=BLUE, lw=2, label='on disk, in the spool (durable)')
     above.plot(t, delivered, color=TEAL, lw=2, label='in the S3 server (confirmed)')
     above.set(ylabel='objects', ylim=(0, None))
-    above.set_title('Disk before network: what the outage did to delivery')
+    above.set_title('Disk before network: the effect of the outage on delivery')
     above.legend(loc='upper left')
     below.fill_between(t, pending, color=AMBER, alpha=0.75, lw=0, step='post')
-    below.set(xlabel='time since the robot was first heard [s]', ylabel='waiting', ylim=(0, None), xlim=(0, max(t)))
+    below.set(xlabel='time since the first message [s]', ylabel='waiting', ylim=(0, None), xlim=(0, max(t)))
     figure.savefig(path)
     return path
 
 
-def _of_sensor(bodies: Mapping[str, bytes], sensor: str) -> dict[str, bytes]:
+def _objects_of_sensor(bodies: Mapping[str, bytes], sensor: str) -> dict[str, bytes]:
     return {key: body for key, body in bodies.items() if key.split('/')[1] == sensor}
 
 

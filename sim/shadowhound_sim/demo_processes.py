@@ -1,6 +1,6 @@
-"""The demo's processes: the node and the simulated robot, in a world of their own, and none outlives the demo.
+"""The demo's processes: the node and the simulated robot, isolated from other ROS nodes; none keeps running after the demo.
 
-It stops them itself; should it be killed, the kernel asks them to stop.
+The demo stops them; if it is killed, the kernel signals them to stop.
 """
 
 from __future__ import annotations
@@ -28,45 +28,49 @@ if TYPE_CHECKING:
 
 ROBOT: Final = 'thor'
 READY_S: Final = 60.0
-"""For a process to start on a machine that is busy."""
+"""Time for a process to start on a busy machine."""
 DRAIN_S: Final = 15.0
 BACKOFF_S: Final = 4.0
-"""Longest pause between two tries while the S3 server is away: not 60 as by default, for the minute shall show it catch up."""
+"""Maximum pause between two tries while the S3 server is down: shorter than the default 60 s, so that the catch-up is visible."""
 STOP_S: Final = 40.0
 TAIL_LINES: Final = 15
 FAILURES: Final = ('[ERROR]', '[FATAL]', 'Traceback (most recent call last)')
-"""In a line of a ROS log."""
+"""Marks of errors in a ROS log."""
 PR_SET_PDEATHSIG: Final = 1
 """linux/prctl.h"""
 DOMAINS: Final = range(1, 102)
-"""Those whose ports lie below Linux's ephemeral ones; https://docs.ros.org/en/kilted/Concepts/Intermediate/About-Domain-ID.html"""
+"""Domains whose ports are below Linux's ephemeral ones; https://docs.ros.org/en/kilted/Concepts/Intermediate/About-Domain-
+ID.html
+"""
 THIS_MACHINE: Final = (
     {'ROS_LOCALHOST_ONLY': '1'} if os.environ.get('ROS_DISTRO') == 'humble' else {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 )
-"""The variable that keeps nodes among themselves on one machine: Humble does not know the second one."""
+"""Variables that restrict nodes to this machine: Humble does not support the second one."""
 FOREIGN_VARIABLES: Final = ('AWS_', 'MLFLOW_', 'SHADOWHOUND_', 'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_NAMESPACE')
-"""What would lead the demo to somebody's real Tower or robot; a name or the beginning of one."""
+"""Variables, or prefixes, that could connect the demo to a real Tower or robot."""
 OUR_VARIABLE: Final = 'SHADOWHOUND_ENVIRONMENT'
-"""Set by scripts/with-env; says nothing about data."""
+"""Set by scripts/with-env; independent of data."""
 
 
 class DemoFailed(DataLoggerError):
-    """The demo could not be run to its end."""
+    """The demo could not be completed."""
 
 
 class Child:
-    """A process of the demo. Its output goes to files; Ctrl-C does not reach it; ``stop`` asks, waits and at last kills."""
+    """A process of the demo. Its output is in files; Ctrl-C does not reach it; ``stop`` sends SIGINT, waits, and finally kills
+    it.
+    """
 
     def __init__(self, module: str, arguments: Iterable[str], environ: Mapping[str, str], log: Path) -> None:
         self.name = module.rpartition('.')[2]
         self.log = log
         self._libc = ctypes.CDLL(None)
-        self._is_asked = False
+        self._is_stopping = False
         with log.open('wb') as errors, log.with_suffix('.out').open('wb') as output:
             self._process = subprocess.Popen(
                 [sys.executable, '-m', module, *arguments], env=environ, stdin=subprocess.DEVNULL, stdout=output, stderr=errors,
                 start_new_session=True,
-                # Safe here: the demo has one thread when it starts its processes, and that one outlives them.
+                # Safe here: the demo has one thread when it starts its processes, and that thread runs until they exit.
                 preexec_fn=self._die_with_the_demo,  # noqa: PLW1509
             )  # fmt: skip
 
@@ -85,23 +89,23 @@ class Child:
         return self.log.with_suffix('.out').read_text(encoding='utf-8')
 
     def check(self) -> None:
-        """Raises DemoFailed when it has ended, unless all went well."""
+        """Raises DemoFailed if it has exited, unless it succeeded."""
         if self._process.poll():
-            raise self.failed(f'ended with exit code {self._process.returncode}')
+            raise self.failed(f'exited with code {self._process.returncode}')
 
     def errors(self) -> list[str]:
-        """Lines of its log that are of severity ERROR or worse, or tell an unhandled exception."""
+        """Lines of its log with severity ERROR or above, or an unhandled exception."""
         lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
         return [line for line in lines if any(mark in line for mark in FAILURES)]
 
     def ask_to_stop(self) -> None:
-        """SIGINT, once: Python that ends no longer catches it, and a second one would be its exit code."""
-        if self.is_running and not self._is_asked:
-            self._is_asked = True
+        """Send SIGINT once: a Python process that exits no longer catches it, and a second one would become its exit code."""
+        if self.is_running and not self._is_stopping:
+            self._is_stopping = True
             self._process.send_signal(signal.SIGINT)
 
     def wait(self) -> None:
-        """Until it ends."""
+        """Wait until it exits."""
         self._process.wait()
 
     def stop(self, timeout_s: float) -> None:
@@ -122,7 +126,7 @@ class Child:
 
 
 def free_domain() -> int:
-    """A ROS_DOMAIN_ID that nobody on this machine uses."""
+    """A ROS_DOMAIN_ID that is unused on this machine."""
     used = domains(Path('/'))
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         if domain not in used:
@@ -131,14 +135,14 @@ def free_domain() -> int:
 
 
 def environment(home: Path, tower: Mapping[str, str], domain: int) -> dict[str, str]:
-    """Ours, without what leads elsewhere, with the demo's folder, Tower and domain."""
+    """This environment without foreign variables, with the demo's folder, Tower and domain."""
     kept = {name: value for name, value in os.environ.items() if name == OUR_VARIABLE or not name.startswith(FOREIGN_VARIABLES)}
     ours = {'SHADOWHOUND_HOME': str(home), 'SHADOWHOUND_ROBOT': ROBOT, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1'}
     return {**kept, **tower, **THIS_MACHINE, **ours}
 
 
 def start_logger(folder: Path, environ: Mapping[str, str], *, arm: str = '') -> Child:
-    """The node, once its spool can be read; its bag has the topics of an arm too. Raises DemoFailed when it does not start."""
+    """The node, once its spool can be read; its bag has the topics of an arm too. Raises DemoFailed if it does not start."""
     settings: tuple[str, ...] = (f'shutdown.drain_s:={DRAIN_S}', f'upload.backoff_s:={BACKOFF_S}', 'bag.record:=mission')
     settings += (f'bag.regex:=^/({arm}/.*|camera/compressed|odom|joint_states)$',) if arm else ()
     arguments = ['--ros-args', *(word for each in settings for word in ('-p', each))]
@@ -156,11 +160,11 @@ def start_logger(folder: Path, environ: Mapping[str, str], *, arm: str = '') -> 
 
 
 def start_page(folder: Path, environ: Mapping[str, str]) -> tuple[Child, str]:
-    """The live page, and its address. Raises DemoFailed when it does not start."""
+    """The live page, and its address. Raises DemoFailed if it does not start."""
     page = Child('shadowhound_data_logger.cli.main', ['live', '--port', '0', '--json'], environ, folder / 'live.log')
     end = time.monotonic() + READY_S
     while True:
-        with suppress(ValueError):  # it has not said all of it
+        with suppress(ValueError):  # its output is incomplete
             return page, str(json.loads(page.output)['url'])
         if not page.is_running or time.monotonic() > end:
             page.stop(0.0)

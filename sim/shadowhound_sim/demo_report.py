@@ -1,4 +1,4 @@
-"""What the demo prints: a line of progress while it runs, then what became of everything."""
+"""The demo's output: a line of progress while it runs, then the results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TOWER: Final = {'up': 'up', 'going': 'going away', 'away': 'AWAY', 'coming': 'AW
 
 @contextmanager
 def progress(console: Console, duration_s: float) -> Iterator[Show]:
-    """Something to show readings with: a live line on a terminal, else a line every five seconds and at each change."""
+    """A function that shows readings: a live line on a terminal, otherwise a line every five seconds and at each change."""
     if not console.is_terminal:
         lines = Lines(console)
         yield lines.show
@@ -57,21 +57,21 @@ class Lines:
         self._console = console
         self._next_s = 0.0
         self._tower = ''
-        self._unsaid: SpoolReading | None = None
+        self._unprinted: SpoolReading | None = None
         console.print(HEADING)
 
     def show(self, reading: SpoolReading) -> None:
-        self._unsaid = reading
+        self._unprinted = reading
         if reading.t >= self._next_s or TOWER[reading.tower] != self._tower:
             self.end()
             self._next_s = (reading.t // LINE_EVERY_S + 1) * LINE_EVERY_S
             self._tower = TOWER[reading.tower]
 
     def end(self) -> None:
-        """Say the last reading, if it has not been said."""
-        if self._unsaid is not None:
-            self._console.print(line(self._unsaid))
-            self._unsaid = None
+        """Print the last reading, unless it was printed."""
+        if self._unprinted is not None:
+            self._console.print(line(self._unprinted))
+            self._unprinted = None
 
 
 def line(reading: SpoolReading) -> str:
@@ -83,7 +83,7 @@ def line(reading: SpoolReading) -> str:
 
 
 def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
-    """The tables, what they leave to say, and the verdicts."""
+    """Print the tables, remarks, and the verdicts."""
     print_page(messages_table(audit), '', objects_table(audit), console=console)
     console.print()
     for remark in _remarks(audit, record):
@@ -92,7 +92,7 @@ def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
     console.print(verdict(audit.ledger, ()))
     found = '[red]something is wrong' if audit.problems else '[green]all as spooled'
     console.print(f'{audit.read_back:,} objects with {audit.samples:,} messages read back from the S3 server: {found}')
-    console.print(f'The catalog in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object but its own.')
+    console.print(f'The catalog in {BUCKET}/*/_catalog/ has {audit.rows:,} rows: one for each object except its own.')
     for problem in audit.problems:
         console.print(Text(f'  {problem}', style='red'))
     if record.errors:
@@ -103,21 +103,21 @@ def show_result(audit: DemoAudit, record: Record, console: Console) -> None:
 def _remarks(audit: DemoAudit, record: Record) -> Iterator[str]:
     before = sum(row.before_match or 0 for row in audit.messages.values())
     if before:
-        yield f'{before:,} messages went out before the node had found their publishers: the ledger begins after them.'
+        yield f'{before:,} messages were published before the node found their publishers: the ledger starts after them.'
     for topic, row in audit.messages.items():
         if row.account is None:
-            yield f'{topic} is not logged: the compressed image is there, and preferred.'
+            yield f'{topic} is not logged: the compressed image is preferred.'
     if record.outage is not None:
         length_s, after_s = record.outage[1] - record.outage[0], record.caught_up_s
         end = 'they still wait' if after_s is None else f'delivered {max(after_s, 1):.0f} s after its return'
-        yield f'The S3 server was away for {length_s:.0f} s: {record.backlog:,} objects waited, {end}.'
+        yield f'The S3 server was down for {length_s:.0f} s: {record.backlog:,} objects waited, {end}.'
 
 
 def messages_table(audit: DemoAudit) -> Table:
-    """A row a topic: what the robot says it published, and what became of it."""
+    """One row per topic: what the robot counted as published, and what happened to it."""
     fates = ('received', 'stored', 'skipped', 'missed')
     has_before = any(row.before_match for row in audit.messages.values())
-    table = plain_table('What became of the messages', ('topic', 'published', *(['before match'] if has_before else ()), *fates))
+    table = plain_table('Messages by outcome', ('topic', 'published', *(['before match'] if has_before else ()), *fates))
     for topic, row in sorted(audit.messages.items()):
         before = [number(row.before_match)] if has_before else []
         account = row.account
@@ -130,9 +130,9 @@ def messages_table(audit: DemoAudit) -> Table:
 
 
 def objects_table(audit: DemoAudit) -> Table:
-    """A row a sensor: the objects that lie in the S3 server, and what they are called."""
+    """One row per sensor: its objects in the S3 server, and the latest key."""
     columns = ('objects', 'delivered', 'size', 'the latest one')
-    table = plain_table('What lies in the S3 server', columns, left=columns[-1:])
+    table = plain_table('Objects in the S3 server', columns, left=columns[-1:])
     for _, each in sorted(audit.totals.items(), key=lambda item: item[1].latest):
         table.add_row(number(each.objects), number(each.delivered), volume(each.bytes), each.latest)
     totals = audit.totals.values()
@@ -142,32 +142,32 @@ def objects_table(audit: DemoAudit) -> Table:
 
 
 def show_mission(summary: Mapping[str, Any], console: Console) -> None:
-    """What a mission came to, by its summary.json."""
+    """The result of a mission, from its summary.json."""
     counts, last = summary['counts'], summary['last']
     walked = f'{summary["distance_m"]:.1f} m in {summary["duration_s"]:.0f} s'
     battery = f', battery {last["battery_pct"]:.0f} %' if 'battery_pct' in last else ''
     console.print(f'The mission {summary["run_name"]}: {walked}{battery}, {number(counts["camera_frames"])} frames.')
-    console.print('Its run in MLflow has parameters, metrics over time, trajectory, frames, three pictures and a summary.')
+    console.print('Its run in MLflow has parameters, metrics over time, trajectory, frames, three plots and a summary.')
 
 
 def show_where(folder: Path, pictures: list[Path], environ: Mapping[str, str], console: Console, page: str = '') -> None:
-    """Where everything is, and how to look at it; ``page`` is the live page, where it and the Tower stay."""
+    """Where everything is, and how to open it; ``page`` is the live page, if it and the Tower stay."""
     prefix = 'scripts/with-env ' if OUR_VARIABLE in environ else ''
     place = shlex.quote(str(folder))
     console.print('\n[bold]Look at')
     for picture in pictures:
         console.print(f'  {picture}', soft_wrap=True)
-    console.print(f'  {folder}/node.log: what the node said', soft_wrap=True)
+    console.print(f'  {folder}/node.log: the log of the node', soft_wrap=True)
     if page:
         console.print(f'\n[bold]The live page stays, with the whole patrol to look back at: {page}')
-        console.print('Ctrl-C ends it, and the Tower.')
+        console.print('Ctrl-C stops it, and the Tower.')
         return
     console.print('\n[bold]Look at the bucket')
     console.print('The Tower has stopped, its data stay. Start it again, with new credentials:')
     console.print(f'  {prefix}python -m shadowhound_tower.embedded --folder {place}/tower', soft_wrap=True)
     console.print('Paste the "export" lines it prints into another terminal, and use any S3 client:')
     console.print('  aws s3 ls --recursive s3://sensor-data/ --endpoint-url "$AWS_ENDPOINT_URL"', soft_wrap=True)
-    console.print('It prints where MLflow is as well, and who may look at its pages: experiment thor_missions has the mission.')
+    console.print('It also prints the URL of MLflow and the user for its pages: experiment thor_missions has the mission.')
     console.print('The ledger again, as on a robot:')
     console.print(f'  SHADOWHOUND_HOME={place}/home {prefix}shadowhound-data ledger', soft_wrap=True)
 

@@ -1,4 +1,4 @@
-"""The demo's minute: the robot walks, the S3 server goes away in the middle, and the spool is read twice a second."""
+"""The demo's minute: the robot walks, the S3 server is down in the middle, and the spool is read twice per second."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 LOOK_S: Final = 0.5
 """Between two readings of the spool."""
 CATCH_UP_S: Final = 30.0
-"""For the backlog after the robot has stopped; it takes a second or two unless the Tower came back only then."""
+"""Time for the backlog after the robot has stopped; a second or two unless the Tower returned only then."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpoolReading:
-    """What the spool said at one moment."""
+    """The state of the spool at one moment."""
 
     t: float
-    """Seconds since the robot was first heard."""
+    """Seconds since the robot's first message."""
     messages: int
     spooled: int
     delivered: int
@@ -46,24 +46,24 @@ class SpoolReading:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A run that came to its end."""
+    """A completed run."""
 
     published: Mapping[str, int]
-    """Messages by topic, as the simulated robot itself says."""
+    """Messages by topic, as counted by the simulated robot."""
     readings: tuple[SpoolReading, ...]
     outage: tuple[float, float] | None
-    """From when until when the S3 server was away, seconds since the robot was first heard."""
+    """Start and end of the S3 server's outage, seconds since the robot's first message."""
     errors: tuple[str, ...] = ()
-    """What the node logged as an error."""
+    """Errors logged by the node."""
 
     @property
     def backlog(self) -> int:
-        """The most objects that waited at once."""
+        """The maximum number of objects that waited."""
         return max(reading.pending for reading in self.readings)
 
     @property
     def caught_up_s(self) -> float | None:
-        """How long after the return of the S3 server the backlog was gone (a tenth of it, for new objects come all the time)."""
+        """How long after the outage the backlog was gone (a tenth of it, because new objects keep arriving)."""
         if self.outage is None:
             return None
         after = (reading.t for reading in self.readings if reading.t >= self.outage[1] and reading.pending <= self.backlog / 10)
@@ -71,7 +71,7 @@ class Record:
 
 
 class Patrolled:
-    """Which room the robot is in, by the time it has walked."""
+    """The room of the robot, by walking time."""
 
     def __init__(self) -> None:
         self._plan = FloorPlan.build()
@@ -83,7 +83,7 @@ class Patrolled:
 
 
 class StoreOutage:
-    """Takes the S3 server away for a while, on a thread of its own: stopping and starting a server takes a second."""
+    """Stops the S3 server for a while, on a separate thread: stopping and starting a server takes a second."""
 
     def __init__(self, tower: Tower, begin_s: float, length_s: float) -> None:
         self._tower = tower
@@ -92,7 +92,7 @@ class StoreOutage:
         self._pool = ThreadPoolExecutor(1, 'outage')
         self._step: Future[None] | None = None
         self.state = 'up'
-        self.away_s: float | None = None
+        self.down_s: float | None = None
         self.back_s: float | None = None
 
     def __enter__(self) -> Self:
@@ -102,7 +102,7 @@ class StoreOutage:
         self._pool.shutdown()
 
     def poll(self, t: float, *, is_last: bool = False) -> None:
-        """Do what is due; with ``is_last`` the server comes back at once. Raises ServerFailed when it does not."""
+        """Do what is due; with ``is_last`` the server is restarted immediately. Raises ServerFailed if that fails."""
         if self._step is not None:
             if not self._step.done():
                 return
@@ -113,31 +113,31 @@ class StoreOutage:
             else:
                 self.state, self.back_s = 'back', t
         if self.state == 'up' and self._length_s and t >= self._begin_s and not is_last:
-            self.state, self.away_s = 'going', t
+            self.state, self.down_s = 'going', t
             self._step = self._pool.submit(self._tower.stop_s3)
-        elif self.state == 'away' and self.away_s is not None and (t >= self.away_s + self._length_s or is_last):
+        elif self.state == 'away' and self.down_s is not None and (t >= self.down_s + self._length_s or is_last):
             self.state = 'coming'
             self._step = self._pool.submit(self._tower.start_s3)
 
     @property
     def span(self) -> tuple[float, float] | None:
-        return (self.away_s, self.back_s) if self.away_s is not None and self.back_s is not None else None
+        return (self.down_s, self.back_s) if self.down_s is not None and self.back_s is not None else None
 
 
 Show = Callable[[SpoolReading], None]
 
 
 def patrol(folder: Path, node: Child, outage: StoreOutage, environ: Mapping[str, str], duration_s: float, show: Show) -> Record:
-    """Let the robot walk and the node log; returns when everything is delivered, or the time for that is over."""
+    """Let the robot walk and the node log; returns when everything is delivered, or the time is over."""
     arguments = ['--ros-args', '-p', f'duration_s:={duration_s}']
     with Child('shadowhound_sim.sim_go2_node', arguments, environ, folder / 'sim.log') as sim:
         readings = list(_follow(folder / 'home' / 'spool', (node, sim), outage, show))
         try:
             published = json.loads(sim.output.splitlines()[-1])['published']
         except (IndexError, ValueError, KeyError):
-            raise sim.failed('did not say what it published') from None
+            raise sim.failed('did not report what it published') from None
     if not readings:
-        raise node.failed('heard nothing of the simulated robot')
+        raise node.failed('received nothing from the simulated robot')
     return Record(published, tuple(readings), outage.span)
 
 
@@ -152,7 +152,7 @@ def _follow(spool: Path, processes: tuple[Child, Child], outage: StoreOutage, sh
         for process in processes:
             process.check()
         if not node.is_running:
-            raise node.failed('ended too early')
+            raise node.failed('exited too early')
         now = time.monotonic()
         if not sim.is_running and stopped_s is None:
             stopped_s = now

@@ -1,7 +1,7 @@
 """The building that the simulated Go2 patrols: rooms, and everything solid in them as axis-aligned boxes.
 
-Lengths are meters. The constants stand in the building's own frame (corner of the outer wall at 0, 0; x east, y north);
-``FloorPlan.build()`` gives all of it in the robot's frame ``odom``, whose origin is the charging dock.
+Lengths are meters. The constants are in the building's frame (corner of the outer wall at 0, 0; x east, y north);
+``FloorPlan.build()`` converts everything to the robot's frame ``odom``, whose origin is the charging dock.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ DOOR_HEIGHT: Final = 2.05
 WALL: Final = 0.06
 """Half the thickness of a wall."""
 ORIGIN: Final = (2.0, 1.7)
-"""Where the robot gets up from its dock; the origin of ``odom``."""
+"""Position of the dock; the origin of ``odom``."""
 
 
 class Room(NamedTuple):
-    """One rectangular room, named as the camera's caption names it."""
+    """One rectangular room with its name in the camera's caption."""
 
     name: str
     x0: float
@@ -46,10 +46,10 @@ PATROL: Final = (
     (1.4, 1.7), (4.6, 1.7), (6.6, 1.1), (10.4, 1.1), (10.4, 4.1), (7.2, 4.1),
     (7.2, 5.5), (10.9, 5.5), (10.9, 7.3), (6.9, 7.3), (6.9, 6.4), (1.4, 6.4),
 )  # fmt: skip
-"""Corners of the closed patrol; it leads through every room and through every door once."""
+"""Corners of the closed patrol; it visits every room and passes every door once."""
 
 _Wall = tuple[float, float, float, tuple[float, ...]]
-# Walls along x: (y, x from, x to, door centres); walls along y: (x, y from, y to, door centres).
+# Walls along x: (y, x from, x to, door centers); walls along y: (x, y from, y to, door centers).
 _WALLS_X: Final[tuple[_Wall, ...]] = (
     (0.0, 0.0, WIDTH, ()),
     (3.4, 0.0, WIDTH, (1.4, 10.4)),
@@ -66,7 +66,7 @@ _WALLS_Y: Final[tuple[_Wall, ...]] = (
 
 
 class Box(NamedTuple):
-    """A solid from (x0, y0, z0) to (x1, y1, z1); ``material`` names its look and how well it reflects."""
+    """A solid from (x0, y0, z0) to (x1, y1, z1); ``material`` determines its look and its reflectivity."""
 
     x0: float
     x1: float
@@ -81,7 +81,7 @@ REFLECTIVITY: Final[dict[str, float]] = {
     'wall': 0.75, 'frame': 0.85, 'wood': 0.55, 'steel': 0.9, 'dark': 0.12, 'screen': 0.08, 'books': 0.5, 'plant': 0.35,
     'board': 0.95, 'orange': 0.8, 'crate': 0.5, 'red': 0.6, 'white': 0.9, 'blue': 0.4, 'counter': 0.7,
 }  # fmt: skip
-"""Share of the laser's light that comes back at normal incidence; its keys are all the materials there are."""
+"""Share of the laser's light that is reflected at normal incidence; its keys are all materials."""
 
 FURNITURE: Final = (
     # dock: the charging pad, shelves, crates
@@ -134,7 +134,7 @@ class FloorPlan:
     bounds: NDArray[np.float32]
     """(6, n): x0, x1, y0, y1, z0, z1 of each box."""
     is_full: NDArray[np.bool_]
-    """(n,): whether the box reaches from floor to ceiling, so that nothing is seen behind it."""
+    """(n,): whether the box reaches from floor to ceiling, and so hides everything behind it."""
 
     @classmethod
     def build(cls) -> FloorPlan:
@@ -157,7 +157,7 @@ class FloorPlan:
         return -ORIGIN[0], -ORIGIN[1]
 
     def room_at(self, x: float, y: float) -> str:
-        """The name of the room around a point, ``outside`` where there is none."""
+        """The name of the room at a point, ``outside`` if there is none."""
         for room in self.rooms:
             if room.x0 <= x < room.x1 and room.y0 <= y < room.y1:
                 return room.name
@@ -165,7 +165,7 @@ class FloorPlan:
 
 
 def _walls() -> list[Box]:
-    """Every wall, cut open at its doors, with lintels and door frames."""
+    """Every wall, split at its doors, with lintels and door frames."""
     boxes: list[Box] = []
     for y, start, end, doors in _WALLS_X:
         for low, high, z0, z1, half, material in _along(start, end, doors):
@@ -196,18 +196,18 @@ def _along(start: float, end: float, doors: tuple[float, ...]) -> list[tuple[flo
 
 
 class Crossings(NamedTuple):
-    """For n boxes and m rays, each array is (n, m); distances count in lengths of the ray's direction vector."""
+    """For n boxes and m rays, each array is (n, m); distances are in lengths of the ray's direction vector."""
 
     near: NDArray[np.float32]
-    """Where the ray enters; infinite where it misses the box or starts behind its front."""
+    """Where the ray enters; infinite if it misses the box or starts behind its front."""
     far: NDArray[np.float32]
-    """Where the ray leaves; of no meaning where it misses."""
+    """Where the ray leaves; meaningless if it misses."""
     through_x: NDArray[np.bool_]
     """Whether it enters through a face that is perpendicular to x."""
 
 
 def cross(bounds: NDArray[np.float32], x: float, y: float, dx: NDArray[Any], dy: NDArray[Any]) -> Crossings:
-    """The slab test of rays from (x, y) along (dx, dy), each (m,), with boxes ``bounds`` (x0, x1, y0, y1, ...; n)."""
+    """Slab test of rays from (x, y) along (dx, dy), each (m,), with boxes ``bounds`` (x0, x1, y0, y1, ...; n)."""
     tiny = np.float32(1e-9)
     by_x = np.float32(1.0) / np.where(np.abs(dx) < tiny, tiny, dx).astype(np.float32)
     by_y = np.float32(1.0) / np.where(np.abs(dy) < tiny, tiny, dy).astype(np.float32)

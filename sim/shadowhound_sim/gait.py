@@ -9,10 +9,10 @@ import math
 from typing import Final, NamedTuple
 
 STRIDE_HZ: Final = 2.0
-"""Strides a second; the body bobs at twice that, once for each pair of legs."""
+"""Strides per second; the body bobs at twice that, once for each pair of legs."""
 LEGS: Final = ('FR', 'FL', 'RR', 'RL')
 PHASE: Final = (0.0, 0.5, 0.5, 0.0)
-"""Share of the stride by which each leg is ahead."""
+"""Phase of each leg as a share of the stride."""
 HIP: Final = 0.0955
 THIGH: Final = 0.213
 CALF: Final = 0.213
@@ -34,7 +34,7 @@ _PITCH: Final = 0.009
 
 
 class Sway(NamedTuple):
-    """What the trot does to the body: angles in rad, height in m, and their derivatives by time."""
+    """The effect of the trot on the body: angles in rad, height in m, and their time derivatives."""
 
     roll: float
     pitch: float
@@ -57,7 +57,7 @@ class Leg(NamedTuple):
 
 
 def sway(t: float) -> Sway:
-    """The body's own movement at time ``t``."""
+    """The body's sway at time ``t``."""
     once, twice = _OMEGA * t, 2 * _OMEGA * t
     return Sway(
         roll=_ROLL * math.sin(once),

@@ -1,4 +1,4 @@
-"""A 5x7 pixel font, enough to burn a caption into a camera frame without a font library."""
+"""A 5x7 pixel font for captions in camera frames, without a font library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HEIGHT: Final = 7 * SCALE
 ADVANCE: Final = 6 * SCALE
 """Pixels from one character to the next."""
 
-# Each character is its five columns from left to right; in a column the lowest bit is the top row.
+# Each character is its five columns from left to right; the lowest bit of a column is the top row.
 _COLUMNS: Final = {
     ' ': '0000000000', '#': '147f147f14', '-': '0808080808', '.': '0060600000', ':': '0036360000', '/': '2010080402',
     '0': '3e5149453e', '1': '00427f4000', '2': '4261514946', '3': '2141454b31', '4': '1814127f10', '5': '2745454539',
@@ -27,14 +27,14 @@ _COLUMNS: Final = {
 
 @lru_cache(maxsize=64)
 def glyph(character: str) -> NDArray[np.bool_]:
-    """(HEIGHT, ADVANCE) mask of one character; one that the font lacks is blank."""
+    """(HEIGHT, ADVANCE) mask of one character; unknown ones are blank."""
     columns = np.frombuffer(bytes.fromhex(_COLUMNS.get(character.upper(), _COLUMNS[' '])), np.uint8)
     rows = (columns[None, :] >> np.arange(7)[:, None]) & 1
     return np.pad(np.kron(rows, np.ones((SCALE, SCALE))), ((0, 0), (0, SCALE))).astype(bool)
 
 
 def write(image: NDArray[np.uint8], text: str, left: int, top: int, color: tuple[int, int, int]) -> None:
-    """Burns one line of text into an (h, w, 3) image; what does not fit at the right is left out."""
+    """Draws one line of text into an (h, w, 3) image; text that does not fit is cut off."""
     room = (image.shape[1] - left) // ADVANCE
     shown = text[: max(room, 0)]
     if shown:

@@ -60,7 +60,7 @@ class StateSource:
 class LowStateSource:
     """``lowstate`` at the rate of the robot's low-frequency topic (``rt/lf/lowstate``), with the battery.
 
-    The driver does not publish it: it comes from the robot itself, to whoever is in its DDS network. There its type is
+    The robot itself publishes it, not the driver, to every participant in its DDS network. Its type there is
     ``unitree_go/msg/LowState``, which has the same fields.
     """
 
@@ -94,7 +94,7 @@ class LowStateSource:
 
 
 def go2_sources(world: World, *, lowstate: bool = True) -> list[SimulatedSensor]:
-    """The sensors that only a machine with go2_interfaces can publish."""
+    """The sensors that require go2_interfaces."""
     return [ImuSource(world), StateSource(world), *([LowStateSource(world)] if lowstate else [])]
 
 

@@ -1,4 +1,4 @@
-"""The simulated 4D lidar: every ray meets a wall, a thing, the floor or the ceiling of the building, noise included."""
+"""The simulated 4D lidar: every ray hits a wall, an object, the floor or the ceiling of the building, with noise."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from shadowhound_sim.world import BodyPose, World
 AZIMUTHS: Final = 800
 RINGS: Final = 25
 MOUNT: Final = (0.28, 0.05)
-"""How far ahead of and above the middle of the body the sensor sits, m."""
+"""Position of the sensor ahead of and above the center of the body, m."""
 RANGE_NOISE: Final = 0.006
 """Standard deviation of a range, m."""
 DROPPED: Final = 1.9
-"""A ray whose noise is above this many standard deviations comes back as nothing: 2.9% of them."""
+"""A ray whose noise is above this many standard deviations is lost: 2.9 % of them."""
 _STREAM: Final = 8
 _FLOOR, _CEILING_LIGHT = 0.35, 0.8
 
 
 class Lidar:
-    """Scans of one world; holds only what does not change from scan to scan."""
+    """Scans of one world; holds only what is constant across scans."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -35,7 +35,7 @@ class Lidar:
         self.partial = np.flatnonzero(~world.plan.is_full)
 
     def origin(self, pose: BodyPose) -> tuple[float, float, float]:
-        """Where the sensor is in ``odom``."""
+        """Position of the sensor in ``odom``."""
         return pose.x + MOUNT[0] * math.cos(pose.yaw), pose.y + MOUNT[0] * math.sin(pose.yaw), pose.z + MOUNT[1]
 
     def scan(self, t: float) -> NDArray[np.float32]:

@@ -1,8 +1,9 @@
 """The messages of the real Go2 driver, filled from the simulated world.
 
-Types, frames, orders and quality of service are those of go2_ros2_sdk's ``go2_driver_node.py`` and ``ros2_publisher.py``;
-``camera/compressed`` is what ``image_transport republish`` makes of its images. Every message object is made once and
-filled again and again: what ``fill`` returned is valid until the next ``fill``.
+Types, frames, order and QoS are those of go2_ros2_sdk's ``go2_driver_node.py`` and ``ros2_publisher.py``; ``camera/compressed``
+is
+what ``image_transport republish`` makes of its images. Every message object is created once and reused: the result of ``fill`` is
+valid until the next ``fill``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from shadowhound_sim.world import World
 
 JPEG_QUALITY: Final = 80
 BASE_HEIGHT: Final = 0.07
-"""What the driver adds to the height of the body in ``odom``, m."""
+"""The driver's offset to the height of the body in ``odom``, m."""
 DRIVER_ORDER: Final = (1, 0, 3, 2)
 """The driver publishes joints as FL, FR, RL, RR; the robot itself counts FR, FL, RR, RL."""
 
@@ -40,7 +41,7 @@ class SimulatedTopic(NamedTuple):
 
 
 class SimulatedSensor(Protocol):
-    """One sensor: what it publishes, how often, and how its messages are made."""
+    """One sensor: its topics, its rate, and its messages."""
 
     @property
     def rate_hz(self) -> float: ...
@@ -49,7 +50,7 @@ class SimulatedSensor(Protocol):
     def topics(self) -> tuple[SimulatedTopic, ...]: ...
 
     def fill(self, t: float, stamp_ns: int, /) -> Iterator[Any]:
-        """One message for each of ``topics``, in their order: the world ``t`` seconds after the start."""
+        """One message for each of ``topics``, in order: the world ``t`` seconds after the start."""
 
 
 class CameraSource:
@@ -65,7 +66,7 @@ class CameraSource:
         self.topics: tuple[SimulatedTopic, ...] = (*raw, SimulatedTopic('camera/camera_info', CameraInfo, False, 1), *jpeg)
         self._image = Image(height=camera.HEIGHT, width=camera.WIDTH, encoding='bgr8', step=camera.WIDTH * 3)
         self._image.data = array('B', bytes(camera.WIDTH * camera.HEIGHT * 3))
-        # Drawn in place, into the array that the message holds: which may be a copy of the one it was given.
+        # Drawn in place, into the array in the message, which may be a copy of the original one.
         self._pixels = np.frombuffer(self._image.data, np.uint8).reshape(camera.HEIGHT, camera.WIDTH, 3)
         self._info = _camera_info()
         self._jpeg = CompressedImage(format='bgr8; jpeg compressed bgr8')
@@ -73,7 +74,7 @@ class CameraSource:
             message.header.frame_id = 'front_camera'
 
     def fill(self, t: float, stamp_ns: int) -> Iterator[Any]:
-        """The frame is drawn whenever somebody is to see it; its number and time are burnt in."""
+        """The frame is drawn if a topic needs it; its number and time are drawn into it."""
         caption = f'{iso(stamp_ns)[:-4]}Z #{self._frames:06d} {self._world.room(t)}'
         self._frames += 1
         for message in (self._image, self._info, self._jpeg):
@@ -113,7 +114,7 @@ class CloudSource:
 
 
 class OdometrySource:
-    """``odom``: a pose without a twist, as the driver has it."""
+    """``odom``: a pose without a twist, as from the driver."""
 
     rate_hz = 50.0
     topics = (SimulatedTopic('odom', Odometry),)
@@ -132,7 +133,7 @@ class OdometrySource:
 
 
 class JointSource:
-    """``joint_states``: twelve positions; the driver knows no velocities or efforts."""
+    """``joint_states``: twelve positions; the driver has no velocities or efforts."""
 
     rate_hz = 50.0
     topics = (SimulatedTopic('joint_states', JointState),)
@@ -150,7 +151,7 @@ class JointSource:
 
 
 def sources(world: World, *, image_raw: bool, compressed: bool) -> list[SimulatedSensor]:
-    """The sensors whose messages every ROS 2 machine has."""
+    """The sensors with standard ROS 2 message types."""
     return [
         OdometrySource(world),
         JointSource(world),

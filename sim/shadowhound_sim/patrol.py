@@ -1,4 +1,4 @@
-"""The way the simulated Go2 walks: a closed polyline with rounded corners at constant speed, exact at any time."""
+"""The path of the simulated Go2: a closed polyline with rounded corners at constant speed, exact at any time."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SPEED: Final = 0.6
 RADIUS: Final = 0.4
 """Radius of the rounded corners, m."""
 COMMAND_S: Final = 0.5
-"""How long a robot obeys the last command that it got."""
+"""How long the last command applies."""
 DRIVEN_SPEED, DRIVEN_TURN = 2.0, 3.0
-"""Most that it can do, m/s and rad/s."""
+"""Maximum velocities, m/s and rad/s."""
 
 
 class Motion(NamedTuple):
-    """Where the body is in ``odom`` and how it moves; SI units, angles in radians, yaw within (-pi, pi]."""
+    """Position of the body in ``odom`` and its velocity; SI units, angles in radians, yaw within (-pi, pi]."""
 
     x: float
     y: float
@@ -30,7 +30,7 @@ class Motion(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """A straight (curvature 0) or an arc, from where it starts and heading where it starts."""
+    """A straight (curvature 0) or an arc, with its start and initial heading."""
 
     x: float
     y: float
@@ -41,18 +41,18 @@ class _Piece(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Patrol:
-    """A closed path, walked forever; ``at`` depends on nothing but the time."""
+    """A closed path, walked forever; ``at`` depends only on the time."""
 
     pieces: tuple[_Piece, ...]
     starts: tuple[float, ...]
-    """Arc length at which each piece begins."""
+    """Arc length at the start of each piece."""
     length: float
     offset: float
     """Arc length at time 0."""
 
     @classmethod
     def through(cls, corners: Sequence[tuple[float, float]], radius: float = RADIUS) -> Patrol:
-        """The path around ``corners`` that is nearest to the origin at time 0; raises ValueError where a side is too short."""
+        """The path around ``corners`` that is nearest to the origin at time 0; raises ValueError if a side is too short."""
         n = len(corners)
         turns = [_turn(corners[i - 1], corners[i], corners[(i + 1) % n]) for i in range(n)]
         pieces: list[_Piece] = []
@@ -95,9 +95,9 @@ class Patrol:
 
 
 class Driven:
-    """A body that does as it is told: it keeps the velocity of the last command for half a second, then it stands.
+    """A body that follows commands: it keeps the velocity of the last command for half a second, then it stands.
 
-    Times are seconds since the start, and do not go back: an earlier one is answered as the latest. Owned by one thread.
+    Times are seconds since the start, and must not decrease: an earlier one is treated as the latest. Owned by one thread.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class Driven:
         self._until = 0.0
 
     def command(self, t: float, forward: float, left: float, yaw_rate: float) -> None:
-        """Velocities in the frame of the body (REP-103), m/s and rad/s, beyond what a Go2 can do cut to that."""
+        """Velocities in the frame of the body (REP-103), m/s and rad/s, clipped to what a Go2 can do."""
         self._move(t)
         top = (DRIVEN_SPEED, DRIVEN_SPEED, DRIVEN_TURN)
         self._command = tuple(  # type: ignore[assignment]
@@ -124,7 +124,7 @@ class Driven:
         return Motion(self._x, self._y, wrapped(self._yaw), forward * cos - left * sin, forward * sin + left * cos, yaw_rate)
 
     def _move(self, t: float) -> None:
-        """On the arc of the command, exactly, until it ends."""
+        """Move along the arc of the command until it ends."""
         seconds = max(min(t, self._until) - self._t, 0.0)
         forward, left, yaw_rate = self._command
         turned = yaw_rate * seconds

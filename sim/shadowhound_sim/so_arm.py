@@ -1,7 +1,7 @@
-"""A simulated SO-ARM100 on the robot's back: what its joints do, and a machine of its own whose clock is off and drifts.
+"""A simulated SO-ARM100 on the robot's back: its joints, and a separate machine whose clock is off and drifts.
 
-``python -m shadowhound_sim.so_arm`` publishes it beside the simulated Go2 (docs/datasets.md): ``/soarm/joint_states``
-and ``/soarm/joint_commands`` by the arm's clock, and ``/soarm/clock``, an event of which both told the time, once a second.
+``python -m shadowhound_sim.so_arm`` publishes it next to the simulated Go2 (docs/datasets.md): ``/soarm/joint_states`` and
+``/soarm/joint_commands`` by the arm's clock, and once per second ``/soarm/clock``, an event timed by both clocks.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ JOINTS: Final = ('shoulder_pan', 'shoulder_lift', 'elbow_flex', 'wrist_flex', 'w
 RATE_HZ: Final = 50.0
 CLOCK_HZ: Final = 1.0
 JITTER_NS: Final = 200_000
-"""Of what the robot tells of such an event: 0.2 ms."""
+"""Jitter of the robot's time of such an event: 0.2 ms."""
 LAG_S: Final = 0.06
-"""The joints follow what they are told by so much."""
+"""Delay of the joints behind their commands."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArmClock:
-    """How the arm's clock runs: ``offset_ns`` ahead of the robot's at ``at_ns``, and ``drift`` faster (1e-6: a ppm)."""
+    """The arm's clock: ``offset_ns`` ahead of the robot's at ``at_ns``, and ``drift`` faster (1e-6: a ppm)."""
 
     at_ns: int
     offset_ns: int = 37_000_000
@@ -45,20 +45,20 @@ class ArmClock:
 
 
 def commanded(robot_ns: int) -> list[float]:
-    """Where the joints are told to be, rad; the gripper 0 to 1."""
+    """The commanded joint positions, rad; the gripper 0 to 1."""
     t = robot_ns % (3600 * SECOND) / SECOND
     return [0.6 * math.sin(0.5 * t + number) * (1.0 - 0.1 * number) for number in range(5)] + [0.5 + 0.5 * math.sin(0.8 * t)]
 
 
 def positions(robot_ns: int) -> list[float]:
-    """Where they are."""
+    """The actual positions."""
     return commanded(robot_ns - round(LAG_S * SECOND))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Publish until SIGINT, or for so long."""
+    """Publish until SIGINT, or for a duration."""
     parser = argparse.ArgumentParser(prog='so_arm', description=__doc__.partition('\n')[0])
-    parser.add_argument('--duration', type=float, default=0.0, metavar='S', help='seconds (default: for ever)')
+    parser.add_argument('--duration', type=float, default=0.0, metavar='S', help='seconds (default: until interrupted)')
     parser.add_argument('--offset-ms', type=float, default=37.0, help="how far the arm's clock is ahead (default 37)")
     parser.add_argument('--drift-ppm', type=float, default=20.0, help='and how much faster it runs (default 20)')
     options = parser.parse_args(arguments)

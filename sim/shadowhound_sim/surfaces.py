@@ -1,7 +1,7 @@
-"""How the building looks: pictures of floors, ceilings, walls and furniture, and the atlas that the camera looks them up in.
+"""The look of the building: textures of floors, ceilings, walls and furniture, and the camera's atlas of them.
 
-The pictures are drawn with numpy, float RGB from 0 to 255. The atlas is flat and of packed BGR pixels, with a copy of every
-picture for each level of shade: the camera turns every pixel into one index into it, and colors nothing after that.
+The textures are drawn with numpy, float RGB from 0 to 255. The atlas is a flat array of packed BGR pixels, with a copy of every
+texture for each shade level: the camera only computes one index per pixel.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ LEVELS: Final = 14
 DIMMING: Final = 0.043
 """How much darker each level of shade is."""
 WALL_SCALE: Final = 80.0
-"""Pixels a meter on walls."""
+"""Pixels per meter on walls."""
 WALL_ROWS: Final = round(CEILING * WALL_SCALE)
 WALL_COLUMNS: Final = 320
-"""A wall's picture repeats after this many pixels: 4 m."""
+"""A wall's texture repeats after this many pixels: 4 m."""
 MAP_SCALE: Final = 62.5
-"""Pixels a meter on floor and ceiling."""
+"""Pixels per meter on floor and ceiling."""
 MAP_ROWS: Final = round(DEPTH * MAP_SCALE)
 MAP_COLUMNS: Final = round(WIDTH * MAP_SCALE)
 FACE: Final = 64
-"""Pixels along each side of the picture of a material, which is stretched over the face of its box."""
+"""Pixels along each side of a material's texture, which is stretched over the face of its box."""
 
 
 def _grain(shape: tuple[int, ...], strength: float, seed: int) -> Picture:
@@ -62,7 +62,7 @@ def _grain(shape: tuple[int, ...], strength: float, seed: int) -> Picture:
 
 
 def floor_map(shape: tuple[int, int], scale: float) -> Picture:
-    """The floor of the whole building seen from above: row 0 is south, column 0 west; darker beside walls and furniture."""
+    """The floor of the complete building seen from above: row 0 is south, column 0 west; darker near walls and furniture."""
     image = np.zeros((*shape, 3), np.float32)
     y, x = np.indices(shape, np.float32) / np.float32(scale)
     for room in ROOMS:
@@ -102,7 +102,7 @@ def _floor_marks(image: Picture, x: Picture, y: Picture) -> None:
 
 
 def _contact_shadow(shape: tuple[int, int], scale: float) -> Picture:
-    """(rows, columns, 1): 1 in the open, down to about 0.6 beside walls and what stands on the floor."""
+    """(rows, columns, 1): 1 in the open, down to about 0.6 near walls and objects on the floor."""
     solid = np.zeros(shape, np.float32)
     for room in ROOMS:
         x0, x1, y0, y1 = (round(v * scale) for v in (room.x0, room.x1, room.y0, room.y1))
@@ -155,7 +155,7 @@ def wall(name: str, shape: tuple[int, int], scale: float) -> Picture:
 
 
 def _ornament(name: str, image: Picture, z: Picture, u: Picture, accent: Color) -> None:
-    """What hangs on, or is painted on, the walls of each room."""
+    """Decorations on the walls of each room."""
     if name == 'kitchen':
         image[(z < 0.95) & ((z % 0.15 < 0.012) | (u % 0.15 < 0.012))] = (196, 196, 188)
         _frame(image, z, u, (2.0, 1.55, 0.5, 0.32), accent, ((250, 250, 240), (120, 170, 90)))
@@ -249,7 +249,7 @@ def material(name: str, size: int) -> Picture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas:
-    """All pixels, and where each surface begins: ``base + level * size of one picture``."""
+    """All pixels, and the start of each surface: ``base + level * size of one texture``."""
 
     pixels: NDArray[np.uint32]
     floor: int
@@ -278,7 +278,7 @@ class Atlas:
 
 
 def _shaded(picture: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """(LEVELS, rows, columns) packed pixels of an (rows, columns, 3) picture in RGB from 0 to 255."""
+    """(LEVELS, rows, columns) packed pixels of an (rows, columns, 3) texture in RGB from 0 to 255."""
     packed = np.empty((LEVELS, *picture.shape[:2]), np.uint32)
     for level in range(LEVELS):
         rgb = np.clip(picture * np.float32(1.0 - DIMMING * level), 0, 255).astype(np.uint32)

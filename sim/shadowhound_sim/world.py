@@ -1,8 +1,8 @@
-"""The simulated Go2 in its building: what its sensors would read at any time, pure and deterministic.
+"""The simulated Go2 in its building: its sensor readings at any time, pure and deterministic.
 
-On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A robot that is driven also depends on the
-commands it got. ``t`` is in seconds since the start, units are SI, and all sensors derive from the one motion, so that they
-agree with each other.
+On its patrol everything is a function of (seed, t): no clock, no state, no ROS. A driven robot also depends on its commands.
+``t``
+is in seconds since the start, units are SI, and all sensors derive from one motion, so that they agree.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from shadowhound_sim.patrol import SPEED, Driven, Motion, Patrol
 
 GRAVITY: Final = 9.81
 DISCHARGE_S: Final = 5.0
-"""Seconds for one percent of the battery: some sixty times faster than real, so that a short run shows it."""
+"""Seconds per percent of the battery: some sixty times faster than real, so that a short run shows it."""
 EMPTY: Final = 8
-"""State of charge (percent) below which it does not fall."""
+"""Minimum state of charge (percent)."""
 RANGE_LIMIT: Final = 6.0
 _IMU, _FOOT, _POWER = range(3)
 _NORMALS: Final = 1 << 16
 
 
 class Noise:
-    """Noise that depends on seed, stream and time alone: the same run can be made again, sample by sample.
+    """Noise that depends only on seed, stream and time: a run can be reproduced sample by sample.
 
-    It is a table of standard normal numbers, read from a place that each (stream, time) owns.
+    A table of standard normal numbers, read at an index derived from (stream, time).
     """
 
     def __init__(self, seed: int) -> None:
@@ -72,7 +72,7 @@ class Imu(NamedTuple):
 
 
 class Power(NamedTuple):
-    """The battery and what is warm: percent, V, mA (negative: it discharges), mV a cell, degrees Celsius."""
+    """Battery and temperatures: percent, V, mA (negative: discharging), mV per cell, degrees Celsius."""
 
     soc: int
     voltage: float
@@ -90,11 +90,11 @@ class World:
     path: Patrol | Driven
     noise: Noise
     solid: NDArray[np.float32]
-    """Bounds of the boxes that stand at the height of the body."""
+    """Bounds of the boxes at the height of the body."""
 
     @classmethod
     def of(cls, seed: int, driven: Driven | None = None) -> World:
-        """On its patrol, or wherever it is driven."""
+        """On its patrol, or driven."""
         plan = FloorPlan.build()
         bounds = plan.bounds
         solid = bounds[:, (bounds[4] < gait.STANCE_HEIGHT) & (bounds[5] > gait.STANCE_HEIGHT)].copy()
@@ -116,7 +116,7 @@ class World:
         return BodyPose(motion.x, motion.y, sway.height, sway.roll, sway.pitch, motion.yaw, quaternion)
 
     def imu(self, t: float) -> Imu:
-        """What the IMU in the body reads; specific force, so that a robot at rest reads +9.81 upwards."""
+        """The IMU's reading; specific force, so that a robot at rest reads +9.81 upwards."""
         motion, sway = self.path.at(t), gait.sway(t)
         noise = self.noise.at(_IMU, t, 6)
         sin_r, cos_r = math.sin(sway.roll), math.cos(sway.roll)
@@ -168,7 +168,7 @@ class World:
 
 
 def _warmth(t: float, cold: float, warm: float) -> int:
-    """A temperature on its way from ``cold`` to ``warm``, 40 seconds to the most of it."""
+    """A temperature rising from ``cold`` to ``warm``, most of it within 40 seconds."""
     return round(warm + (cold - warm) * math.exp(-t / 40.0))
 
 

@@ -122,7 +122,7 @@ def test_a_mission_that_no_worker_survives_is_named(house: House, wanted: dict[s
     process = start(house.folder, '--to', 'dying', *ON_RAY)
     assert kill_builders(process, 100) >= 9
     _, said = finished(process, 1)
-    assert all(f'm{number}: its worker died' in said for number in range(3))
+    assert all(f'm{number}: its worker was killed' in said for number in range(3))
     assert not (house.folder / 'dying' / INFO).exists()
     finished(start(house.folder, '--to', 'dying', *ON_RAY))
     assert contents(house.folder / 'dying') == wanted

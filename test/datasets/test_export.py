@@ -77,7 +77,7 @@ def test_a_mission_is_an_episode_once_it_is_known_what_is_missing(exported: Expo
     """The one of which the robot has not told all waits, and says for what."""
     assert [each['mission_id'] for each in exported.added] == ['whole', 'gappy']
     assert list(exported.waiting) == ['fresh']
-    assert '3.0 s before its end what is missing' in exported.waiting['fresh']
+    assert '3.0 s before its end so far' in exported.waiting['fresh']
     assert (exported.fps, exported.action, exported.refused) == (10, 'odometry', {})
 
 
@@ -212,7 +212,7 @@ def test_what_the_robot_cannot_tell_is_not_waited_for(tmp_path: Path) -> None:
     place.record(Mission('blind', seconds=2, sensors=('camera', 'odom'), uncounted=('odom',)))
     found = export(tmp_path / 'set', place.source, PATROLS, ExportOptions(), wait=True, sleep=pytest.fail)
     assert found.waiting == {}
-    assert found.refused['blind'].startswith('of /odom the robot can say nothing what is missing')
+    assert found.refused['blind'].startswith('the gaps of /odom are reported for no part of it')
     found = export(tmp_path / 'set', place.source, PATROLS, ExportOptions(allow_gaps=True))
     assert [each['mission_id'] for each in found.added] == ['blind']
 
@@ -313,7 +313,7 @@ def test_by_received_frames_have_what_had_arrived(tmp_path: Path, *, archives: b
         assert row['received_ns'] - row['stamp_ns'] == late_ns
         assert row['received_ns'] == pytest.approx(ticks[row['frame']] - row['held_s'] * SECOND, abs=1000)
     assert verify(tmp_path / 'set', DirectoryStore(house.settings.directory), frames=None).wrong == []
-    with pytest.raises(LakeError, match='was started with by received'):
+    with pytest.raises(LakeError, match='was created with by received'):
         export(tmp_path / 'set', house.source, {'mission_type': 'patrol'}, ExportOptions())
 
 
@@ -411,8 +411,8 @@ def test_what_was_changed_is_found(house: House, tmp_path: Path) -> None:
     data = tmp_path / 'set/data/chunk-000/file-000.parquet'
     data.write_bytes(data.read_bytes() + b' ')
     wrong = verify(tmp_path / 'set', store, is_read=True).wrong
-    assert any('data/chunk-000/file-000.parquet is not what was written' in each for each in wrong)
-    assert any(picture.name in each and 'not what it was' in each for each in wrong)
+    assert any('data/chunk-000/file-000.parquet differs from what was written' in each for each in wrong)
+    assert any(picture.name in each and 'has changed' in each for each in wrong)
 
 
 def test_another_mission_rewrites_nothing_before_it(house: House, tmp_path: Path) -> None:
@@ -502,15 +502,15 @@ def test_commands_are_the_action_where_they_were_logged(tmp_path: Path) -> None:
     assert action[:, 0] == pytest.approx([x_of(int(stamp)) for stamp in newest], abs=1e-4)
     assert made.info is not None
     assert made.info['features']['action']['info'] == {'units': ['m/s', 'm/s', 'rad/s'], 'source': 'cmd_vel', 'derived': False}
-    assert found.refused == {'silent': 'the store has nothing of cmd_vel in it'}
+    assert found.refused == {'silent': 'the store has no data of cmd_vel in it'}
 
 
 def test_other_settings_are_another_data_set(house: House, exported: Exported, tmp_path: Path) -> None:
-    """What it was started with holds for all of it; what no source has is refused, and what is there is told."""
-    with pytest.raises(LakeError, match='was started with codec av1'):
+    """What it was created with holds for all of it; what no source has is refused, and what is there is told."""
+    with pytest.raises(LakeError, match='was created with codec av1'):
         export(exported.folder, house.source, PATROLS, ExportOptions(state=('pose', 'imu', 'joints'), codec='h264'))
     found = export(tmp_path / 'set', house.source, {'mission': 'whole'}, ExportOptions(fps=30))
-    assert found.refused == {'whole': '/camera has 10 Hz in the objects, less than 30 frames a second'}
+    assert found.refused == {'whole': '/camera has 10 Hz in the objects, less than 30 frames per second'}
     with pytest.raises(SettingError, match='state = '):
         ExportOptions(state=('mood',))
 
@@ -617,6 +617,6 @@ def test_an_address_where_nothing_answers_is_told_at_once(tmp_path: Path) -> Non
 
 def test_a_worker_with_other_libraries_is_refused(tmp_path: Path) -> None:
     """Its episodes would have other bytes; the error names what differs, and where."""
-    wanted = {**cluster.made_with(), 'av': '1.0', 'architecture': 'riscv64'}
+    wanted = {**cluster.library_versions(), 'av': '1.0', 'architecture': 'riscv64'}
     with pytest.raises(LakeError, match=rf'has architecture {platform.machine()} instead of riscv64, av .* instead of 1\.0'):
         cluster.Builder().build((), wanted)  # type: ignore[arg-type]

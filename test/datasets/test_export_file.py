@@ -135,7 +135,7 @@ def test_the_file_of_a_dataset_is_in_it(tmp_path: Path) -> None:
     assert exported(house, EXAMPLES / 'export_base.yaml').mission_ids == ['m1'], 'nothing is added again'
     other = tmp_path / 'other.yaml'
     other.write_text((EXAMPLES / 'export_base.yaml').read_text().replace('[linear.x, angular.z]', '[linear.x, linear.y]'))
-    with pytest.raises(LakeError, match='was started with action_from'):
+    with pytest.raises(LakeError, match='was created with action_from'):
         exported(house, other)
 
 
@@ -158,7 +158,7 @@ WRONG: Final = {
     'max_gap_s: soon': 'max_gap_s is not float',
     'state: [mood]': 'state',
     'state: [pose, pose]': 'one or more different',
-    'state: [{topic: odom, fields: [x]}]': 'a topic begins with a slash',
+    'state: [{topic: odom, fields: [x]}]': 'a topic starts with a slash',
     'state: [{topic: /odom, field: [x]}]': "there is no key 'field' of state: is it fields?",
     'action: 3': 'is not a mapping',
     'images: {}': 'images',

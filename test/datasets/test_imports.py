@@ -23,7 +23,7 @@ from shadowhound_data_logger.core.config import UploadSettings
 from shadowhound_data_logger.core.errors import LakeError, SettingError
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import ExportOptions
-from shadowhound_data_logger.datasets.imports import Imported, identity_of, import_episodes, of_hdf5, of_lerobot, times_of
+from shadowhound_data_logger.datasets.imports import Imported, identity_of, import_episodes, read_hdf5, read_lerobot, read_times
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.stores import open_store
@@ -112,8 +112,8 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
     """As it is, joints in degrees: stored once, in the catalogue, and each value traced to the object and the file."""
     arm, source = f'arm{version[1]}', lerobot_set(tmp_path / 'theirs', version)
     store = open_store(house.settings, UploadSettings())
-    assert import_episodes(of_lerobot(source, times_of(times), is_degrees=True), arm, store).objects == 4
-    again = import_episodes(of_lerobot(source, times_of(times), is_degrees=True), arm, store)
+    assert import_episodes(read_lerobot(source, read_times(times), is_degrees=True), arm, store).objects == 4
+    again = import_episodes(read_lerobot(source, read_times(times), is_degrees=True), arm, store)
     assert (again.objects, again.present) == (0, 4)
     made = exported(house, tmp_path / 'set', arm)
     assert_is_as_recorded(made)
@@ -127,7 +127,7 @@ def test_a_data_set_of_the_arm(house: House, tmp_path: Path, times: Path, versio
 def test_a_data_set_without_a_unit(house: House, tmp_path: Path, times: Path) -> None:
     """The numbers stay as they are, and no unit is claimed."""
     store = open_store(house.settings, UploadSettings())
-    import_episodes(of_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), times_of(times), is_degrees=False), 'bare', store)
+    import_episodes(read_lerobot(lerobot_set(tmp_path / 'theirs', 'v3.0'), read_times(times), is_degrees=False), 'bare', store)
     made = exported(house, tmp_path / 'set', 'bare')
     assert made.info is not None
     assert made.info['features']['observation.state']['info']['units'][:6] == ['as recorded'] * 6
@@ -145,29 +145,29 @@ def test_demonstrations_in_hdf5(house: House, tmp_path: Path, times: Path) -> No
             file['observations/qpos'] = positions(number).astype(np.float32)
             file['action'] = positions(number).astype(np.float32)
     store = open_store(house.settings, UploadSettings())
-    import_episodes(of_hdf5(paths, times_of(times), fps=FPS, joints=so_arm.JOINTS), 'aloha', store)
+    import_episodes(read_hdf5(paths, read_times(times), fps=FPS, joints=so_arm.JOINTS), 'aloha', store)
     assert_is_as_recorded(exported(house, tmp_path / 'set', 'aloha'))
     with pytest.raises(LakeError, match='has 6 joints, not 2'):
-        list(of_hdf5(paths, times_of(times), fps=FPS, joints=('a', 'b')))
+        list(read_hdf5(paths, read_times(times), fps=FPS, joints=('a', 'b')))
 
 
 def test_what_is_no_recording_is_refused(tmp_path: Path, times: Path) -> None:
     """With what is wrong and what to do; nobody guesses when an episode began."""
     with pytest.raises(LakeError, match='not a LeRobotDataset'):
-        list(of_lerobot(tmp_path, {}, is_degrees=False))
+        list(read_lerobot(tmp_path, {}, is_degrees=False))
     source = lerobot_set(tmp_path / 'theirs', 'v3.0')
     with pytest.raises(LakeError, match='the start time of episode 0'):
-        list(of_lerobot(source, {}, is_degrees=False))
+        list(read_lerobot(source, {}, is_degrees=False))
     (source / 'data/chunk-000/file-000.parquet').write_bytes(b'PAR1 and more')
     with pytest.raises(LakeError, match='is not a data file of a LeRobotDataset'):
-        list(of_lerobot(source, times_of(times), is_degrees=False))
+        list(read_lerobot(source, read_times(times), is_degrees=False))
     (tmp_path / 'odd.hdf5').write_bytes(b'\x89HDF\r\n\x1a\nand more')
     pytest.importorskip('h5py')
     with pytest.raises(LakeError, match='not a demonstration in the layout'):
-        list(of_hdf5([tmp_path / 'odd.hdf5'], times_of(times), fps=50))
+        list(read_hdf5([tmp_path / 'odd.hdf5'], read_times(times), fps=50))
     times.write_text('episode,begin_ns\n0,soon\n')
     with pytest.raises(SettingError, match='--times'):
-        times_of(times)
+        read_times(times)
 
 
 # -- again -----------------------------------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class Shelf:
     def bring(self, folder: Path, begins: Sequence[int] | None = None, *, is_degrees: bool = True) -> Imported:
         """``begins`` are the recordings with whose begins its episodes are imported."""
         times = {episode: begin_ns(number) for episode, number in enumerate(range(9) if begins is None else begins)}
-        return import_episodes(of_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
+        return import_episodes(read_lerobot(folder, times, is_degrees=is_degrees), 'arm', self.store)
 
     def contents(self) -> dict[str, bytes]:
         root = self.settings.directory / 'sensor-data/arm'
@@ -250,7 +250,7 @@ def test_an_episode_that_changed_is_refused(shelf: Shelf) -> None:
     assert counts(found) == (1, 1, 1, 0)
     ((name, why),) = found.refused.items()
     assert name == f'episode 1 ({iso(begin_ns(1))})'
-    assert why.startswith('it changed: the recording with this begin was imported as ')
+    assert why.startswith('it changed: the recording with this start time was imported as ')
     assert {key: body for key, body in shelf.contents().items() if key in before} == before
 
 
@@ -304,10 +304,10 @@ def test_two_recordings_of_one_time(shelf: Shelf, shift_s: float) -> None:
     shelf.bring(shelf.set(numbers=(0,)))
     other = shelf.set(numbers=(3, 4))
     times = {0: begin_ns(0) + round(shift_s * SECOND), 1: begin_ns(0) + 4 * SECOND}
-    found = import_episodes(of_lerobot(other, times, is_degrees=True), 'arm', shelf.store)
+    found = import_episodes(read_lerobot(other, times, is_degrees=True), 'arm', shelf.store)
     assert list(found.refused) == [f'episode 0 ({iso(times[0])})']
     assert found.episodes == 1
-    double = import_episodes(of_lerobot(other, {0: begin_ns(7), 1: begin_ns(7)}, is_degrees=True), 'other', shelf.store)
+    double = import_episodes(read_lerobot(other, {0: begin_ns(7), 1: begin_ns(7)}, is_degrees=True), 'other', shelf.store)
     assert counts(double) == (1, 0, 1, 0)
 
 

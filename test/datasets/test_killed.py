@@ -111,7 +111,7 @@ def test_a_worker_that_was_killed_is_told(house: House, tmp_path: Path) -> None:
     export(tmp_path / 'whole', house.source, PATROLS, ExportOptions())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr('shadowhound_data_logger.datasets.export.build', kill_this_process)
-        with pytest.raises(LakeError, match='a process was killed while episodes were made; m0 is not made'):
+        with pytest.raises(LakeError, match='a process was killed while building episodes; m0 is not finished'):
             export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)
     assert not (tmp_path / 'set' / INFO).exists()
     export(tmp_path / 'set', house.source, PATROLS, ExportOptions(), workers=2)

@@ -44,12 +44,12 @@ def exported(house: House, folder: Path, *missions: str, layout: str = SHARED, c
 def assert_same_frames(one: Lerobot, other: Lerobot) -> None:
     """Of each mission that the first one has, in sequence and out of it."""
     for row in one.rows:
-        mine = list(one.pictures(row, KEY))
+        mine = list(one.images(row, KEY))
         (theirs,) = [each for each in other.rows if each['shadowhound/mission_id'] == row['shadowhound/mission_id']]
-        wanted = list(other.pictures(theirs, KEY))
+        wanted = list(other.images(theirs, KEY))
         assert len(mine) == len(wanted) == row['length']
         assert all(np.array_equal(*pair) for pair in zip(mine, wanted, strict=True))
-        some = list(one.pictures_at(row, KEY, (1, 6, row['length'] - 1)))
+        some = list(one.images_at(row, KEY, (1, 6, row['length'] - 1)))
         assert all(np.array_equal(*pair) for pair in zip(some, (wanted[1], wanted[6], wanted[-1]), strict=True))
 
 
@@ -103,17 +103,17 @@ def test_an_episode_that_is_dropped(house: House, tmp_path: Path, plain: Lerobot
 
 def test_a_set_keeps_its_layout(house: House, tmp_path: Path) -> None:
     exported(house, tmp_path / 'set', 'm0')
-    with pytest.raises(LakeError, match='was started with layout shared'):
+    with pytest.raises(LakeError, match='was created with layout shared'):
         exported(house, tmp_path / 'set', 'm1', layout='episode')
     exported(house, tmp_path / 'own', 'm0', layout='episode')
-    with pytest.raises(LakeError, match='was started with layout episode'):
+    with pytest.raises(LakeError, match='was created with layout episode'):
         exported(house, tmp_path / 'own', 'm1')
 
 
 def test_a_setting_that_a_set_was_begun_without(house: House, tmp_path: Path) -> None:
     """One that is given later only differs as well as one that is given no more."""
     exported(house, tmp_path / 'set', 'm0')
-    with pytest.raises(LakeError, match='was started with labels none'):
+    with pytest.raises(LakeError, match='was created with labels none'):
         export(tmp_path / 'set', house.source, {'mission': 'm1'}, ExportOptions(layout=SHARED, labels=True))
 
 
@@ -135,7 +135,7 @@ def test_a_task_has_a_video_of_each_mission(house: House, tmp_path: Path, plain:
     for row in plain.rows:
         path = tmp_path / 'go2' / row['shadowhound/mission_id'] / 'camera_front.mp4'
         found = list(frames_of(Clip(path, 0, 100), 10))
-        assert all(np.array_equal(*pair) for pair in zip(found, plain.pictures(row, KEY), strict=True))
+        assert all(np.array_equal(*pair) for pair in zip(found, plain.images(row, KEY), strict=True))
 
 
 def test_pictures_that_are_kept_are_marked_as_such(house: House, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_a_set_that_was_killed_while_it_grew_goes_on(house: House, tmp_path: Pat
     for at in range(1, 100):
         folder = tmp_path / f'set{at}'
         before = exported(house, folder, 'm0', layout=layout)
-        frames = list(before.pictures(before.rows[0], KEY))
+        frames = list(before.images(before.rows[0], KEY))
         with pytest.MonkeyPatch.context() as patch:
             dying(patch, at)
             try:
@@ -184,7 +184,7 @@ def test_a_set_that_was_killed_while_it_grew_goes_on(house: House, tmp_path: Pat
             else:
                 break
         between = Lerobot(folder)
-        assert all(np.array_equal(*pair) for pair in zip(between.pictures(between.rows[0], KEY), frames, strict=True))
+        assert all(np.array_equal(*pair) for pair in zip(between.images(between.rows[0], KEY), frames, strict=True))
         exported(house, folder, 'm1', layout=layout)
         assert contents(folder) == wanted, at
     assert at > 10

@@ -17,7 +17,7 @@ from datasets.test_arm import record_arm
 from shadowhound_data_logger.core.clock import SECOND
 from shadowhound_data_logger.datasets.export import export
 from shadowhound_data_logger.datasets.features import SHARED, ExportOptions
-from shadowhound_data_logger.datasets.imports import Imported, import_episodes, of_lerobot
+from shadowhound_data_logger.datasets.imports import Imported, import_episodes, read_lerobot
 from shadowhound_data_logger.datasets.lerobot import Lerobot
 from shadowhound_data_logger.datasets.verify import verify
 from shadowhound_data_logger.lake import decode
@@ -214,7 +214,7 @@ def test_an_arms_set_that_lerobot_recorded_and_edited(tmp_path: Path) -> None:
 
     def brought(name: str, *recordings: int) -> tuple[Imported, tuple[int, int, int, int]]:
         times = {episode: begins[recording] for episode, recording in enumerate(recordings)}
-        found = import_episodes(of_lerobot(tmp_path / 'arm' / name, times, is_degrees=False), 'arm', store)
+        found = import_episodes(read_lerobot(tmp_path / 'arm' / name, times, is_degrees=False), 'arm', store)
         return found, (found.episodes, found.unchanged, len(found.refused), len(found.absent))
 
     assert brought('two', 0, 1)[1] == (2, 0, 0, 0)
@@ -227,4 +227,4 @@ def test_an_arms_set_that_lerobot_recorded_and_edited(tmp_path: Path) -> None:
     assert brought('merged', 1, 2, 0)[1] == (0, 3, 0, 0)
     assert brought('merged', 0, 1, 2)[1] == (0, 0, 3, 0)
     late = {0: begins[0] + SECOND // 2}
-    assert len(import_episodes(of_lerobot(tmp_path / 'arm/split/first', late, is_degrees=False), 'arm', store).refused) == 1
+    assert len(import_episodes(read_lerobot(tmp_path / 'arm/split/first', late, is_degrees=False), 'arm', store).refused) == 1

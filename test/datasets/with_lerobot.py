@@ -63,8 +63,8 @@ def load(out: str, folder: str) -> None:
     actions = [np.asarray(batch['action']) for batch in batches]
     kinds = {name: feature.type.value for name, feature in dataset_to_policy_features(plain.meta.features).items()}
     told = {name: np.array(values) for name, values in found.items() if name != CAMERA}
-    pictures = (np.array(found[CAMERA]) * 255).round().astype(np.uint8)
-    np.savez(out, pictures=pictures.transpose(0, 2, 3, 1), windows=np.concatenate(actions), episodes=plain.num_episodes,
+    images = (np.array(found[CAMERA]) * 255).round().astype(np.uint8)
+    np.savez(out, images=images.transpose(0, 2, 3, 1), windows=np.concatenate(actions), episodes=plain.num_episodes,
              kinds=np.array([f'{name}={kind}' for name, kind in kinds.items()]), **told)  # fmt: skip
 
 
@@ -157,15 +157,15 @@ def edited(out: str, folder: str) -> None:
 
 def difference(made: LeRobotDataset, before: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     """Of the frames with the same stamp: the largest of numbers, and of pictures the mean, 0 to 1."""
-    numbers, pictures, tasks = 0.0, 0.0, set()
+    numbers, images, tasks = 0.0, 0.0, set()
     for place in range(len(made)):
         item = made[place]
         was = before[int(item['shadowhound.stamp_ns'])]
         for key in ('observation.state', 'action', 'timestamp', 'shadowhound.age_s'):
             numbers = max(numbers, float(np.abs(np.asarray(item[key]) - np.asarray(was[key])).max()))
-        pictures = max(pictures, float(np.abs(np.asarray(item[CAMERA]) - np.asarray(was[CAMERA])).mean()))
+        images = max(images, float(np.abs(np.asarray(item[CAMERA]) - np.asarray(was[CAMERA])).mean()))
         tasks.add(item['task'])
-    return {'frames': len(made), 'episodes': made.num_episodes, 'numbers': numbers, 'pictures': pictures, 'tasks': sorted(tasks)}
+    return {'frames': len(made), 'episodes': made.num_episodes, 'numbers': numbers, 'pictures': images, 'tasks': sorted(tasks)}
 
 
 def view(out: str, folder: str) -> None:

@@ -42,7 +42,7 @@ def test_walls_stand_where_the_pinhole_puts_them(front: Camera) -> None:
     """The foot of the wall ahead is seen at horizon + focal length * camera height / depth, to the row."""
     checked = 0
     for t in np.arange(0.5, 59, 1.3):
-        view = front._look(front.world.pose(float(t)))
+        view = front._view(front.world.pose(float(t)))
         middle = camera.WIDTH // 2
         depth = float(view.wall[middle])
         nearer = view.hits.near[:, middle - 2 : middle + 2].min()

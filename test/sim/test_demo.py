@@ -109,12 +109,12 @@ def test_an_audit_of_what_is_well_has_no_problems(good: Scene) -> None:
 
 
 def test_an_object_that_changed_is_found(good: Scene) -> None:
-    """Content that is not what was spooled is named by its key."""
+    """Content that differs from the spooled object is named by its key."""
     get = good.store.get
     good.store.get = lambda bucket, key: b'other' if 'front' in key else get(bucket, key)  # type: ignore[method-assign]
-    assert [problem for problem in good.audit().problems if 'is not what was spooled' in problem] == [
-        'thor/camera/20251018/120000_front.jpg is not what was spooled',
-        'thor/camera/20251018/120001_front.jpg is not what was spooled',
+    assert [problem for problem in good.audit().problems if 'differs from the spooled object' in problem] == [
+        'thor/camera/20251018/120000_front.jpg differs from the spooled object',
+        'thor/camera/20251018/120001_front.jpg differs from the spooled object',
     ]
 
 
@@ -126,7 +126,7 @@ def test_a_delivered_object_that_is_not_there_is_found(scene: Scene) -> None:
     scene.catalog()
     assert scene.audit().problems == (
         'thor/camera/20251018/120000_front.jpg was delivered, but is not in the bucket',
-        f'{CAMERA}: 2 messages are delivered, but 1 lie in the bucket',
+        f'{CAMERA}: 2 messages are delivered, but 1 are in the bucket',
         'thor/camera/20251018/120000_front.jpg has a row in the catalog, but is not in the bucket',
     )
 
@@ -170,9 +170,9 @@ def test_the_result_fits_into_80_columns(good: Scene) -> None:
     record = Record(good.published, (replace(READING, t=40.0, pending=0),), (25.0, 35.0))
     text = said(good.audit(), record)
     assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
-    assert '10 messages went out before the node had found their publishers' in text
+    assert '10 messages were published before the node found their publishers' in text
     assert f'{RAW} is not logged' in text
-    assert 'The S3 server was away for 10 s' in text
+    assert 'The S3 server was down for 10 s' in text
     assert '4 objects with 5 messages read back from the S3 server: all as spooled' in text
     assert IMU_KEY in text
 
@@ -285,7 +285,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, capsys: pytest.Cap
     """Exit code 2, a line that says so, and nothing is touched."""
     (tmp_path / 'thesis.tex').touch()
     assert demo.main(['--folder', str(tmp_path)]) == 2
-    assert 'no demo made it' in capsys.readouterr().err
+    assert 'was not created by a demo' in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ['thesis.tex']
 
 
@@ -396,7 +396,7 @@ def test_a_short_demo_ends_well(tmp_path: Path) -> None:
         assert json.loads(asked(address, 'api/session'))['robot'] == 'thor'
         assert '"published"' not in walking.read_text(), 'the robot walks no more'
 
-        assert address in heard('Ctrl-C ends it').split()[-20:]
+        assert address in heard('Ctrl-C stops it').split()[-20:]
         assert 'doctor' in json.loads(asked(address, 'api/doctor'))  # which takes it seconds
         assert b'<html' in asked(address, '')
         run.send_signal(signal.SIGINT)
@@ -412,6 +412,6 @@ def test_a_short_demo_ends_well(tmp_path: Path) -> None:
     if CHROMIUM is not None and find_spec('playwright') is not None:
         pictures.append('live.jpg')
     for name in pictures:
-        with Image.open(folder / name) as picture:
-            assert min(picture.size) > 200
+        with Image.open(folder / name) as plot:
+            assert min(plot.size) > 200
         assert str(folder / name) in said

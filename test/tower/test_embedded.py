@@ -195,7 +195,7 @@ def test_a_server_that_ends_at_once_shows_its_log(tmp_path: Path) -> None:
     """The error names the server, its exit code and the end of its log."""
     server = Server('a bad server', ['bash', '-c', 'echo the port is taken; exit 3'], log=tmp_path / 'log', environ=os.environ)
     server.start()
-    with pytest.raises(ServerFailed, match=r'(?s)a bad server ended with exit code 3.*the port is taken'):
+    with pytest.raises(ServerFailed, match=r'(?s)a bad server exited with code 3.*the port is taken'):
         server.wait(lambda: False, 10.0)
     server.stop()
 

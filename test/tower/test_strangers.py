@@ -392,7 +392,7 @@ def test_a_tower_knocks_at_its_own_ports_alone(tmp_path: Path, monkeypatch: pyte
     """After its start, at the address of others and at its own: another Tower beside it is none of its business."""
     asked: set[tuple[str, int]] = set()
     monkeypatch.setattr(run.seaweedfs, 'answers_without_keys', lambda host, port, _: asked.add((host, port)))
-    run.Runner(tmp_path, '127.0.0.2', 100)._knock()
+    run.Runner(tmp_path, '127.0.0.2', 100)._check_authentication()
     ports = {PORTS[name] + GRPC + 100 for name in ('s3', 'filer', 'master', 'volume')}
     assert asked == {(host, port) for host in ('127.0.0.1', '127.0.0.2') for port in ports}
 

@@ -1,1 +1,1 @@
-"""The servers of a Tower as processes of this machine, and who may do what on its MLflow."""
+"""The servers of a Tower as processes of this machine, and the access control of its MLflow."""

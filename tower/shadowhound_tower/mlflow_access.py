@@ -1,11 +1,13 @@
-"""Who may do what on the MLflow server of a Tower. It asks everybody for a password, and lets each user do only what it is for.
+"""Access control of a Tower's MLflow server: it requires a password, and limits each user to its purpose.
 
-MLflow's own app ``basic-auth`` decides about experiments and runs; this module adds what it leaves open. The server loads it to
-check the password of each request (``authenticate``), so that a user can have two while they are changed, and to refuse what is
-none of a user's business before MLflow looks at it: without a rule here, nothing but ``tower`` gets through. Nobody chooses where
-artifacts go, ``tower`` included.
+MLflow's own app ``basic-auth`` controls access to experiments and runs; this module adds the rest. The server loads it to check
+the
+password of each request (``authenticate``), so that a user can have two during a change, and to reject requests that a user does
+not need before MLflow handles them: without a rule here, only ``tower`` is allowed. No user can choose where artifacts are
+stored,
+not even ``tower``.
 
-Only the standard library and what MLflow itself needs: the container of compose.yaml has this file alone, and runs ``main``.
+It uses only the standard library and MLflow's dependencies: the container of compose.yaml has only this file, and runs ``main``.
 """
 
 from __future__ import annotations
@@ -47,22 +49,23 @@ if TYPE_CHECKING:
 ADMIN: Final = 'tower'
 READER: Final = 'spark'
 USERS: Final = 'SHADOWHOUND_MLFLOW_USERS'
-"""The variable of the server that names the file of its users: JSON, user -> SHA-256 of each password, in hex."""
+"""The server's variable with the path of its users file: JSON, user -> SHA-256 of each password, in hex."""
 APP: Final = ('--app-name', 'basic-auth')
-"""What ``mlflow server`` has to be told besides."""
+"""Required arguments of ``mlflow server``."""
 SOURCES: Final = r'\A((runs|models|mlflow-artifacts):/|s3://lerobot/policies/)[^\r\n]*\Z'
-"""Where a model's files may come from: from what the server stores itself, and from the policies, which it has no keys for."""
+"""Allowed sources of a model's files: the server's own storage, and the policies, for which it has no keys."""
 BODY_BYTES: Final = 32 << 20
-"""The longest body of a request that MLflow keeps in memory whole; the inputs of a run
-may have 17 MB. Artifacts are streamed."""
+"""Maximum size of a request body that MLflow keeps in memory; the inputs of a run
+may have 17 MB. Artifacts are streamed.
+"""
 MAX_WRONG, WRONG_S = 10, 60.0
 """After this many wrong passwords within this time an address must wait."""
 MAX_ADDRESSES: Final = 1000
-"""Addresses whose wrong passwords are remembered; beyond it the one that failed least recently is forgotten."""
+"""Maximum number of addresses with wrong passwords; beyond it the one that failed least recently is dropped."""
 LOOPBACK: Final = frozenset({'', '127.0.0.1', '::1'})
-"""Addresses that never wait: of programs of this machine, such as a proxy in front, behind which are all others."""
+"""Addresses that never wait: programs of this machine, such as a reverse proxy in front of all clients."""
 SILENT_S: Final = 20.0
-"""A connection on which no request arrives is closed at the latest after twice this time."""
+"""A connection without a request is closed after at most twice this time."""
 NO_USER: Final = 'MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD are not a user of this Tower'
 ANSWER_S: Final = 30.0
 START_S: Final = 180.0
@@ -80,7 +83,7 @@ _ROBOT: Final = (
     ('PUT', _ARTIFACTS),
     ('GET', r'/version'),
 )
-"""What a robot needs: to log missions. It makes no experiment and deletes nothing."""
+"""What a robot needs: to log missions. It creates no experiment and deletes nothing."""
 _READER: Final = (
     *_ROBOT,
     *((method, _API + r'(?:experiments|runs|metrics|artifacts|logged-models|registered-models|model-versions)/(?!permissions).*')
@@ -90,22 +93,22 @@ _READER: Final = (
     ('POST', r'/(?:ajax-api/2\.0/mlflow/)?graphql'),
     ('GET', r'/(?:(?:model-versions/)?get-artifact)?'),
 )  # fmt: skip
-"""Training besides: experiments and models of one's own, and the pages."""
+"""For training, in addition: its own experiments and models, and the pages."""
 _FREE_BODY: Final = r'/(?:ajax-api/2\.0/mlflow/)?graphql|' + _API + r'upload-artifact|' + _ARTIFACTS
-"""Whose bodies are none of the protocol's messages."""
+"""Requests whose bodies are not protocol messages."""
 
 
 class NotPrepared(Exception):
-    """MLflow could not be given its users; the text says why, without a password."""
+    """MLflow's users could not be set up; the text has the reason, without a password."""
 
 
 def digest(password: str) -> str:
-    """As it stands in the file of users. A random password of 256 bits needs nothing slower: nobody finds it by trying."""
+    """The form in the users file. A random password of 256 bits needs no slow hash: it cannot be guessed."""
     return hashlib.sha256(password.encode()).hexdigest()
 
 
 def may(user: str, method: str, path: str) -> bool:
-    """Whether a request is a user's business at all; whose experiment it is about, MLflow decides afterwards."""
+    """Whether a user needs this request at all; access to the experiment is decided by MLflow afterwards."""
     if user == ADMIN:
         return True
     rules = _READER if user == READER else _ROBOT
@@ -113,7 +116,7 @@ def may(user: str, method: str, path: str) -> bool:
 
 
 def authenticate() -> Authorization | Response:
-    """MLflow's ``authorization_function``: called in the server, with Flask's request, before anything is looked at."""
+    """MLflow's ``authorization_function``: called in the server, with Flask's request, before it is handled."""
     from flask import request  # noqa: PLC0415 - those who only start the server do not need it
 
     given = request.authorization
@@ -123,17 +126,18 @@ def authenticate() -> Authorization | Response:
     if not may(user, request.method, request.path):
         return _refusal(403, 'PERMISSION_DENIED', f'the user {user} may not do this on this Tower')
     if user != ADMIN and request.get_data() and not re.fullmatch(_FREE_BODY, request.path) and not _is_plain(request):
-        return _refusal(400, 'INVALID_PARAMETER_VALUE', 'a body has to be a JSON object, whose names are as run_id, not as runId')
+        return _refusal(400, 'INVALID_PARAMETER_VALUE', 'a body must be a JSON object with names such as run_id, not runId')
     if request.method == 'GET' and re.fullmatch(_ALIAS, request.path):
-        return type(given)('basic', {'username': ADMIN, 'password': ''})  # which version has an alias, everybody may know
+        return type(given)('basic', {'username': ADMIN, 'password': ''})  # every user may see which version has an alias
     return given
 
 
 def _is_plain(request: Request) -> bool:
     """Whether MLflow's check and MLflow's handler read the same from a body.
 
-    The check knows neither the names of protobuf's JSON (runId), nor JSON in a string, nor in a DELETE or PATCH JSON that says it
-    is something else. The handler takes all of these: a request could be checked for one run, and change another.
+    The check ignores the names of protobuf's JSON (runId), JSON in a string, and JSON in a DELETE or PATCH with another content
+    type.
+    The handler accepts all of these: a request could be checked for one run, and change another.
     """
     body = request.get_json(silent=True) if request.mimetype == 'application/json' else None
     return isinstance(body, dict) and not any(name != name.lower() for name in _names(body))
@@ -148,7 +152,7 @@ def _names(value: Any) -> Iterator[str]:
 
 
 def _user(given: Authorization | None) -> str:
-    """Whose login this is; empty when it is nobody's."""
+    """The user of this login; empty if it is invalid."""
     user, password = (given.username or '', given.password or '') if given and given.type == 'basic' else ('', '')
     with open(os.environ[USERS], encoding='utf-8') as file:  # noqa: PTH123 - each time: a change counts at once
         known: list[str] = json.load(file).get(user, [])
@@ -157,9 +161,9 @@ def _user(given: Authorization | None) -> str:
 
 
 class WrongPasswords:
-    """Which addresses sent wrong passwords lately. For the event loop alone; of a bounded size.
+    """Addresses that sent wrong passwords recently. For the event loop only; of bounded size.
 
-    There is no limit for all addresses together: it would let any host in the network lock out everybody.
+    There is no limit across all addresses: it would let any host in the network lock out all others.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -167,12 +171,12 @@ class WrongPasswords:
         self._failures: dict[str, deque[float]] = {}
 
     def wait_s(self, address: str) -> float:
-        """How long the address must wait before it may try another password; 0 where it need not."""
-        known = self._failures.get(_network_of(address))
+        """How long the address must wait before its next password; 0 if it need not."""
+        known = self._failures.get(_subnet(address))
         return max(0.0, known[0] + WRONG_S - self._now()) if known is not None and len(known) == MAX_WRONG else 0.0
 
     def add(self, address: str) -> None:
-        network = _network_of(address)
+        network = _subnet(address)
         known = self._failures.pop(network, None) or deque(maxlen=MAX_WRONG)
         known.append(self._now())
         self._failures[network] = known  # the last one now
@@ -180,8 +184,8 @@ class WrongPasswords:
             del self._failures[next(iter(self._failures))]
 
 
-def _network_of(address: str) -> str:
-    """The address, or of IPv6 its /64: a host there may have any address of it."""
+def _subnet(address: str) -> str:
+    """The address, or for IPv6 its /64: a host there may use any address in it."""
     try:
         found = ipaddress.ip_address(address.partition('%')[0])
     except ValueError:
@@ -194,17 +198,20 @@ _WRONG: Final = WrongPasswords()
 
 
 def connection(**given: Any) -> Protocol:
-    """The protocol of uvicorn, whose app gets no body of a stranger and none without a bound, and no request of whoever guesses.
+    """The protocol of uvicorn, whose app gets no body without authentication and none without a bound, and no request of an
+    address
+    that guesses passwords.
 
-    MLflow's app reads each body into memory, and only then asks ``authenticate``. Artifacts are streamed, after it. uvicorn
-    closes a connection that is idle after a request, but neither one that never sends a request nor one that never ends its head.
+    MLflow's app reads each body into memory, and only then calls ``authenticate``. Artifacts are streamed, after it. uvicorn
+    closes a
+    connection that is idle after a request, but neither one that never sends a request nor one that never ends its headers.
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol  # noqa: PLC0415 - see authenticate
 
     class Connection(H11Protocol):
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self._begun = self._running = 0
+            self._requests_begun = self._running = 0
             self._served, self.app = self.app, self._serve
             self._timer = self.loop.call_later(SILENT_S, self._watch, 0)
 
@@ -212,15 +219,15 @@ def connection(**given: Any) -> Protocol:
             self._timer.cancel()
             super().connection_lost(exc)
 
-        def _watch(self, begun: int) -> None:
-            """Close it where no request began since the last look, and none is being served."""
-            if begun == self._begun and not self._running:
+        def _watch(self, requests_begun: int) -> None:
+            """Close it if no request began since the last check, and none is being served."""
+            if requests_begun == self._requests_begun and not self._running:
                 self.transport.close()
             else:
-                self._timer = self.loop.call_later(SILENT_S, self._watch, self._begun)
+                self._timer = self.loop.call_later(SILENT_S, self._watch, self._requests_begun)
 
         async def _serve(self, scope: Message, receive: Receive, send: Send) -> None:
-            self._begun += 1
+            self._requests_begun += 1
             self._running += 1
             try:
                 await _with_bound(self._served)(scope, receive, send)
@@ -247,7 +254,7 @@ def _with_bound(served: Served) -> Served:
 
 
 def _wait(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
-    """As ``_body_refused``, of an address that sent too many wrong passwords; a wrong one that comes now is counted."""
+    """Like ``_body_refused``, for an address that sent too many wrong passwords; another wrong one is counted."""
     from werkzeug.datastructures import Authorization  # noqa: PLC0415 - see authenticate
 
     given = next((value for name, value in scope['headers'] if name == b'authorization'), None)
@@ -257,12 +264,12 @@ def _wait(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
     if address in LOOPBACK or not _WRONG.wait_s(address):
         if not _user(Authorization.from_header(given.decode('latin-1'))):
             _WRONG.add(address)
-        return None  # the app says what is wrong with it
+        return None  # the app reports the error
     return 429, 'RESOURCE_EXHAUSTED', 'too many wrong passwords from this address; wait a minute'
 
 
 def _body_refused(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
-    """Why the body of a request is not read: status, code and text; None when it is, or when there is none."""
+    """Why the body of a request is not read: status, code and text; None if it is, or if there is none."""
     from werkzeug.datastructures import Authorization  # noqa: PLC0415 - see authenticate
 
     headers = {name: value.decode('latin-1') for name, value in scope['headers']}
@@ -274,8 +281,8 @@ def _body_refused(scope: Mapping[str, Any]) -> tuple[int, str, str] | None:
     if scope['method'] == 'PUT' and re.fullmatch(_ARTIFACTS, scope['path']):
         return None
     if is_chunked:
-        return 411, 'BAD_REQUEST', 'a request with a body has to tell its length (Content-Length)'
-    return (413, 'BAD_REQUEST', f'a body of more than {BODY_BYTES} bytes is not taken') if length > BODY_BYTES else None
+        return 411, 'BAD_REQUEST', 'a request with a body must have its length (Content-Length)'
+    return (413, 'BAD_REQUEST', f'a body of more than {BODY_BYTES} bytes is not accepted') if length > BODY_BYTES else None
 
 
 def _refusal(status: int, code: str, message: str) -> Response:
@@ -289,10 +296,10 @@ def _refusal(status: int, code: str, message: str) -> Response:
 
 
 def environment(folder: Path, users: Path, database: str) -> dict[str, str]:
-    """The variables of ``mlflow server`` with ``APP``. Writes its settings, and in them the address of the database.
+    """The variables of ``mlflow server`` with ``APP``. Writes its settings, including the address of the database.
 
-    ``folder``, for the settings, belongs to the server's user alone; ``database`` is an SQLAlchemy URI, the server's own or
-    another one.
+    ``folder``, for the settings, belongs to the server's user only; ``database`` is an SQLAlchemy URI, the server's own or
+    another.
     """
     package = __name__.rpartition('.')[0]
     here = Path(__file__).resolve()
@@ -308,10 +315,10 @@ def environment(folder: Path, users: Path, database: str) -> dict[str, str]:
     root = here.parents[package.count('.') + 1] if package else here.parent
     return {
         USERS: str(users), 'MLFLOW_AUTH_CONFIG_PATH': str(path),
-        'MLFLOW_AUTH_ADMIN_PASSWORD': secrets.token_urlsafe(32),  # of its own list of users, which nobody logs in by
+        'MLFLOW_AUTH_ADMIN_PASSWORD': secrets.token_urlsafe(32),  # for its own list of users, which is never used for logins
         'MLFLOW_FLASK_SERVER_SECRET_KEY': secrets.token_urlsafe(32),
         'MLFLOW_BASIC_AUTH_FAIL_CLOSED': 'true',
-        'MLFLOW_ARTIFACT_LOCATION_MAX_LENGTH': '0',  # an experiment that names one is refused
+        'MLFLOW_ARTIFACT_LOCATION_MAX_LENGTH': '0',  # an experiment that names one is rejected
         'MLFLOW_CREATE_MODEL_VERSION_SOURCE_VALIDATION_REGEX': SOURCES,
         'MLFLOW_DISABLE_TELEMETRY': 'true', 'MLFLOW_SERVER_ENABLE_JOB_EXECUTION': 'false',
         'UVICORN_HTTP': f'{module}:{connection.__name__}',
@@ -329,15 +336,15 @@ def is_up(url: str, trust: ssl.SSLContext | None = None) -> bool:
 
 
 def experiment_of(robot: str) -> str:
-    """Where a robot's missions are."""
+    """The experiment of a robot's missions."""
     return f'{robot}_missions'
 
 
 def prepare(url: str, password: str, robots: Iterable[str], trust: ssl.SSLContext | None = None) -> list[str]:
-    """Give a server its users, each robot its experiment, and ``spark`` a look at it; to be run again at any time.
+    """Set up a server's users, each robot's experiment, and read access for ``spark``; can be run again at any time.
 
-    ``password`` is that of ``tower``. Returns a sentence for each experiment whose artifacts lie where this Tower would not put
-    them. Raises NotPrepared.
+    ``password`` is that of ``tower``. Returns a sentence for each experiment whose artifacts are stored elsewhere. Raises
+    NotPrepared.
     """
     server = _Server(url, password, trust)
     robots = list(robots)
@@ -351,13 +358,13 @@ def prepare(url: str, password: str, robots: Iterable[str], trust: ssl.SSLContex
             grant = {'resource_type': 'experiment', 'resource_id': found['experiment_id'], 'permission': permission}
             server.ask('POST', '3.0/mlflow/users/permissions/grant', {'username': user, **grant})
     return [
-        f'the experiment {one["name"]} keeps its artifacts in {one["artifact_location"]}: delete it, or look who made it'
+        f'the experiment {one["name"]} keeps its artifacts in {one["artifact_location"]}: delete it, or find out who created it'
         for one in server.experiments() if not one['artifact_location'].startswith('mlflow-artifacts:')
     ]  # fmt: skip
 
 
 class _Server:
-    """The MLflow server, asked as ``tower``. Raises NotPrepared."""
+    """Client of the MLflow server as ``tower``. Raises NotPrepared."""
 
     def __init__(self, url: str, password: str, trust: ssl.SSLContext | None) -> None:
         self._url = url
@@ -367,7 +374,7 @@ class _Server:
         self._trust = trust
 
     def ask(self, method: str, path: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """What is there already is fine, and answered by nothing."""
+        """Send a request; if the object already exists, the result is empty."""
         data = json.dumps(body).encode() if body is not None else None
         try:
             request = Question(f'{self._url}/api/{path}', data, self._headers, method=method)  # noqa: S310 - http(s), by us
@@ -376,12 +383,12 @@ class _Server:
                 return found
         except HTTPError as error:
             with error:
-                said = error.read().decode(errors='replace')[:300]
-            if 'RESOURCE_ALREADY_EXISTS' in said:
+                reply = error.read().decode(errors='replace')[:300]
+            if 'RESOURCE_ALREADY_EXISTS' in reply:
                 return {}
-            raise NotPrepared(f'{self._url} answers {error.code} to {path.partition("?")[0]}: {said}') from error
+            raise NotPrepared(f'{self._url} answers {error.code} to {path.partition("?")[0]}: {reply}') from error
         except (OSError, ValueError) as error:
-            raise NotPrepared(f'{self._url} cannot be asked: {error}') from error
+            raise NotPrepared(f'{self._url} cannot be reached: {error}') from error
 
     def experiments(self) -> Iterable[dict[str, Any]]:
         page = ''
@@ -394,11 +401,11 @@ class _Server:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line; what follows ``--`` is the command of ``mlflow server``."""
+    """The command line; the command of ``mlflow server`` follows ``--``."""
     made = argparse.ArgumentParser(description='Run mlflow server with the users of a Tower.')
     made.add_argument('--users', type=Path, required=True, help='the file of users and digests, from make_secrets.py')
     made.add_argument('--password', type=Path, required=True, metavar='FILE', help='the file with the password of tower')
-    made.add_argument('--folder', type=Path, required=True, help="where the server's settings go, readable by this user alone")
+    made.add_argument('--folder', type=Path, required=True, help="folder of the server's settings, readable by this user only")
     made.add_argument('command', nargs='+', help='mlflow server ...')
     return made
 

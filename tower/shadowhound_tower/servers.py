@@ -1,4 +1,4 @@
-"""Server processes for the embedded Tower: their ports, their logs, and that none of them outlives its owner."""
+"""Server processes of the embedded Tower: their ports and logs; none keeps running after its owner."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from shadowhound_data_logger.core.errors import DataLoggerError
 
 GUARD: Final = Path(__file__).with_name('_guard.py')
 STOP_S: Final = 15.0
-"""More than the guard takes to kill what does not stop."""
+"""More than the guard needs to kill a server."""
 POLL_S: Final = 0.02
 TAIL_LINES: Final = 15
 PORTS: Final = range(11_000, 22_700)
-"""Below Linux's ephemeral ports (32768 up), as are the same plus 10,000: no outgoing connection takes one meanwhile."""
+"""Below Linux's ephemeral ports (32768 up), as are the same plus 10,000: outgoing connections never use them."""
 GRPC: Final = 10_000
-"""SeaweedFS serves gRPC on the HTTP port plus this; some of it cannot be told another."""
+"""SeaweedFS serves gRPC on the HTTP port plus this; some of these ports cannot be configured."""
 SOCKETS: Final = Path('/tmp')  # noqa: S108 - where SeaweedFS leaves its sockets is fixed; we only remove them
 
 
@@ -33,13 +33,13 @@ class ServerFailed(DataLoggerError):
 
 
 def seaweed_sockets(ports: Mapping[str, int]) -> list[Path]:
-    """What a SeaweedFS whose parts listen on these ports leaves behind."""
+    """Files left behind by a SeaweedFS with these ports."""
     names = ((f'{name}-{port}', f'{name}-grpc-{port + GRPC}') for name, port in ports.items())
     return [SOCKETS / f'seaweedfs-{name}.sock' for both in names for name in both]
 
 
 class Server:
-    """One server process under a guard. Life: New; start and stop any number of times; not thread-safe."""
+    """One server process under a guard. Lifecycle: New; start and stop any number of times; not thread-safe."""
 
     def __init__(
         self, name: str, command: Sequence[str], *, log: Path, environ: Mapping[str, str], leftovers: Sequence[Path] = ()
@@ -55,7 +55,7 @@ class Server:
         return f'Server({self.name!r}, {"running" if self._guard else "stopped"})'
 
     def start(self) -> None:
-        """Returns at once; ``wait`` says when it answers."""
+        """Returns immediately; use ``wait`` for its readiness."""
         if self._guard is None:
             with self._log.open('ab') as log:
                 self._guard = subprocess.Popen(
@@ -64,18 +64,18 @@ class Server:
                 )  # fmt: skip
 
     def wait(self, ready: Callable[[], bool], timeout_s: float) -> None:
-        """Returns when ``ready()``; raises ServerFailed with the end of the log when it ended or took too long."""
+        """Returns when ``ready()``; raises ServerFailed with the end of the log if it exited or took too long."""
         deadline = time.monotonic() + timeout_s
         while not ready():
             if self._guard is None or self._guard.poll() is not None:
                 code = self._guard.returncode if self._guard else None
-                raise self._failed(f'{self.name} ended with exit code {code} instead of starting')
+                raise self._failed(f'{self.name} exited with code {code} instead of starting')
             if time.monotonic() > deadline:
                 raise self._failed(f'{self.name} did not answer within {timeout_s:g} s')
             time.sleep(POLL_S)
 
     def stop(self) -> None:
-        """Returns when the process and its children are gone."""
+        """Returns when the process and its children have exited."""
         guard, self._guard = self._guard, None
         if guard is None:
             return
@@ -93,10 +93,11 @@ class Server:
 
 
 class Ports:
-    """Ports that are ours until ``release``, whether a server listens on them at the moment or not.
+    """Ports that are reserved until ``release``, whether a server listens on them or not.
 
-    Each is held by a socket that is bound but does not listen: nobody else can take it, a connection is refused, and a server
-    that sets SO_REUSEADDR, as Go's and Python's do, can listen on it. A server that stops and comes back finds its port free.
+    Each is held by a bound socket that does not listen: no other process can take it, connections are refused, and a server that
+    sets
+    SO_REUSEADDR, as Go's and Python's do, can listen on it. A server that restarts finds its port free.
     """
 
     def __init__(self, host: str) -> None:
@@ -116,7 +117,7 @@ class Ports:
                     half.close()
                 continue
             for half in pair:
-                half.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # only now: ours alone, then open to our server
+                half.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # only now: reserved first, then open to our server
             self._sockets += pair
             return port
         raise ServerFailed(f'there is no free port on {self._host} between {PORTS.start} and {PORTS.stop}')
@@ -127,9 +128,9 @@ class Ports:
 
 
 def find_program(name: str, remedy: str) -> str:
-    """The path of a program beside this interpreter (a wheel's script), else on PATH; raises ServerFailed."""
-    beside = Path(sys.executable).parent / name
-    found = str(beside) if os.access(beside, os.X_OK) else shutil.which(name)
+    """The path of a program next to this interpreter (a wheel's script), otherwise on PATH; raises ServerFailed."""
+    script = Path(sys.executable).parent / name
+    found = str(script) if os.access(script, os.X_OK) else shutil.which(name)
     if found is None:
         raise ServerFailed(f'the program {name} is not installed', remedy=remedy)
     return found
