@@ -142,9 +142,8 @@ def _about_ingest(done: Ingested, root: str) -> str:
 
 @lake.command('reindex', epilog=examples('lake reindex --robot thor'))
 @click.option('--robot', metavar='NAME', required=True, help='The robot.')
-@click.option('--statistics', is_flag=True, help='Instead, add statistics for objects that lack them.')
 @as_json
-def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
+def lake_reindex(*, robot: str, as_json: bool) -> ExitCode:
     """Add objects that the catalog lacks.
 
     It lists the store and reads the metadata of each object without a row.
@@ -156,13 +155,10 @@ def lake_reindex(*, robot: str, statistics: bool, as_json: bool) -> ExitCode:
     left_out = quietly()
     with the_store() as target, progress() as bar:
         source = default_source(the_store_settings())
-        make = library.add_statistics if statistics else library.reindex
-        found = make(source, target, robot, findings=left_out, tell=lambda so_far: bar.say(
+        found = library.reindex(source, target, robot, findings=left_out, tell=lambda so_far: bar.say(
             f'{number(so_far.listed)} objects listed, {number(so_far.added)} added'))  # fmt: skip
     if as_json:
         print_json(asdict(found))
-    elif statistics:
-        click.echo(f'{number(found.listed)} objects had no statistics; of {number(found.added)} they are there now.')
     else:
         click.echo(f'{number(found.listed)} objects are in the store; {number(found.added)} were not in the catalog and are now.')
         if found.gone:

@@ -10,20 +10,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Final
+from typing import Final
 
-from shadowhound_data_logger.core.errors import LakeError, ObjectRefused
 from shadowhound_data_logger.core.keys import check_name
 from shadowhound_data_logger.core.model import ObjectInfo
-from shadowhound_data_logger.core.untrusted import MAX_OBJECT_BYTES
 from shadowhound_data_logger.formats.rows import parts
 from shadowhound_data_logger.formats.rows.schema import BUCKET, FORGOTTEN, OBJECTS, Row, TableSchema, is_row, row_of
-from shadowhound_data_logger.formats.rows.statistics import STATISTICS, statistic_rows
-from shadowhound_data_logger.formats.statistics import ALL
 from shadowhound_data_logger.lake.bucket import THREADS, Bucket, put_part
 from shadowhound_data_logger.lake.findings import Findings
 from shadowhound_data_logger.lake.row_files import backfilled_key
-from shadowhound_data_logger.lake.tables import literal
 from shadowhound_data_logger.lake.views import rows_of
 from shadowhound_data_logger.stores.base import ObjectStore
 
@@ -31,8 +26,6 @@ KEY: Final = ('bucket', 'key')
 BUCKETS: Final = (BUCKET, 'trajectories')
 PAGE: Final = 10_000
 """Objects whose rows are written together."""
-STATISTICS_PAGE: Final = 1000
-"""Objects whose statistics are written together."""
 
 
 @dataclass(slots=True)
@@ -73,45 +66,6 @@ def reindex(
             tell(found)
     forgotten = _keys(source, robot, findings, FORGOTTEN) if known else set()
     found.gone = sum(pair[0] in buckets and pair not in forgotten for pair in known)
-    return found
-
-
-def add_statistics(source: Bucket, store: ObjectStore, robot: str, *, tell: Callable[[Reindexed], None] = lambda _: None,
-                   findings: Findings | None = None) -> Reindexed:  # fmt: skip
-    """Compute the missing statistics of one robot's objects. Raises StoreError, NameRefused.
-
-    Rows added before an error are kept. Missing and damaged objects are reported in ``findings``.
-    """
-    from shadowhound_data_logger.lake import query, values  # noqa: PLC0415 - the extra lake
-
-    check_name(robot, 'the robot name')
-    findings, found = Findings() if findings is None else findings, Reindexed()
-    existing = rows_of(source, STATISTICS, findings, robot=robot, where=f'field = {literal(ALL)}', columns=KEY)
-    known = set(zip(*(existing[name].to_pylist() for name in KEY), strict=True))
-    columns = ('robot', 'sensor', *KEY, 'topic', 't_start', 't_start_ns')
-    asked = query.objects(source, findings=findings, robot=robot, columns=columns)
-    rows = [row for row in asked.to_pylist() if row['topic'] is not None and (row['bucket'], row['key']) not in known]
-    found.listed = len(rows)
-
-    def statistics(row: dict[str, Any]) -> list[Row]:
-        of = {**row, 't_start': None if row['t_start'] is None else row['t_start_ns'] // 1000}
-        try:
-            body = Bucket(source.settings, row['bucket']).get(row['key'], MAX_OBJECT_BYTES)
-            return list(statistic_rows(of, values.statistics_of(row['key'], body)))
-        except (LakeError, ObjectRefused) as error:
-            findings.add(row['key'], str(error))
-            return []
-
-    with ThreadPoolExecutor(THREADS) as pool:
-        for start in range(0, len(rows), STATISTICS_PAGE):
-            made = [one for some in pool.map(statistics, rows[start : start + STATISTICS_PAGE]) for one in some]
-            for _, date, numbered in parts.by_folder(enumerate(made)):
-                part = [row for _, row in numbered]
-                key = backfilled_key(robot, date, {f'{row["bucket"]}/{row["key"]}' for row in part}, STATISTICS)
-                put_part(store, key, robot, parts.encode(part, STATISTICS), len(part))
-                found.parts += 1
-            found.added += sum(row['field'] == ALL for row in made)
-            tell(found)
     return found
 
 

@@ -609,14 +609,9 @@ def _runs(row: Mapping[str, Any], body: bytes, expression: Expression) -> Iterat
         yield int(stamps[first]), int(stamps[end - 1]), int(end - first)
 
 
-def statistics_of(key: str, body: bytes, chosen: Sequence[str] = ()) -> dict[str, Statistic]:
-    """Statistics of the content of an object, as its encoder computes them; empty for other formats. Raises LakeError."""
-    extension = extension_of(key)
-    if extension == _JSON:
-        return _collected(records(body), chosen)
-    if extension == _PCD:
-        return point_statistics(cloud_points(body))
-    return jpeg_statistics(body) if extension == _JPEG else {}
+def statistics_of(key: str, body: bytes) -> dict[str, Statistic]:
+    """Statistics of an image or a cloud, as its encoder computes them. Raises LakeError."""
+    return point_statistics(cloud_points(body)) if extension_of(key) == _PCD else jpeg_statistics(body)
 
 
 def _collected(messages: Sequence[Mapping[str, Any]], chosen: Sequence[str]) -> dict[str, Statistic]:

@@ -26,7 +26,6 @@ from shadowhound_data_logger.formats.statistics import MAX_FIELDS, FieldStatisti
 from shadowhound_data_logger.lake import query, values
 from shadowhound_data_logger.lake.bucket import Bucket
 from shadowhound_data_logger.lake.findings import Findings
-from shadowhound_data_logger.lake.reindex import add_statistics
 from shadowhound_data_logger.stores import open_store
 
 SIGNS = {'<': operator.lt, '<=': operator.le, '>': operator.gt, '>=': operator.ge, '=': operator.eq, '!=': operator.ne}
@@ -248,20 +247,6 @@ def test_what_is_no_condition_is_told(text: str) -> None:
     with pytest.raises(SettingError, match='when') as refused:
         values.parse(text)
     assert len(str(refused.value)) < 600
-
-
-def test_statistics_are_made_again_of_the_objects(tmp_path: Path) -> None:
-    """Missing statistics are added once; a damaged object is reported."""
-    source = filled(tmp_path, BATCHES, [True] * 5 + [False] * 5)
-    damaged = tmp_path / 'store/sensor-data/thor/s/20261028/000009_s.json'
-    damaged.write_bytes(b'no JSON')
-    left_out = Findings(lambda _: None)
-    with closing(open_store(source.settings, UploadSettings())) as store:
-        made = [add_statistics(source, store, 'thor', findings=left_out) for _ in range(2)]
-    assert [(each.listed, each.added) for each in made] == [(5, 4), (1, 0)]
-    assert [one.key for one in left_out] == ['thor/s/20261028/000009_s.json']
-    found = values.ranges('s.a > 11', source)
-    assert (found.opened, found.unknown, len(found.ranges)) == (1, 1, 1)
 
 
 LIES: list[dict[str, Any]] = [
