@@ -30,14 +30,15 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Final
+from typing import Any, Final
 
-from shadowhound_data_logger.bags.json_object import JsonObject
+from shadowhound_data_logger.core.dataclass_json import as_plain, parse
 from shadowhound_data_logger.core.errors import BagDamaged
 from shadowhound_data_logger.core.untrusted import from_json, is_path
 from shadowhound_data_logger.formats.mcap.slice_info import SliceInfo
 
 VERSION: Final = 1
+LIMIT: Final = 1 << 64
 COMPLETE: Final = 'complete'
 RECOVERED: Final = 'recovered'
 """The recording was interrupted: at least the messages that had not reached the disk are missing."""
@@ -113,6 +114,7 @@ class RecordedTopic:
 
     topic: str
     type: str
+    """Empty for another recorder's channel without a schema."""
     messages: int
 
 
@@ -166,21 +168,40 @@ class Manifest:
         """Raises BagDamaged, which names the file (``name``) and the first invalid field."""
         try:
             found = from_json(content)
+            version = found.get('version') if isinstance(found, dict) else None
+            if version != VERSION:
+                raise BagDamaged(
+                    f'{name}: version is {version!r:.80}; this program reads {VERSION}', remedy='update it', path=name
+                )
+            manifest = checked(parse(cls, found))
         except ValueError as error:
-            raise BagDamaged(f'{name} is not JSON: {error}', path=name) from error
-        top = JsonObject(found, name, '')
-        if (version := top.count('version')) != VERSION:
-            raise BagDamaged(f'{name} has version {version}; this program reads {VERSION}', remedy='update it', path=name)
-        state = top.text('state')
-        if state not in STATES:
-            raise top.wrong('state', f'one of {", ".join(sorted(STATES))}')
-        mission, event, clock = top.object_or_none('mission'), top.object_or_none('event'), top.object_or_none('clock')
-        return cls(
-            top.text('bag'), top.text('robot'), read_mission(mission) if mission else None, state,
-            tuple(map(read_missing, top.objects('missing'))),
-            tuple(map(_topic, top.objects('topics'))),
-            tuple(map(_slice, top.objects('slices'))), read_event(event) if event else None, read_clock(clock) if clock else None,
-        )  # fmt: skip
+            raise BagDamaged(f'{name} is not a manifest: {error}', path=name) from error
+        return manifest
+
+
+def checked(manifest: Manifest) -> Manifest:
+    """The manifest unchanged. Raises ValueError, with the path of the field, for a value that no manifest has."""
+    if manifest.state not in STATES:
+        raise ValueError(f'state is {manifest.state!r:.80} and must be one of {", ".join(sorted(STATES))}')
+    for place, one in enumerate(manifest.slices):
+        if not is_path(one.file):
+            raise ValueError(f'slices[{place}].file is {one.file!r:.80} and must be the name of a file')
+        if not _SHA256.fullmatch(one.sha256):
+            raise ValueError(f'slices[{place}].sha256 is {one.sha256!r:.80} and must be a SHA-256 in hex')
+    check_numbers(as_plain(manifest))
+    return manifest
+
+
+def check_numbers(value: Any, at: str = '') -> None:
+    """Raises ValueError, with its path, for an integer that does not fit into uint64, as times in MCAP are."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            check_numbers(part, f'{at}.{name}' if at else name)
+    elif isinstance(value, list):
+        for place, part in enumerate(value):
+            check_numbers(part, f'{at}[{place}]')
+    elif isinstance(value, int) and not 0 <= value < LIMIT:
+        raise ValueError(f'{at} is {value} and must be from 0 to 2^64')
 
 
 def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
@@ -191,47 +212,3 @@ def topics_of(slices: Sequence[SliceInfo]) -> tuple[RecordedTopic, ...]:
             name = channel.topic, channel.type
             counts[name] = counts.get(name, 0) + count
     return tuple(RecordedTopic(topic, kind, count) for (topic, kind), count in counts.items())
-
-
-def _topic(one: JsonObject) -> RecordedTopic:
-    """The type is empty for another recorder's channel without a schema."""
-    return RecordedTopic(one.text('topic', is_any=True), one.text('type', is_any=True), one.count('messages'))
-
-
-def read_missing(one: JsonObject) -> Missing:
-    """Raises BagDamaged if a field is invalid, as do the following functions."""
-    return Missing(one.text('file'), one.text('what'), one.count_or_none('messages'), one.text_or_none('topic'),
-                   one.text_or_none('reason'))  # fmt: skip
-
-
-def read_mission(one: JsonObject) -> MissionOf:
-    """A mission; its type may be any text."""
-    return MissionOf(one.text('type', is_any=True), one.text_or_none('mission_id'), one.text_or_none('run_id'))
-
-
-def read_event(one: JsonObject) -> EventOf:
-    """An event; the names of its triggers may be any text."""
-    triggers = tuple(
-        TriggerOf(each.text('name', is_any=True), each.text('by'), each.count('at_ns'), each.text_or_none('detail'),
-                  each.text_or_none('who'))
-        for each in one.objects('triggers')
-    )  # fmt: skip
-    return EventOf(one.text('name'), one.number('pre_s'), one.number('held_s'), one.number('post_s'), triggers)
-
-
-def read_clock(one: JsonObject) -> ClockOf:
-    """The clock of a bag."""
-    return ClockOf(one.text('known'), one.text('boot_id'), one.count('boot_ns'), one.count('wall_ns'),
-                   one.count_or_none('offset_ns'))  # fmt: skip
-
-
-def _slice(one: JsonObject) -> SliceEntry:
-    if not is_path(one.text('file')):
-        raise one.wrong('file', 'the name of a file')
-    sha256 = one.text('sha256')
-    if not _SHA256.fullmatch(sha256):
-        raise one.wrong('sha256', 'a SHA-256 in hex')
-    return SliceEntry(
-        one.text('file'), one.text('key'), one.count('bytes'), sha256, one.count('messages'), one.count('t_start_ns'),
-        one.count('t_end_ns'), one.counts('counts'), one.counts('repeated'),
-    )  # fmt: skip

@@ -22,18 +22,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from shadowhound_data_logger.bags.json_object import LIMIT, JsonObject
-from shadowhound_data_logger.bags.manifest import (
-    ClockOf,
-    EventOf,
-    Missing,
-    MissionOf,
-    read_clock,
-    read_event,
-    read_missing,
-    read_mission,
-)
+from shadowhound_data_logger.bags.manifest import ClockOf, EventOf, Missing, MissionOf, check_numbers
 from shadowhound_data_logger.bags.naming import slice_file, slice_number
+from shadowhound_data_logger.core.dataclass_json import parse
 from shadowhound_data_logger.core.durable_files import sync
 from shadowhound_data_logger.core.errors import BagDamaged, NameRefused
 from shadowhound_data_logger.core.keys import check_key
@@ -55,6 +46,19 @@ ENDED: Final = '.ended'
 """Suffix of a slice without messages, which an ended bag keeps for its record until the bag is complete in the spool."""
 LEFT_OUT: Final = 'the index was lost: {} earlier slices or losses are not listed here'
 """For a bag with more slices than the records in its slices can list."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """What is known about a bag as a whole."""
+
+    bag: str
+    robot: str
+    mission: MissionOf | None
+    event: EventOf | None
+    clock: ClockOf | None
+    named: bool
+    ended: bool
 
 
 @dataclass(slots=True)
@@ -102,14 +106,15 @@ class BagState:
         """The state from rows of the index, or from a slice's record. Raises BagDamaged if they are invalid."""
         state = cls(folder, folder.name, robot)
         try:
-            state._load(JsonObject(from_json(rows.said.encode()), RECORD, 'said'))
+            state._load(from_json(rows.said.encode()))
             channels = [_read_channel(one) for one in _list(from_json(rows.channels.encode()))]
             state._channels = {_channel_id(one): one for one in channels}
             for row in rows.slices:
                 info = state._read_slice_row(row)
                 state.slices[info.path.name] = info
             for one in rows.missing:
-                state.missing.append(read_missing(JsonObject(one._asdict(), RECORD, 'missing')))
+                check_numbers(one._asdict(), 'missing')
+                state.missing.append(parse(Missing, one._asdict(), 'missing'))
         except (ValueError, TypeError, AttributeError, NameRefused) as error:
             raise BagDamaged(f'the state of bag {folder.name} is invalid: {error}', path=str(folder)) from error
         return state
@@ -203,18 +208,16 @@ class BagState:
             self.folder.rmdir()
 
     def _description(self) -> str:
-        mission, event, clock = (part and asdict(part) for part in (self.mission, self.event, self.clock))
-        return json.dumps({'bag': self.bag, 'robot': self.robot, 'mission': mission, 'event': event, 'clock': clock,
-                           'named': self.is_named, 'ended': self.ended})  # fmt: skip
+        said = _Description(self.bag, self.robot, self.mission, self.event, self.clock, self.is_named, self.ended)
+        return json.dumps(asdict(said))
 
-    def _load(self, said: JsonObject) -> None:
-        """The inverse of ``_description``."""
-        mission, event, clock = said.object_or_none('mission'), said.object_or_none('event'), said.object_or_none('clock')
-        bag = said.text('bag')
-        check_key(slice_file(bag, 0))
-        self.bag, self.ended, self.is_named = bag, said.flag('ended'), said.flag('named')
-        self.mission, self.event = read_mission(mission) if mission else None, read_event(event) if event else None
-        self.clock = read_clock(clock) if clock else None
+    def _load(self, given: Any) -> None:
+        """The inverse of ``_description``. Raises ValueError, NameRefused."""
+        check_numbers(given, 'said')
+        said = parse(_Description, given, 'said')
+        check_key(slice_file(said.bag, 0))
+        self.bag, self.mission, self.event, self.clock = said.bag, said.mission, said.event, said.clock
+        self.is_named, self.ended = said.named, said.ended
 
     def _slice_row(self, info: SliceInfo) -> SliceRow:
         counts = json.dumps([info.channels.get(one) for one in self._channels.values()])
@@ -225,7 +228,7 @@ class BagState:
         """The inverse of ``_slice_row``. Raises ValueError."""
         found = _list(from_json(row.counts.encode()))
         numbers = [row.number, row.bytes, row.t_start_ns, row.t_end_ns, row.messages, *(one for one in found if one is not None)]
-        if not isinstance(row.sha256, str) or not all(type(one) is int and 0 <= one < LIMIT for one in numbers):  # type: ignore[redundant-expr]
+        if not isinstance(row.sha256, str) or not all(type(one) is int and 0 <= one < 1 << 64 for one in numbers):  # type: ignore[redundant-expr]
             raise ValueError(f'a row of a slice is {row!r:.200}')
         channels = {one: count for one, count in zip(self._channels.values(), found, strict=False) if count is not None}
         return SliceInfo(self.folder / slice_file(self.folder.name, row.number), row.bytes, row.sha256, row.t_start_ns,

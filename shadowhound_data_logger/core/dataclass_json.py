@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -31,19 +31,26 @@ def dumps(value: Any) -> bytes:
     return json.dumps(value, default=fields_of).encode()
 
 
-def parse(kind: type[T], given: Any) -> T:
+def parse(kind: type[T], given: Any, at: str = '') -> T:
     """A dataclass from what ``json.loads`` returned. Missing fields have their defaults, unknown fields are ignored.
 
-    Raises ValueError for a value of another type than its field, and for a missing field without a default.
+    Raises ValueError for a value of another type than its field, and for a missing field without a default; it names the field
+    by its path, which begins with ``at``.
     """
     if not isinstance(given, dict):
-        raise ValueError(f'{kind.__name__} is not an object, but {given!r}')  # noqa: TRY004 - one error for bad input
+        raise ValueError(f'{at or kind.__name__} is not an object, but {given!r:.80}')  # noqa: TRY004 - one error for bad input
     hints = _hints(kind)  # type: ignore[arg-type] # any class is hashable
-    values = {name: _value(hints[name], value, name) for name, value in given.items() if name in hints}
+    below = f'{at}.' if at else ''
+    values = {name: _value(hints[name], value, f'{below}{name}') for name, value in given.items() if name in hints}
     try:
         return kind(**values)
-    except TypeError as error:  # a field without a default is missing
-        raise ValueError(str(error)) from error
+    except TypeError:
+        missing = next(one.name for one in fields(kind) if one.name not in values and _is_required(one))  # type: ignore[arg-type]
+        raise ValueError(f'{below}{missing} is missing') from None
+
+
+def _is_required(one: Field[Any]) -> bool:
+    return one.init and one.default is MISSING and one.default_factory is MISSING
 
 
 @cache
@@ -51,20 +58,20 @@ def _hints(kind: type[Any]) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
-def _value(hint: Any, given: Any, name: str) -> Any:
+def _value(hint: Any, given: Any, at: str) -> Any:
     if hint is Any:
         return given
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in {Union, UnionType}:
         (hint,) = (kind for kind in arguments if kind is not NoneType)
-        return None if given is None else _value(hint, given, name)
+        return None if given is None else _value(hint, given, at)
     if is_dataclass(hint):
-        return parse(hint, given)  # type: ignore[arg-type]
+        return parse(hint, given, at)  # type: ignore[arg-type]
     if origin is tuple and isinstance(given, list):
-        return tuple(_value(arguments[0], part, name) for part in given)
+        return tuple(_value(arguments[0], part, f'{at}[{place}]') for place, part in enumerate(given))
     if origin is not None and issubclass(origin, Mapping) and isinstance(given, dict):
-        return {key: _value(arguments[1], part, name) for key, part in given.items()}
+        return {key: _value(arguments[1], part, f'{at}.{key}') for key, part in given.items()}
     kinds = (float, int) if hint is float else hint
     if origin is not None or not isinstance(given, kinds) or (isinstance(given, bool) and hint is not bool):
-        raise ValueError(f'{name} is not {getattr(hint, "__name__", hint)}, but {given!r}')
+        raise ValueError(f'{at} is not {getattr(hint, "__name__", hint)}, but {given!r:.80}')
     return given

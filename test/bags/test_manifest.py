@@ -67,7 +67,7 @@ def test_what_made_an_event_comes_back() -> None:
     found = json.loads(WHOLE.to_json())
     del found['event']
     assert Manifest.from_json(json.dumps(found).encode()).event is None
-    for name, value in (('held_s', True), ('held_s', None), ('triggers', {}), ('name', '')):
+    for name, value in (('held_s', True), ('held_s', None), ('triggers', {}), ('name', 3)):
         found['event'] = {**asdict(event), name: value}
         with pytest.raises(BagDamaged, match=f'event.{name}'):
             Manifest.from_json(json.dumps(found).encode())
@@ -89,7 +89,7 @@ def test_made_of_slices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('place', 'value'), [
-    ('version', 2), ('version', None), ('bag', ''), ('robot', 7), ('state', 'growing'), ('mission', 'patrol'), ('missing', None),
+    ('version', 2), ('version', None), ('robot', 7), ('state', 'growing'), ('mission', 'patrol'), ('missing', None),
     ('topics', {}), ('slices', [1]), ('slices[0].bytes', -1), ('slices[0].bytes', True), ('slices[0].messages', 1.5),
     ('slices[0].sha256', 'AB' * 32), ('slices[0].counts', []), ('slices[0].counts./imu', '5'), ('mission.type', None),
     ('missing[0].messages', -3),
