@@ -26,6 +26,7 @@ HEAD: Final = """\
 
 The node runs without any of them. Set them in a parameter file (`--ros-args --params-file my.yaml`) or one by one
 (`--ros-args -p camera.rate_hz:=5.0`). `shadowhound-data init` writes a file for your robot;
+[generic.yaml](../launch_configs/generic.yaml) is a start for any robot, and
 [go2.yaml](../launch_configs/go2.yaml) has all parameters with the defaults for a Unitree Go2. With an unknown name
 or an invalid value the node exits with code 2, and the message says what is allowed.
 

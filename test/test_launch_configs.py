@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from shadowhound_data_logger.core.config import Settings, default_parameters
+from shadowhound_data_logger.core.type_rules import RULES
 from shadowhound_data_logger.node.intake.sampling import EveryMessage, rule_for
 
 FOLDER = Path(__file__).parents[1] / 'launch_configs'
@@ -37,6 +39,21 @@ def test_go2_yaml_is_the_defaults() -> None:
 def test_every_parameter_file_is_valid(path: Path) -> None:
     """The node starts with each of the files."""
     assert Settings.load(parameters(path), {}).sensors
+
+
+def test_generic_yaml_logs_every_topic_by_its_type() -> None:
+    """Its comments name the rules as they are, and its examples are settings that the node takes."""
+    text = (FOLDER / 'generic.yaml').read_text(encoding='utf-8')
+    assert parameters(FOLDER / 'generic.yaml') == {'robot': '', 'capture.topics': 'all'}
+    table = text.partition('names:\n')[2].partition('# docs/parameters')[0]
+    for words, kind in (('Odometry', 'nav_msgs/msg/Odometry'), ('DiagnosticArray', 'diagnostic_msgs/msg/DiagnosticArray')):
+        assert words.lower() in table.lower()
+        assert RULES[kind]['batch_s'] == {'Odometry': 1.0, 'DiagnosticArray': 10.0}[words]
+    examples = re.sub(r'^    # ', '    ', text.partition('capture:')[2], flags=re.M).replace('A sensor of', '# A sensor of')
+    given = flat(yaml.safe_load('    capture:' + examples))
+    settings = Settings.load(given, {})
+    assert {sensor.name for sensor in settings.sensors} >= {'camera', 'front'}
+    assert (settings.upload.max_mbps, settings.bag.record) == (20.0, 'mission')
 
 
 def test_the_full_rate_keeps_every_message() -> None:
