@@ -49,7 +49,9 @@ def test_generic_yaml_logs_every_topic_by_its_type() -> None:
     for words, kind in (('Odometry', 'nav_msgs/msg/Odometry'), ('DiagnosticArray', 'diagnostic_msgs/msg/DiagnosticArray')):
         assert words.lower() in table.lower()
         assert RULES[kind]['batch_s'] == {'Odometry': 1.0, 'DiagnosticArray': 10.0}[words]
-    examples = re.sub(r'^    # ', '    ', text.partition('capture:')[2], flags=re.MULTILINE).replace('A sensor of', '# A sensor of')
+    examples = re.sub(r'^    # ', '    ', text.partition('capture:')[2], flags=re.MULTILINE).replace(
+        'A sensor of', '# A sensor of'
+    )
     given = flat(yaml.safe_load('    capture:' + examples))
     settings = Settings.load(given, {})
     assert {sensor.name for sensor in settings.sensors} >= {'camera', 'front'}
