@@ -185,6 +185,8 @@ def view(page: Page, console: Console) -> list[RenderableType]:
 def _fine(topics: Mapping[str, TopicStatus]) -> str:
     """Nothing needs attention; unknown losses are not called none."""
     grades = [row.accounting or '' for row in topics.values() if row.received]
+    if not grades:
+        return 'No message has been received yet: `shadowhound-data doctor --only ros` finds out why.'
     if not set(grades) - {EXACT}:
         return 'Fine: nothing missed, dropped, rejected, evicted or quarantined in this session.'
     return f'Fine: nothing dropped, rejected, evicted or quarantined in this session; what was missed is {unsure(grades)}.'

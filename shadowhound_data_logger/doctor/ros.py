@@ -50,7 +50,7 @@ STREAMS: Final = {
     'lowstate': Stream(20.0, optional=True),
     'utlidar/voxel_map_compressed': Stream(10.0, optional=True),
 }
-"""By the sensor's name in the settings."""
+"""Of a Unitree Go2, by topic."""
 UNKNOWN: Final = Stream(0.0)
 """No expectations."""
 
@@ -109,11 +109,13 @@ def check(context: Context) -> Iterator[Result]:
         return
     if TF in heard:
         yield from _transforms(heard[TF])
-    is_complete = context.settings.capture.topics == NAMED or any(map(is_of_unitree, (f'{name}/' for name in packages)))
+    is_unitree = any(map(is_of_unitree, (f'{name}/' for name in packages)))
+    is_complete = context.settings.capture.topics == NAMED or is_unitree
+    streams = STREAMS if is_unitree else {}
     for sensor in sensors:
         topics = [heard[resolved[topic]] for topic in sensor.topics]
         if is_complete or any(one.publishers for one in topics):  # the default sensors are for a Unitree
-            yield from _sensor(sensor, topics, context.rates_hz)
+            yield from _sensor(sensor, topics, context.rates_hz, streams)
 
 
 def _clock(waiting: Sequence[str]) -> Iterator[Result]:
@@ -256,12 +258,17 @@ def _peek(domain: int, topics: Sequence[str], listener: Middleware | None) -> li
         return [topic for topic, publishers in ros_watch.discover(node, topics, PEEK_S).items() if publishers]
 
 
-def _sensor(sensor: SensorSettings, heard: Sequence[WatchedTopic], rates_hz: Mapping[str, float]) -> Iterator[Result]:
-    """A sensor is present if one of its topics is; each topic that is present is checked."""
+def _sensor(
+    sensor: SensorSettings, heard: Sequence[WatchedTopic], rates_hz: Mapping[str, float], streams: Mapping[str, Stream]
+) -> Iterator[Result]:
+    """A sensor is present if one of its topics is; each topic that is present is checked.
+
+    ``rates_hz`` are those that the user expects, ``streams`` has what is known about the topics of this kind of robot.
+    """
     present = [(topic, one) for topic, one in zip(sensor.topics, heard, strict=True) if one.publishers]
     if not present:
         names = ' nor '.join(one.topic for one in heard)
-        stream = STREAMS.get(sensor.topics[0], UNKNOWN)
+        stream = streams.get(sensor.topics[0], UNKNOWN)
         if stream.optional:
             yield info('ros.topic', f'{names} has no publisher', 'many robots have none')
         else:
@@ -274,7 +281,7 @@ def _sensor(sensor: SensorSettings, heard: Sequence[WatchedTopic], rates_hz: Map
             )
         return
     for topic, one in present:
-        stream = STREAMS.get(topic, UNKNOWN)
+        stream = streams.get(topic, UNKNOWN)
         expected = rates_hz.get(one.topic, rates_hz.get(topic, stream.rate_hz or sensor.rate_hz))
         yield from _check_topic(one, sensor, stream, expected)
 

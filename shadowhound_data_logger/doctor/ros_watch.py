@@ -106,10 +106,14 @@ def published(ros_node: Node, within: str = '/') -> dict[str, list[Endpoint]]:
     while (now := time.monotonic()) < end or (now - quiet_since < SETTLE_S and now < end + DISCOVER_S):
         named = [name for name, _ in ros_node.get_topic_names_and_types() if is_plain_name(name) and name not in NOT_LOGGED]
         seen = {name: endpoints(ros_node, name) for name in named if name.startswith(f'{within.rstrip("/")}/')}
-        if {topic: len(each) for topic, each in seen.items()} != {topic: len(each) for topic, each in found.items()}:
+        if _nodes(seen) != _nodes(found):  # the name of a node arrives after its publishers
             found, quiet_since = seen, now
         time.sleep(POLL_S)
     return {topic: publishers for topic, publishers in found.items() if publishers}
+
+
+def _nodes(found: Mapping[str, Sequence[Endpoint]]) -> dict[str, list[str]]:
+    return {topic: sorted(each.node for each in publishers) for topic, publishers in found.items()}
 
 
 def listen(ros_node: Node, found: dict[str, list[Endpoint]], window_s: float, types: Mapping[str, str]) -> list[WatchedTopic]:

@@ -105,6 +105,13 @@ def test_it_fits_into_80_columns() -> None:
     assert text.rstrip().splitlines()[-1].startswith('Fine')
 
 
+def test_without_a_message_it_names_the_command_that_finds_out_why() -> None:
+    """It is not called fine."""
+    text = shown(topics={})
+    assert 'doctor --only ros' in text
+    assert 'Fine' not in text
+
+
 def test_it_says_what_is_recorded() -> None:
     """The bag, how much is in it, and what is wrong with it; nothing while nothing is recorded."""
     bag = {'recording': True, 'paused': False, 'bag': 'patrol_1', 'slice': 3, 'messages': 12_345, 'bytes': 10**7, 'dropped': 0,

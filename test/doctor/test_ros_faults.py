@@ -149,9 +149,40 @@ def test_no_command_has_a_name_that_is_invalid_in_ros(monkeypatch: pytest.Monkey
 
     names = ['/robot0/odom', '/$(reboot)/odom', '/a;b/odom', '/a b/odom', '/a\nb/odom', '/rosout', '/_hidden/odom']
     here = SimpleNamespace(get_topic_names_and_types=lambda: [(name, ['a/msg/B']) for name in names])
-    monkeypatch.setattr(ros_watch, 'endpoints', lambda *_: [SimpleNamespace(type='a/msg/B')])
+    monkeypatch.setattr(ros_watch, 'endpoints', lambda *_: [SimpleNamespace(type='a/msg/B', node='/robot')])
     monkeypatch.setattr(ros_watch, 'DISCOVER_S', 0.1)
     assert list(ros_watch.published(here)) == ['/robot0/odom']
+
+
+def test_a_publisher_whose_node_is_found_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """DDS announces publishers before the names of their nodes."""
+    from shadowhound_data_logger.doctor import ros_watch
+
+    nodes = iter(['', '', '/robot'])
+    here = SimpleNamespace(get_topic_names_and_types=lambda: [('/odom', ['a/msg/B'])])
+    monkeypatch.setattr(ros_watch, 'endpoints', lambda *_: [SimpleNamespace(type='a/msg/B', node=next(nodes, '/robot'))])
+    monkeypatch.setattr(ros_watch, 'DISCOVER_S', 0.5)
+    assert [each.node for each in ros_watch.published(here)['/odom']] == ['/robot']
+
+
+@pytest.mark.parametrize(('of', 'findings'), [('go2_interfaces/msg/IMU', ['ros.qos', 'ros.rate']), ('sensor_msgs/msg/Imu', [])])
+def test_only_a_go2_is_expected_to_be_one(scene: Scene, monkeypatch: pytest.MonkeyPatch, of: str, findings: list[str]) -> None:
+    """An IMU of another robot may be slow and BEST_EFFORT."""
+    from shadowhound_data_logger.doctor import ros, ros_watch
+
+    publisher = SimpleNamespace(type=of, node='/robot', reliable=False, transient_local=False)
+    imu = ros_watch.WatchedTopic('/imu', [publisher], of, received=10, window_s=2.5)
+    here = SimpleNamespace(
+        resolve_topic_name=lambda topic: f'/{topic}', count_publishers=lambda _: 1, get_publishers_info_by_topic=lambda _: [],
+    )  # fmt: skip
+    monkeypatch.setattr(ros_watch, 'node', lambda **_: nullcontext(here))
+    monkeypatch.setattr(ros_watch, 'discover', lambda *_: {'/imu': [publisher]})
+    monkeypatch.setattr(ros_watch, 'publishers_of', lambda *_: [])
+    monkeypatch.setattr(ros_watch, 'waiting_for_clock', lambda _: [])
+    monkeypatch.setattr(ros_watch, 'listen', lambda *_: [imu])
+    own = {'sensors': ['imu'], 'imu.topics': ['imu'], 'imu.types': [of]}
+    context = make(scene.environ, role=scene.role, parameters=own, root=scene.root)
+    assert sorted(result.check for result in ros.check(context) if result.is_finding) == findings
 
 
 def test_it_is_another_robot(examined: Examined) -> None:
